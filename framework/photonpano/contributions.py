@@ -1,0 +1,179 @@
+"""The frozen records with which a plugin offers its components."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeAlias, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
+
+from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from photonpano.values import Response, StreamInfo
+
+
+class Config(BaseModel):
+    """Base of the configs of components: closed (an unknown key is an error) and frozen.
+
+    Give every field a description, bounds, and its unit in the name or the description.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _relative_to_spec(path: Path, info: ValidationInfo) -> Path:
+    directory = (info.context or {}).get("directory")
+    path = path.expanduser()
+    return path if directory is None else Path(directory) / path
+
+
+SpecPath = Annotated[Path, AfterValidator(_relative_to_spec)]
+"""A path in a config: relative paths count from the folder of the spec, and arrive in the component resolved."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceContext:
+    """What the framework tells a source when it is built.
+
+    Attributes:
+        seed: the seed of the run; all randomness derives from it.
+        threads: how many threads the component may use.
+    """
+
+    seed: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class StageContext:
+    """What the framework tells every other component when it is built.
+
+    Attributes:
+        stream: the capture's frames, size and rate.
+        response: the camera's response.
+        seed: the seed of the run; all randomness derives from it.
+        threads: how many threads the component may use.
+    """
+
+    stream: StreamInfo
+    response: Response
+    seed: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """A library that a component imports when it is built.
+
+    Attributes:
+        module: the name to import, such as `kornia`.
+        install: what to pass to `pip install`, such as `photonpano[kornia]`.
+    """
+
+    module: str
+    install: str
+
+
+C = TypeVar("C", bound=Config)
+ContextT = TypeVar("ContextT")
+ComponentT = TypeVar("ComponentT", covariant=True)
+
+_KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contribution(Generic[C, ContextT, ComponentT]):
+    """One component that a plugin offers. Plugins yield the subclasses, one for each kind.
+
+    Attributes:
+        name: how specs call it, in kebab-case.
+        summary: one line for lists.
+        config: the closed, frozen model of the keys under `with`.
+        build: makes the component from its config and the context; heavy libraries are imported here, not before.
+        requires: libraries that may be missing, and how to install them.
+    """
+
+    kind: ClassVar[str]
+
+    name: str
+    summary: str
+    config: type[C]
+    build: Callable[[C, ContextT], ComponentT]
+    requires: tuple[Requirement, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not _KEBAB.fullmatch(self.name):
+            raise ValueError(f"the name of a contribution is kebab-case, such as 'my-{self.kind}'; got {self.name!r}")
+        if not self.summary or "\n" in self.summary:
+            raise ValueError(f"{self.name}: the summary is one line, got {self.summary!r}")
+        if not issubclass(self.config, BaseModel):
+            raise TypeError(f"{self.name}: config is a pydantic model class, got {self.config!r}")
+        settings = self.config.model_config
+        if settings.get("extra") != "forbid" or not settings.get("frozen"):
+            raise ValueError(
+                f"{self.name}: the config must be closed and frozen; derive {self.config.__name__} from photonpano.Config"
+            )
+
+
+def no_problems(*_: Any) -> Sequence[str]:
+    """Find nothing: the default `check` of a contribution."""
+    return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceContribution(Contribution[C, SourceContext, Source]):
+    """Offers a source.
+
+    Attributes:
+        check: problems of a config that can be told without reading the capture, such as a missing file.
+    """
+
+    kind: ClassVar[str] = "source"
+    check: Callable[[C], Sequence[str]] = no_problems
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageContribution(Contribution[C, StageContext, ComponentT]):
+    """Offers a component of one of the four stages.
+
+    Attributes:
+        check: problems of a config for a capture that looks like this; reads no data, imports nothing heavy.
+    """
+
+    check: Callable[[C, StreamInfo], Sequence[str]] = no_problems
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResamplerContribution(StageContribution[C, Resampler]):
+    """Offers a resampler."""
+
+    kind: ClassVar[str] = "resampler"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergerContribution(StageContribution[C, Merger]):
+    """Offers a merger."""
+
+    kind: ClassVar[str] = "merger"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocatorContribution(StageContribution[C, Locator]):
+    """Offers a locator."""
+
+    kind: ClassVar[str] = "locator"
+
+
+@dataclass(frozen=True, kw_only=True)
+class InterpolatorContribution(StageContribution[C, Interpolator]):
+    """Offers an interpolator."""
+
+    kind: ClassVar[str] = "interpolator"
+
+
+AnyContribution: TypeAlias = Contribution[Any, Any, Any]

@@ -1,0 +1,69 @@
+"""The errors that users meet: each message says what, where, and what to do.
+
+Everything raised on purpose derives from `PhotonpanoError`; anything else that escapes is a defect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+
+class PhotonpanoError(Exception):
+    """Base of all errors with a message made for users."""
+
+
+class InputError(PhotonpanoError):
+    """A capture, mask, truth or other input file cannot be used as it is."""
+
+
+class LocationError(PhotonpanoError):
+    """Too few exposures could be located against each other to go on."""
+
+
+class CanvasTooLargeError(PhotonpanoError):
+    """The predicted panorama exceeds the limit of the spec."""
+
+
+class OutputError(PhotonpanoError):
+    """A result could not be written; nothing is left under its final name."""
+
+
+class PluginError(PhotonpanoError):
+    """A plugin is broken, missing a library, in conflict with another, or broke its contract."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong with a spec.
+
+    Attributes:
+        where: path inside the spec, such as `locate.with.ratio`; empty for the file as a whole.
+        message: what was expected and what was given.
+        file: the spec file, None for a spec that was built in Python.
+        line: line in the file, from 1; None if unknown.
+        column: column in the line, from 1; None if unknown.
+    """
+
+    where: str
+    message: str
+    file: Path | None = None
+    line: int | None = None
+    column: int | None = None
+
+    def __str__(self) -> str:
+        position = [str(part) for part in (self.file, self.line, self.column) if part is not None]
+        head = ":".join(position)
+        return ": ".join(part for part in (head, self.where, self.message) if part)
+
+
+class SpecError(PhotonpanoError):
+    """A spec is wrong; carries every problem that was found, not only the first."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))

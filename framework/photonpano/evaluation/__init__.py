@@ -1,0 +1,1 @@
+"""Scores of trajectories and panoramas against a known truth."""

@@ -1,0 +1,32 @@
+"""Pure functions on homographies and canvases: points are (x, y), integers are pixel centres, maps are float64."""
+
+from photonpano.geometry.canvas import Canvas, canvas_of
+from photonpano.geometry.homographies import (
+    apply,
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    normalised,
+    parameters,
+    rescaled,
+    rescaling,
+    translation,
+)
+from photonpano.geometry.plausibility import implausibility
+
+__all__ = [
+    "Canvas",
+    "apply",
+    "canvas_of",
+    "corner_displacements",
+    "corners",
+    "from_parameters",
+    "implausibility",
+    "inverse",
+    "normalised",
+    "parameters",
+    "rescaled",
+    "rescaling",
+    "translation",
+]

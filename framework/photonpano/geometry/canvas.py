@@ -1,0 +1,57 @@
+"""The canvas of a panorama: where frames land, and how large the image is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry.homographies import apply, corners, rescaling, translation
+
+if TYPE_CHECKING:
+    from photonpano.values import FloatArray, Homography
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Canvas:
+    """The pixel grid of a panorama.
+
+    Attributes:
+        height: rows.
+        width: columns.
+        transform: (3, 3), pixels of the reference plane to pixels of the canvas.
+    """
+
+    height: int
+    width: int
+    transform: Homography
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.height, self.width
+
+
+def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
+    """Return the smallest canvas that holds every frame.
+
+    Args:
+        homographies: (N, 3, 3), frame pixels to reference pixels.
+        frame_shape: (height, width) of a frame.
+        scale: pixels of the canvas per pixel of the reference frame.
+
+    Raises:
+        ValueError: a frame reaches the horizon of the reference plane, so that no finite canvas holds it.
+    """
+    frame = corners(frame_shape)
+    depth = homographies[:, 2:, :2] @ frame.T + homographies[:, 2:, 2:]
+    if depth.min() <= 0:
+        index = int(np.argmin(depth.min(axis=(1, 2))))
+        raise ValueError(f"homography {index} of {len(homographies)} sends part of its frame behind the reference plane")
+    points = apply(homographies, frame).reshape(-1, 2)
+    # Whole reference pixels, so that the canvas of scale 1 samples the reference frame without interpolation.
+    low = np.floor(points.min(axis=0) + 1e-6)
+    high = np.ceil(points.max(axis=0) - 1e-6)
+    width, height = np.ceil((high - low + 1) * scale - 1e-6).astype(int)
+    return Canvas(int(height), int(width), rescaling(scale) @ translation(-low[0], -low[1]))

@@ -1,0 +1,102 @@
+"""Homographies: building, applying, composing, rescaling, and the eight parameters of the paper.
+
+Convention:
+    Points are (x, y), x right, y down; integer coordinates are pixel centres; sizes are (height, width). A homography is
+    (3, 3) float64 with h33 = 1 and maps column vectors (x, y, 1). All functions take stacks (..., 3, 3) as well.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from photonpano.values import FloatArray, Homography
+
+
+def normalised(matrices: ArrayLike) -> Homography:
+    """Scale (..., 3, 3) matrices so that h33 = 1.
+
+    Raises:
+        ValueError: an h33 is zero or not finite, so that the matrix has no such form.
+    """
+    matrices = np.asarray(matrices, dtype=np.float64)
+    h33 = matrices[..., 2, 2]
+    if not (np.all(np.isfinite(matrices)) and np.all(h33)):
+        raise ValueError("a homography must be finite and have h33 other than 0")
+    return np.asarray(matrices / h33[..., None, None])
+
+
+def inverse(homographies: Homography) -> Homography:
+    """Return the inverse maps, (..., 3, 3) with h33 = 1."""
+    return normalised(np.linalg.inv(homographies))
+
+
+def translation(x: float, y: float) -> Homography:
+    """Return the map that adds (x, y) pixels."""
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+
+
+def rescaling(scale: float) -> Homography:
+    """Return the map from pixels of an image to pixels of the same image rescaled: `(p + 0.5) * scale - 0.5`."""
+    offset = 0.5 * scale - 0.5
+    return np.array([[scale, 0.0, offset], [0.0, scale, offset], [0.0, 0.0, 1.0]])
+
+
+def rescaled(homographies: Homography, scale: float) -> Homography:
+    """Return the same motions between images that are both rescaled by `scale`."""
+    return normalised(rescaling(scale) @ homographies @ rescaling(1 / scale))
+
+
+def apply(homographies: Homography, points: ArrayLike) -> FloatArray:
+    """Map points.
+
+    Args:
+        homographies: (..., 3, 3).
+        points: (N, 2), or (..., N, 2) with one set of points for each homography.
+
+    Returns:
+        (..., N, 2) mapped points; infinite or NaN where a point goes to infinity.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    mapped = points @ np.swapaxes(homographies[..., :2, :2], -1, -2) + homographies[..., None, :2, 2]
+    depth = points @ homographies[..., 2, :2, None] + homographies[..., None, 2:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(mapped / depth)
+
+
+def corners(shape: tuple[int, int]) -> FloatArray:
+    """Return the centres of the corner pixels of a (height, width) image, clockwise from the top left: (4, 2)."""
+    height, width = shape
+    return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+
+
+def corner_displacements(first: Homography, second: Homography, shape: tuple[int, int]) -> FloatArray:
+    """Return the distances in pixels between where two maps send the four corners of an image: (..., 4)."""
+    frame = corners(shape)
+    return np.asarray(np.linalg.norm(apply(first, frame) - apply(second, frame), axis=-1))
+
+
+def parameters(homographies: Homography) -> FloatArray:
+    """Return p1..p8 of the paper (section 4, "Interpolate"): (..., 8).
+
+    They fill the homography as [[1 + p1, p3, p5], [p2, 1 + p4, p6], [p7, p8, 1]], so that zeros are the identity.
+    """
+    h = np.asarray(homographies, dtype=np.float64) - np.eye(3)
+    return np.stack([h[..., row, column] for row, column in _PARAMETERS], axis=-1)
+
+
+def from_parameters(p: ArrayLike) -> Homography:
+    """Return the homographies of p1..p8: (..., 8) to (..., 3, 3)."""
+    p = np.asarray(p, dtype=np.float64)
+    h = np.broadcast_to(np.eye(3), (*p.shape[:-1], 3, 3)).copy()
+    for index, (row, column) in enumerate(_PARAMETERS):
+        h[..., row, column] += p[..., index]
+    return h
+
+
+_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))
+"""Row and column of p1..p8."""

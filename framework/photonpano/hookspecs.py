@@ -1,0 +1,204 @@
+"""The extension points: one hook a kind, no arguments, each returns contributions.
+
+A plugin is a module with these hooks, named in the entry-point group `photonpano` of its distribution:
+
+    [project.entry-points.photonpano]
+    my-plugin = "my_plugin.hooks"
+
+The hook module imports no heavy library; the component does so when it is built.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pluggy
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from photonpano.contributions import (
+        InterpolatorContribution,
+        LocatorContribution,
+        MergerContribution,
+        ResamplerContribution,
+        SourceContribution,
+    )
+
+PROJECT = "photonpano"
+"""The pluggy project name, and the entry-point group."""
+
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec
+def photonpano_sources() -> Iterable[SourceContribution]:  # type: ignore[empty-body, type-arg]
+    """Offer sources: they open a capture and give the summed counts, or the frames, of a span.
+
+    Example:
+        ```python
+        from photonpano import Config, SourceContribution, SpecPath, hookimpl
+
+
+        class MyCameraConfig(Config):
+            path: SpecPath
+
+
+        def build(config, context):
+            from my_plugin.camera import MyCameraSource
+
+            return MyCameraSource(config.path)
+
+
+        @hookimpl
+        def photonpano_sources():
+            yield SourceContribution(name="my-camera", summary="Files of my camera", config=MyCameraConfig, build=build)
+        ```
+    """
+
+
+@hookspec
+def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[empty-body, type-arg]
+    """Offer resamplers: they choose the groups of frames of each level.
+
+    Example:
+        ```python
+        from photonpano import Config, FrameSpan, Group, ResamplerContribution, hookimpl
+
+
+        class Halves:
+            def groups(self, n_frames, level):
+                half = n_frames // 2
+                spans = (FrameSpan(0, half), FrameSpan(half, n_frames))
+                return tuple(Group(span, span.centre) for span in spans)
+
+
+        class HalvesConfig(Config):
+            pass
+
+
+        @hookimpl
+        def photonpano_resamplers():
+            yield ResamplerContribution(
+                name="halves",
+                summary="Two groups, whatever the level",
+                config=HalvesConfig,
+                build=lambda config, context: Halves(),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-body, type-arg]
+    """Offer mergers: they merge the frames of a group into a virtual exposure.
+
+    Example:
+        ```python
+        import numpy as np
+
+        from photonpano import Config, MergerContribution, VirtualExposure, hookimpl
+
+
+        class NaiveSum:
+            def merge(self, source, group, trajectory, scale):
+                counts = source.counts(group.span)
+                weight = np.where(source.valid, len(group.span), 0).astype(np.float32)
+                with np.errstate(invalid="ignore"):
+                    flux = source.response.flux((counts / weight).astype(np.float32), weight)
+                return VirtualExposure(flux, weight, group, 1.0, source.response)
+
+
+        class NaiveSumConfig(Config):
+            pass
+
+
+        @hookimpl
+        def photonpano_mergers():
+            yield MergerContribution(
+                name="naive-sum",
+                summary="Sums the frames where they lie",
+                config=NaiveSumConfig,
+                build=lambda config, context: NaiveSum(),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_locators() -> Iterable[LocatorContribution]:  # type: ignore[empty-body, type-arg]
+    """Offer locators: they find the motion between two virtual exposures.
+
+    Example:
+        ```python
+        from photonpano import Config, LocatorContribution, NotLocated, hookimpl
+
+
+        class NeverFound:
+            def describe(self, exposure):
+                return None
+
+            def register(self, moving, fixed, initial):
+                return NotLocated("this example looks at nothing")
+
+
+        class NeverFoundConfig(Config):
+            pass
+
+
+        @hookimpl
+        def photonpano_locators():
+            yield LocatorContribution(
+                name="never-found",
+                summary="Locates nothing, and says so",
+                config=NeverFoundConfig,
+                build=lambda config, context: NeverFound(),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: ignore[empty-body, type-arg]
+    """Offer interpolators: they turn located instants into a trajectory.
+
+    Example:
+        ```python
+        import numpy as np
+
+        from photonpano import Config, InterpolatorContribution, hookimpl
+
+
+        class NearestKnot:
+            def __init__(self, instants, homographies):
+                self.instants, self.homographies = instants, homographies
+
+            def at(self, frame_indices):
+                frames = np.atleast_1d(np.asarray(frame_indices, dtype=float))
+                return self.homographies[np.abs(frames[:, None] - self.instants).argmin(axis=1)]
+
+            def located(self, frame_indices):
+                frames = np.atleast_1d(np.asarray(frame_indices, dtype=float))
+                return (self.instants[0] <= frames) & (frames <= self.instants[-1])
+
+
+        class Nearest:
+            def fit(self, instants, homographies, information):
+                return NearestKnot(instants, homographies)
+
+
+        class NearestConfig(Config):
+            pass
+
+
+        @hookimpl
+        def photonpano_interpolators():
+            yield InterpolatorContribution(
+                name="nearest",
+                summary="The homography of the nearest located instant",
+                config=NearestConfig,
+                build=lambda config, context: Nearest(),
+            )
+        ```
+    """

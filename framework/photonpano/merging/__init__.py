@@ -1,0 +1,1 @@
+"""Sums of frames along a motion: chunks, warps, accumulation."""

@@ -1,0 +1,39 @@
+"""How a camera turns flux into counts, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class BinaryResponse:
+    """A pixel is 1 if it detected at least one photon (paper, equations 2 and 3).
+
+    The mean count at flux `f` (detected photons per frame period, dark counts included) is `1 - exp(-f)`.
+
+    A pixel that is lit in all of n frames has no finite estimate. The rule: half a frame is taken to be dark, so its flux is
+    `ln(2 n)`, which is what the next brighter pixel could not exceed by more than a photon's chance.
+    """
+
+    def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the expected count of one frame: `1 - exp(-flux)` (equation 2)."""
+        return -np.expm1(-flux)
+
+    def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return the maximum-likelihood flux `-ln(1 - mean_count)` (equation 3), with saturation as the class says."""
+        ceiling = 1 - 0.5 / np.maximum(frames, 1)
+        return np.asarray(-np.log1p(-np.clip(mean_count, 0, ceiling)), dtype=np.float32)
+
+    def stabilised(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return `arcsin(sqrt(mean_count))`, from 0 to pi/2, which makes binomial noise uniform (Anscombe 1948)."""
+        return np.asarray(np.arcsin(np.sqrt(np.clip(self.mean_count(flux), 0, 1))), dtype=np.float32)
+
+    def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return `1 / (2 sqrt(frames))`."""
+        return 0.5 / np.sqrt(np.asarray(frames, dtype=np.float32))

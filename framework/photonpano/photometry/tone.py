@@ -1,0 +1,27 @@
+"""Tone curves for looking at flux."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Undo the sRGB curve (IEC 61966-2-1): encoded values in [0, 1] to linear intensities in [0, 1]."""
+    encoded = np.asarray(encoded, dtype=np.float32)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Apply the sRGB curve: linear intensities, clipped to [0, 1], to encoded values in [0, 1]. NaN stays NaN."""
+    linear = np.clip(np.asarray(linear, dtype=np.float32), 0, 1)
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def tone_mapped(flux: NDArray[np.float32], white: float) -> NDArray[np.uint8]:
+    """Return 8-bit sRGB for looking at: `white` photons per pixel per frame become 255; unknown pixels are black."""
+    return np.asarray(np.nan_to_num(linear_to_srgb(flux / white)) * 255 + 0.5).astype(np.uint8)

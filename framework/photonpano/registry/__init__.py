@@ -1,0 +1,1 @@
+"""Discovery of plugins and the catalog of what they contribute."""

@@ -1,0 +1,1 @@
+"""Pipeline specs: YAML with positions, validated models, all problems at once."""

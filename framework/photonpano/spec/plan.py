@@ -1,0 +1,72 @@
+"""A spec that has been resolved against a catalog: what the pipeline runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from photonpano.contributions import (
+        Config,
+        InterpolatorContribution,
+        LocatorContribution,
+        MergerContribution,
+        ResamplerContribution,
+        SourceContribution,
+    )
+    from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
+
+ContributionT = TypeVar("ContributionT")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice(Generic[ContributionT]):
+    """A component chosen by name, with its validated config.
+
+    Attributes:
+        contribution: what the plugin offers under that name.
+        config: an instance of `contribution.config`.
+        plugin: the distribution it came from, such as "photonpano".
+        version: the version of that distribution.
+    """
+
+    contribution: ContributionT
+    config: Config
+    plugin: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class LevelPlan:
+    """The components of one level, and the scale of its exposures (pixels per pixel of a frame)."""
+
+    resample: Choice[ResamplerContribution[Any]]
+    merge: Choice[MergerContribution[Any]]
+    locate: Choice[LocatorContribution[Any]]
+    interpolate: Choice[InterpolatorContribution[Any]]
+    scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything a run needs.
+
+    Attributes:
+        source: the capture.
+        levels: one plan for each level, in order.
+        graph: which pairs are registered, and what happens when the graph falls apart.
+        render: the panorama.
+        output: the run folder.
+        run: seed, threads, memory.
+        document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
+    """
+
+    source: Choice[SourceContribution[Any]]
+    levels: tuple[LevelPlan, ...]
+    graph: GraphSettings
+    render: RenderSettings
+    output: OutputSettings
+    run: RunSettings
+    document: Mapping[str, Any]

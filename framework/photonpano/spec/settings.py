@@ -1,0 +1,53 @@
+"""The framework's own sections of a spec, with their defaults."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ByteSize, Field
+
+from photonpano.contributions import Config, SpecPath
+
+
+class GraphSettings(Config):
+    """Which pairs of exposures are registered, and what happens when too few are located."""
+
+    offsets: tuple[int, ...] = Field(
+        (1,), min_length=1, description="register exposures that are so many places apart in time; 1 is the neighbour"
+    )
+    disconnected: Literal["error", "largest"] = Field(
+        "error",
+        description="when some exposures cannot be tied to the others: stop with an error that names them, "
+        "or go on with the largest part",
+    )
+
+
+class RenderSettings(Config):
+    """The panorama."""
+
+    scale: float = Field(1.0, ge=0.05, le=16, description="pixels of the panorama per pixel of the reference frame")
+    reference: Literal["first", "middle", "last"] | int = Field(
+        "middle", description="the frame whose plane the panorama lies in: first, middle, last, or a frame index"
+    )
+    tolerance_px: float = Field(
+        0.25, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
+    )
+    white_quantile: float = Field(0.995, gt=0, le=1, description="the quantile of flux that becomes white in panorama.png")
+
+
+class OutputSettings(Config):
+    """The run folder."""
+
+    directory: SpecPath = Field(description="the run folder; by default `runs/` and the name of the spec, beside the spec")
+
+
+class RunSettings(Config):
+    """How the run uses the machine."""
+
+    seed: int = Field(0, ge=0, description="all randomness of the run derives from it")
+    threads: Literal["auto"] | int = Field("auto", description="threads to use; auto takes one for each core")
+    memory: ByteSize = Field(
+        ByteSize(2 * 1024**3),
+        ge=64 * 1024**2,
+        description="a panorama that needs more than this is refused, such as 2 GiB",
+    )

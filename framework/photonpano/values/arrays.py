@@ -1,0 +1,22 @@
+"""Names for the arrays that stages exchange: geometry is float64, flux is float32."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+"""Any float64 array: coordinates, parameters, covariances."""
+
+Homography: TypeAlias = NDArray[np.float64]
+"""(3, 3) float64 with h33 = 1; (N, 3, 3) where the text says so."""
+
+FluxImage: TypeAlias = NDArray[np.float32]
+"""(H, W) float32: photons per pixel per frame period, NaN where unknown."""
+
+Counts: TypeAlias = NDArray[np.uint32]
+"""(H, W) uint32: sums of frames."""
+
+BoolArray: TypeAlias = NDArray[np.bool_]

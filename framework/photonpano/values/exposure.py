@@ -1,0 +1,73 @@
+"""Flux images with their weights: virtual exposures and panoramas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from photonpano.values.arrays import FluxImage, Homography
+    from photonpano.values.frames import Group
+
+
+class Response(Protocol):
+    """How a camera turns flux into counts. Every method works element by element and keeps NaN.
+
+    Flux is photons per pixel per frame period; a mean count is the sum of some frames divided by their number.
+    """
+
+    def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the expected count of one frame at this flux."""
+        ...
+
+    def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return the maximum-likelihood flux of a mean count over so many frames; finite for finite input."""
+        ...
+
+    def stabilised(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Map flux to a scale on which its noise is the same everywhere: see `stabilised_std`."""
+        ...
+
+    def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return the standard deviation, on that scale, of a flux estimated from so many frames."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualExposure:
+    """Flux and weight merged from a group, seen from its reference instant.
+
+    Convention:
+        The grid is that of a frame, rescaled: pixel centres p of the frame lie at `(p + 0.5) * scale - 0.5`.
+
+    Attributes:
+        flux: (H, W) float32, photons per pixel per frame period, NaN where nothing was seen.
+        weight: (H, W) float32, how many frames each pixel was seen in; 0 exactly where flux is NaN.
+        group: the frames and the instant.
+        scale: pixels of the exposure per pixel of a frame.
+        response: the camera's response, which tells the noise of the flux.
+    """
+
+    flux: FluxImage
+    weight: FluxImage
+    group: Group
+    scale: float
+    response: Response
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panorama:
+    """Flux and weight on a canvas.
+
+    Attributes:
+        flux: (H, W) float32, photons per pixel per frame period, NaN where nothing was seen.
+        weight: (H, W) float32, how many frames each pixel was seen in (the coverage).
+        canvas: (3, 3) float64, pixels of the reference plane to pixels of the panorama.
+    """
+
+    flux: FluxImage
+    weight: FluxImage
+    canvas: Homography

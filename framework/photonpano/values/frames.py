@@ -1,0 +1,81 @@
+"""Frame spans, groups, and what is known of a capture without reading it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class FrameSpan:
+    """Half-open range `[start, stop)` of absolute frame indices in a source. Never empty."""
+
+    start: int
+    stop: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.start < self.stop:
+            raise ValueError(f"a frame span needs 0 <= start < stop, got [{self.start}, {self.stop})")
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def __str__(self) -> str:
+        return f"frames {self.start} to {self.stop - 1}"
+
+    @property
+    def centre(self) -> float:
+        """The mean instant of the span, in frames: `(start + stop - 1) / 2`."""
+        return (self.start + self.stop - 1) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Frames that are merged into one virtual exposure, seen from one instant.
+
+    Attributes:
+        span: the frames that are merged.
+        reference: the instant that is located, in frames; frame i is the instant i. It may lie between two frames, as the
+            centre of an even number of frames does, but not outside the span.
+    """
+
+    span: FrameSpan
+    reference: float
+
+    def __post_init__(self) -> None:
+        if not self.span.start <= self.reference <= self.span.stop - 1:
+            raise ValueError(f"the reference {self.reference} lies outside {self.span}")
+
+    def __str__(self) -> str:
+        return str(self.span)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInfo:
+    """What is known of a capture before any frame is read.
+
+    Attributes:
+        n_frames: number of frames.
+        height: rows of a frame.
+        width: columns of a frame.
+        frame_rate_hz: frames a second; None if the capture does not say.
+        kind: "binary" if a pixel is 0 or 1, "intensity" if it is a grey value or a sum of binary frames.
+        bit_depth: bits of a pixel.
+    """
+
+    n_frames: int
+    height: int
+    width: int
+    frame_rate_hz: float | None
+    kind: Literal["binary", "intensity"] = "binary"
+    bit_depth: int = 1
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.height, self.width
+
+    @property
+    def span(self) -> FrameSpan:
+        """All frames."""
+        return FrameSpan(0, self.n_frames)

@@ -1,0 +1,63 @@
+"""Pairwise motions: located with their quality, or not located with the reason. Never an identity for a failure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from photonpano.values.arrays import FloatArray, Homography
+
+_NONE: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """A pairwise motion that was found.
+
+    Convention:
+        The map takes pixels of the moving image to pixels of the fixed one; points are (x, y), integers are pixel centres.
+
+    Attributes:
+        homography: (3, 3) float64, h33 = 1.
+        information: (8, 8) inverse covariance of the eight parameters p1..p8 of `homography` in the order of the paper
+            (section 4, "Interpolate"), None if the locator has none.
+        residual_px: root mean square of what remains after the fit, in pixels of the fixed image; None if unknown.
+        evidence: what the locator counted, by name (keypoints, matches, inliers, ...), for records and messages.
+    """
+
+    homography: Homography
+    information: FloatArray | None = None
+    residual_px: float | None = None
+    evidence: Mapping[str, float] = field(default=_NONE)
+
+
+@dataclass(frozen=True, slots=True)
+class NotLocated:
+    """A pairwise motion that was not found.
+
+    Attributes:
+        reason: a clause that completes "not located: ...", with the numbers that decided.
+        evidence: what the locator counted, by name.
+    """
+
+    reason: str
+    evidence: Mapping[str, float] = field(default=_NONE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """One pair of virtual exposures of the motion graph, and what the locator said of it.
+
+    Attributes:
+        moving: number of the exposure that is mapped.
+        fixed: number of the exposure that it is mapped to.
+        motion: the map in pixels of frames (not of rescaled exposures), or the reason why there is none.
+    """
+
+    moving: int
+    fixed: int
+    motion: Located | NotLocated

@@ -1,0 +1,1 @@
+"""First-party components: packed .npy captures, midpoint resampling, maximum-likelihood merging, interpolators."""

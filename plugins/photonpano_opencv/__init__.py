@@ -1,0 +1,1 @@
+"""Locators built on OpenCV."""

@@ -1,0 +1,1 @@
+"""Scenes, camera paths and single-photon cameras that are simulated."""
