@@ -36,4 +36,4 @@ class BinaryResponse:
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `1 / (2 sqrt(frames))`."""
-        return 0.5 / np.sqrt(np.asarray(frames, dtype=np.float32))
+        return np.asarray(0.5 / np.sqrt(frames), dtype=np.float32)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from photonpano.values.arrays import FloatArray, Homography
-
-_NONE: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +29,7 @@ class Located:
     homography: Homography
     information: FloatArray | None = None
     residual_px: float | None = None
-    evidence: Mapping[str, float] = field(default=_NONE)
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +42,7 @@ class NotLocated:
     """
 
     reason: str
-    evidence: Mapping[str, float] = field(default=_NONE)
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
