@@ -1,0 +1,74 @@
+"""Files that are whole or absent: written under a temporary name, then renamed."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from photonpano.errors import OutputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@contextmanager
+def atomic_path(final: Path) -> Iterator[Path]:
+    """Lend a temporary path beside `final`, which becomes `final` when the block ends well.
+
+    When the block raises, Ctrl-C included, the temporary file is removed, and a file that stood under `final` stays as it was.
+    The temporary name keeps the suffix of `final`, by which writers of images and archives choose their format.
+
+    Example:
+        ```python
+        with atomic_path(folder / "trajectory.npz") as temporary:
+            np.savez(temporary, homographies=homographies)
+        ```
+
+    Raises:
+        OutputError: the file cannot be written. Every `OSError` of the block is taken to be one of writing.
+    """
+    temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.partial{final.suffix}")
+    try:
+        if final.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        temporary.touch(exist_ok=False)
+        yield temporary
+        _flush_to_disk(temporary)
+        temporary.replace(final)
+    except OSError as error:
+        raise OutputError(_message(final, error)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _flush_to_disk(path: Path) -> None:
+    """Wait for the disk: some file systems tell only now that they are full, and a rename may overtake the data."""
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space or choose another folder",
+    errno.EDQUOT: "free some of your quota or choose another folder",
+    errno.EFBIG: "raise the limit on file sizes or choose another file system",
+    errno.EACCES: "choose a folder that you may write to",
+    errno.EPERM: "choose a folder that you may write to",
+    errno.EROFS: "choose a folder that you may write to",
+    errno.EISDIR: "choose another name, or remove the folder",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+def _message(final: Path, error: OSError) -> str:
+    reason = error.strerror or str(error)
+    if isinstance(error, FileNotFoundError | NotADirectoryError) and not final.parent.is_dir():
+        return f"cannot write {final}: there is no folder {final.parent}; create it or choose another"
+    remedy = _REMEDIES.get(error.errno or 0)
+    return f"cannot write {final}: {reason}" + (f"; {remedy}" if remedy else "")

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from photonpano import OutputError
+from photonpano.pipeline.atomic import atomic_path
+
+
+def test_the_file_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
+    final = tmp_path / "result.bin"
+    with atomic_path(final) as temporary:
+        temporary.write_bytes(b"half")
+        assert not final.exists()
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".bin"
+        temporary.write_bytes(b"whole")
+    assert final.read_bytes() == b"whole"
+    assert list(tmp_path.iterdir()) == [final]
+
+
+def test_the_mode_follows_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        with atomic_path(tmp_path / "result.bin") as temporary:
+            temporary.write_bytes(b"whole")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "result.bin").stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_failure_keeps_the_old_file_and_removes_the_temporary_one(tmp_path: Path, error: type[BaseException]) -> None:
+    final = tmp_path / "result.bin"
+    final.write_bytes(b"old")
+    with pytest.raises(error), atomic_path(final) as temporary:
+        raise error(temporary.write_bytes(b"new"))
+    assert final.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [final]
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    final = tmp_path / "nowhere" / "result.bin"
+    with pytest.raises(OutputError) as caught, atomic_path(final):
+        raise AssertionError("the block must not run")
+    assert str(caught.value) == (
+        f"cannot write {final}: there is no folder {tmp_path / 'nowhere'}; create it or choose another"
+    )
+
+
+def test_a_folder_under_the_final_name_is_told_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught, atomic_path(tmp_path):
+        raise AssertionError("the block must not run")
+    assert str(caught.value) == f"cannot write {tmp_path}: Is a directory; choose another name, or remove the folder"
+
+
+def test_a_folder_without_permission_is_told(tmp_path: Path) -> None:
+    final = tmp_path / "result.bin"
+    with pytest.raises(OutputError) as caught, atomic_path(final):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    assert str(caught.value) == f"cannot write {final}: Permission denied; choose a folder that you may write to"
+
+
+_FILLS_THE_DISK = """
+import resource, signal, sys
+from pathlib import Path
+from photonpano import OutputError
+from photonpano.pipeline.atomic import atomic_path
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+try:
+    with atomic_path(Path(sys.argv[1])) as temporary:
+        temporary.write_bytes(bytes(8192))
+except OutputError as error:
+    print(error)
+"""
+
+
+def test_a_write_that_the_system_cuts_short_leaves_nothing(tmp_path: Path) -> None:
+    """A limit on file sizes stops the write half-way, as a full disk does."""
+    final = tmp_path / "result.bin"
+    done = subprocess.run([sys.executable, "-c", _FILLS_THE_DISK, final], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == (
+        f"cannot write {final}: File too large; raise the limit on file sizes or choose another file system"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    final = tmp_path / "result.bin"
+    with pytest.raises(OutputError) as caught, atomic_path(final), Path("/dev/full").open("wb", buffering=0) as full:
+        full.write(b"x")
+    assert str(caught.value) == (f"cannot write {final}: No space left on device; free some space or choose another folder")
+    assert list(tmp_path.iterdir()) == []
