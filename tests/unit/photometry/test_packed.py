@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from photonpano.photometry import packed_counts
+
+
+@settings(deadline=None)
+@given(n=st.integers(0, 600), height=st.integers(1, 5), width=st.integers(1, 41), seed=st.integers(0, 2**32 - 1))
+def test_equals_the_sum_of_the_frames(n: int, height: int, width: int, seed: int) -> None:
+    frames = np.random.default_rng(seed).integers(0, 2, (n, height, width), dtype=np.uint8)
+    counts = packed_counts(np.packbits(frames, axis=-1), width)
+    assert counts.dtype == np.uint32
+    np.testing.assert_array_equal(counts, frames.sum(axis=0, dtype=np.uint32).reshape(height, width))
+
+
+def test_lit_padding_bits_do_not_count() -> None:
+    np.testing.assert_array_equal(packed_counts(np.full((300, 2, 2), 255, np.uint8), 11), np.full((2, 11), 300))
+
+
+def test_frames_larger_than_a_block() -> None:
+    packed = np.full((3, 1024, 512), 0b01000000, np.uint8)
+    np.testing.assert_array_equal(packed_counts(packed, 4096), np.tile([0, 3, 0, 0, 0, 0, 0, 0], (1024, 512)))
+
+
+def test_memory_does_not_grow_with_the_frames() -> None:
+    packed = np.full((2000, 64, 62), 255, np.uint8)
+    tracemalloc.start()
+    try:
+        packed_counts(packed, 496)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 4 * 1024**2
+
+
+@pytest.mark.parametrize(
+    ("packed", "width"),
+    [
+        (np.zeros((2, 3, 4), np.int8), 32),
+        (np.zeros((2, 3, 4, 3), np.uint8), 32),
+        (np.zeros((2, 3, 4), np.uint8), 33),
+        (np.zeros((2, 3, 4), np.uint8), 24),
+    ],
+)
+def test_other_arrays_are_refused(packed: np.ndarray, width: int) -> None:
+    with pytest.raises(ValueError, match="packed frames of width"):
+        packed_counts(packed, width)
