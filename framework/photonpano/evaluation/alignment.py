@@ -1,0 +1,87 @@
+"""The map between the plane of an estimated trajectory and the plane of the truth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry import apply, corners, from_parameters, normalised
+
+if TYPE_CHECKING:
+    from photonpano.values import FloatArray, Homography
+
+FIT_FRAMES = 300
+"""The alignment is fitted to so many frames, evenly spaced: it has eight parameters, and every frame gives eight numbers."""
+
+_FAR_PX = 1e6
+"""What counts for a corner that a map sends to infinity."""
+
+
+def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int, int]) -> Homography:
+    """Return the map G from the estimated reference plane to the true plane that fits both trajectories best.
+
+    A trajectory is known up to the choice of its reference plane. G minimises the sum over frames t and corners c of
+
+        | inv(true_t) G estimated_t c - c |^2
+
+    in pixels of the frame, so that the result does not depend on the plane in which either trajectory is given.
+
+    Convention:
+        Homographies map pixels of a frame to pixels of a plane; points are (x, y), integers are pixel centres.
+
+    Args:
+        estimated: (T, 3, 3), frame pixels to pixels of the estimated reference plane.
+        true: (T, 3, 3), frame pixels to pixels of the true plane.
+        frame_shape: (height, width) of a frame.
+
+    Returns:
+        (3, 3), pixels of the estimated reference plane to pixels of the true plane, h33 = 1.
+
+    Raises:
+        ValueError: the trajectories are empty, or differ in length.
+    """
+    from scipy.optimize import least_squares
+
+    if len(estimated) != len(true) or not len(true):
+        raise ValueError(f"two trajectories of the same length are aligned, got {len(estimated)} and {len(true)} homographies")
+    chosen = np.unique(np.linspace(0, len(true) - 1, FIT_FRAMES).round().astype(int))
+    frame = corners(frame_shape)
+    from_points, to_points = apply(estimated[chosen], frame), apply(true[chosen], frame)
+    to_frame = np.linalg.inv(true[chosen])
+    condition, target_condition = _conditioning(from_points), _conditioning(to_points)
+    start = _direct_linear(apply(condition, from_points), apply(target_condition, to_points))
+    left = np.linalg.inv(target_condition) @ start
+
+    def plane(p: FloatArray) -> Homography:
+        # Steps from the linear solution in conditioned coordinates: all eight have the same scale.
+        return left @ from_parameters(p) @ condition
+
+    def residuals(p: FloatArray) -> FloatArray:
+        missed = apply(to_frame @ plane(p), from_points) - frame
+        return np.nan_to_num(missed, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
+
+    fit = least_squares(residuals, np.zeros(8), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    return normalised(plane(fit.x))
+
+
+def _conditioning(points: FloatArray) -> Homography:
+    """Return the similarity that moves points to the origin and scales them to a mean distance of sqrt(2) (Hartley 1997)."""
+    flat = points.reshape(-1, 2)
+    centre = flat.mean(axis=0)
+    scale = np.sqrt(2) / np.linalg.norm(flat - centre, axis=1).mean()
+    return np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]])
+
+
+def _direct_linear(source: FloatArray, target: FloatArray) -> Homography:
+    """Return the homography of the direct linear transform: the right singular vector of `target x (H source) = 0`."""
+    x, y = source.reshape(-1, 2).T
+    u, v = target.reshape(-1, 2).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    equations = [
+        np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
+        np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
+        np.zeros((1, 9)),  # so that the eight equations of a single frame have nine singular vectors, too
+    ]
+    solution: FloatArray = np.linalg.svd(np.concatenate(equations), full_matrices=False)[2][-1].reshape(3, 3)
+    return solution

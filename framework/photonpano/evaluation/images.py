@@ -1,0 +1,121 @@
+"""Scores of a panorama against the true scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry import apply
+from photonpano.photometry import linear_to_srgb
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Canvas
+    from photonpano.values import BoolArray, FluxImage, Homography
+
+WHITE_QUANTILE = 0.999
+"""The quantile of the true scene that becomes white: the brightest pixel alone may be a lamp that darkens all others."""
+
+MIN_COVERAGE = 0.05
+"""A pixel is compared if it was seen in at least this share of the median coverage of the pixels that were seen."""
+
+_SSIM_SIGMA = 1.5
+_SSIM_RADIUS = 5
+_ROWS = 256
+"""The true scene is sampled so many rows at a time, which bounds the memory of the coordinates."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageScore:
+    """How like the truth an image is, in sRGB from 0 to 1, over the pixels that are compared.
+
+    Attributes:
+        psnr_db: peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images.
+        ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window
+            is compared; NaN if there is none.
+        compared_share: share of the pixels of the image that are compared, 0 to 1.
+    """
+
+    psnr_db: float
+    ssim: float
+    compared_share: float
+
+
+def covered(weight: FluxImage) -> BoolArray:
+    """Tell which pixels were seen in enough frames to be compared: see `MIN_COVERAGE`.
+
+    Args:
+        weight: (H, W), how many frames each pixel was seen in.
+    """
+    seen = weight > 0
+    if not seen.any():
+        return seen
+    return np.asarray(weight >= MIN_COVERAGE * np.median(weight[seen])) & seen
+
+
+def white_flux(scene: FluxImage) -> float:
+    """Return the flux that becomes white when images are compared: see `WHITE_QUANTILE`.
+
+    Args:
+        scene: (H, W), true flux; NaN where unknown.
+    """
+    return float(np.nanquantile(scene, WHITE_QUANTILE))
+
+
+def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, white: float) -> ImageScore:
+    """Compare a panorama with the truth.
+
+    Args:
+        panorama: (H, W), flux.
+        truth: (H, W), true flux on the same pixels.
+        compared: (H, W), the pixels to compare; those where either image is not finite are left out.
+        white: the flux that becomes 1 in sRGB, such as `white_flux` of the true scene. What is brighter is clipped to it.
+
+    Raises:
+        ValueError: no pixel is compared, or white is not positive.
+    """
+    import cv2
+    from skimage.metrics import structural_similarity
+
+    if not white > 0:
+        raise ValueError(f"white must be a positive flux, got {white}")
+    compared = compared & np.isfinite(panorama) & np.isfinite(truth)
+    if not compared.any():
+        raise ValueError("no pixel is compared")
+    first, second = (np.where(compared, linear_to_srgb(image / white), np.float32(0)) for image in (panorama, truth))
+    squared = np.square(first[compared] - second[compared], dtype=np.float64).mean()
+    # Filled pixels would enter the windows at the border of what is compared, and beyond the border of the image is nothing.
+    window = np.ones((2 * _SSIM_RADIUS + 1,) * 2, dtype=np.uint8)
+    whole = cv2.erode(compared.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)).astype(bool)
+    ssim = np.nan
+    if whole.any():
+        _, similarity = structural_similarity(  # type: ignore[no-untyped-call]
+            first, second, data_range=1.0, gaussian_weights=True, sigma=_SSIM_SIGMA, use_sample_covariance=False, full=True
+        )
+        ssim = float(similarity[whole].mean(dtype=np.float64))
+    with np.errstate(divide="ignore"):
+        psnr = float(-10 * np.log10(squared))
+    return ImageScore(psnr_db=psnr, ssim=ssim, compared_share=float(compared.mean()))
+
+
+def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> FluxImage:
+    """Return the true scene on the canvas of a panorama, interpolated linearly; NaN outside the scene.
+
+    Args:
+        scene: (H, W), true flux on the true plane.
+        canvas: the pixel grid of the panorama, whose transform maps the estimated reference plane to it.
+        alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
+    """
+    from scipy.ndimage import map_coordinates
+
+    to_scene = alignment @ np.linalg.inv(canvas.transform)
+    image = np.empty(canvas.shape, dtype=np.float32)
+    columns = np.arange(canvas.width)
+    for top in range(0, canvas.height, _ROWS):
+        rows = np.arange(top, min(top + _ROWS, canvas.height))
+        points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        x, y = apply(to_scene, points).T
+        sampled = map_coordinates(scene, [y, x], order=1, mode="constant", cval=np.nan, output=np.float32)
+        image[rows] = sampled.reshape(len(rows), canvas.width)
+    return image

@@ -1,0 +1,173 @@
+"""What is scored: the files of a run folder, and the truth that the simulator stored beside its capture."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.errors import InputError
+from photonpano.geometry import normalised
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What a simulated capture really shows.
+
+    Attributes:
+        homographies: (T, 3, 3), frame pixels to pixels of the scene.
+        frame_shape: (height, width) of a frame.
+        scene: (H, W) float32, photons per pixel per frame period; None if only the motion is known.
+    """
+
+    homographies: FloatArray
+    frame_shape: tuple[int, int]
+    scene: FluxImage | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunTrajectory:
+    """What `trajectory.npz` of a run folder holds.
+
+    Attributes:
+        homographies: (T, 3, 3), frame pixels to reference pixels.
+        canvas: (3, 3), reference pixels to panorama pixels.
+        frame_shape: (height, width) of a frame.
+        located: (T,), False where a frame lies outside what was located.
+    """
+
+    homographies: FloatArray
+    canvas: Homography
+    frame_shape: tuple[int, int]
+    located: BoolArray
+
+
+def load_truth(path: Path) -> Truth:
+    """Read the truth of a simulated capture.
+
+    Args:
+        path: an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`.
+
+    Raises:
+        InputError: the file is missing, is no such archive, lacks an array, or holds something else under its name.
+    """
+    arrays = _read_archive(path, "a truth, as `photonpano simulate` writes it,", ("homographies", "frame_shape"), ("scene",))
+    scene = arrays.get("scene")
+    if scene is not None and (scene.ndim != 2 or not scene.size):
+        raise InputError(f"{path}: scene must be an image (height, width), got the shape {scene.shape}")
+    return Truth(
+        homographies=_homographies(path, arrays),
+        frame_shape=_frame_shape(path, arrays),
+        scene=None if scene is None else scene.astype(np.float32, copy=False),
+    )
+
+
+def load_run_trajectory(folder: Path) -> RunTrajectory:
+    """Read the trajectory of a run folder.
+
+    Raises:
+        InputError: the folder has none, or the file is damaged.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
+    path = folder / "trajectory.npz"
+    if not path.exists():
+        raise InputError(f"{folder} has no trajectory.npz, so no run finished in it; give the run folder of one that did")
+    arrays = _read_archive(path, "the trajectory of a run", ("homographies", "canvas", "frame_shape", "located"), ())
+    homographies = _homographies(path, arrays)
+    canvas, located = arrays["canvas"], arrays["located"]
+    if canvas.shape != (3, 3):
+        raise InputError(f"{path}: canvas must have the shape (3, 3), got {canvas.shape}")
+    if located.shape != (len(homographies),):
+        raise InputError(f"{path}: located must have a flag for each of {len(homographies)} frames, got {located.shape}")
+    return RunTrajectory(homographies, canvas.astype(np.float64), _frame_shape(path, arrays), located.astype(bool))
+
+
+def load_panorama(folder: Path) -> tuple[FluxImage, FluxImage]:
+    """Read flux and weight, (H, W) each, of the panorama of a run folder.
+
+    Raises:
+        InputError: a file is missing or damaged, or the two differ in size.
+    """
+    flux, weight = (_read_tiff(folder / name) for name in ("panorama.tiff", "coverage.tiff"))
+    if flux.ndim != 2 or flux.shape != weight.shape:
+        raise InputError(
+            f"{folder}: panorama.tiff and coverage.tiff must be images of one size, "
+            f"got the shapes {flux.shape} and {weight.shape}"
+        )
+    return flux, weight
+
+
+def _read_tiff(path: Path) -> FluxImage:
+    import tifffile
+
+    if not path.exists():
+        raise InputError(f"{path} is missing; run the spec again, the folder is incomplete")
+    try:
+        return np.asarray(tifffile.imread(path), dtype=np.float32)
+    except (tifffile.TiffFileError, ValueError, OSError) as error:
+        raise InputError(f"{path} cannot be read as a TIFF image: {error}") from error
+
+
+def _read_archive(path: Path, content: str, required: tuple[str, ...], optional: tuple[str, ...]) -> Mapping[str, NDArray[Any]]:
+    """Read named arrays; a pickle is never loaded."""
+    if not path.is_file():
+        raise InputError(f"{path} does not exist")
+    if not zipfile.is_zipfile(path):
+        raise InputError(f"{path} is not an .npz archive, or it is cut off")
+    with np.load(path, allow_pickle=False) as archive:
+        missing = [name for name in required if name not in archive]
+        if missing:
+            raise InputError(
+                f"{path} lacks {' and '.join(missing)}; {content} holds {', '.join((*required, *optional))}, "
+                f"and this file holds {', '.join(archive.files) or 'nothing'}"
+            )
+        names = (*required, *(name for name in optional if name in archive))
+        return {name: _read_array(path, archive, name) for name in names}
+
+
+def _read_array(path: Path, archive: Mapping[str, Any], name: str) -> NDArray[Any]:
+    try:
+        array = archive[name]
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            raise InputError(
+                f"{path}: {name} holds pickled Python objects, which are never loaded; save plain numbers"
+            ) from error
+        raise InputError(f"{path}: {name} is damaged: {error}") from error
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: {name} is damaged: {error}") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise InputError(f"{path}: {name} does not hold numbers")
+    return array
+
+
+def _homographies(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:
+    homographies = arrays["homographies"]
+    if homographies.ndim != 3 or homographies.shape[1:] != (3, 3) or not len(homographies):
+        raise InputError(f"{path}: homographies must have the shape (frames, 3, 3), got {homographies.shape}")
+    try:
+        homographies = normalised(homographies)
+        np.linalg.inv(homographies)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise InputError(f"{path}: homographies must be finite and invertible") from error
+    return homographies
+
+
+def _frame_shape(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+    shape = arrays["frame_shape"]
+    if shape.shape != (2,) or shape.dtype.kind not in "iu" or shape.min() < 1:
+        raise InputError(f"{path}: frame_shape must be two positive integers (height, width), got {shape.tolist()}")
+    height, width = shape.tolist()
+    return height, width

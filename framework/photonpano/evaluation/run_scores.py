@@ -1,0 +1,109 @@
+"""Scores of a run folder against the truth of its capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from photonpano.errors import InputError
+from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
+from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
+from photonpano.evaluation.trajectory import FrameTrajectory, TrajectoryScore, corner_errors
+from photonpano.geometry import Canvas, inverse, normalised
+
+if TYPE_CHECKING:
+    from photonpano.protocols import Trajectory
+    from photonpano.values import Panorama
+
+
+class Renderer(Protocol):
+    """Renders the capture of a run along another motion, as the run rendered its own."""
+
+    def __call__(self, trajectory: Trajectory, canvas: Canvas) -> Panorama:
+        """Return flux and weight on the canvas."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """What a run scores.
+
+    Attributes:
+        trajectory: corner errors.
+        panorama: the panorama against the true scene; None if the truth has no scene.
+        oracle: the panorama along the true motion, over the same pixels; None if it was not asked for.
+        white_flux: the flux that is white when images are compared, in photons per pixel per frame; None without a scene.
+    """
+
+    trajectory: TrajectoryScore
+    panorama: ImageScore | None = None
+    oracle: ImageScore | None = None
+    white_flux: float | None = None
+
+    @property
+    def below_oracle_db(self) -> float | None:
+        """By how much the PSNR falls short of the oracle's, which is what the errors of the motion cost."""
+        if self.panorama is None or self.oracle is None:
+            return None
+        return self.oracle.psnr_db - self.panorama.psnr_db
+
+
+def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | None = None) -> Evaluation:
+    """Score a run against the truth of its capture.
+
+    Args:
+        run_folder: what `photonpano run` wrote.
+        truth_path: the `truth.npz` that `photonpano simulate` stored beside the capture.
+        render: renders the oracle, the panorama along the true motion; see `run_renderer`. Without it there is none.
+
+    Raises:
+        InputError: a file is missing or damaged, or the run and the truth are not of the same capture.
+    """
+    folder, truth_path = Path(run_folder), Path(truth_path)
+    run = load_run_trajectory(folder)
+    truth = load_truth(truth_path)
+    _check_same_capture(folder, run, truth_path, truth)
+    motion = corner_errors(run.homographies, truth.homographies, run.frame_shape, run.located)
+    if truth.scene is None:
+        return Evaluation(motion)
+
+    white = white_flux(truth.scene)
+    if not white > 0:
+        raise InputError(f"{truth_path}: the scene is dark, so there is nothing to compare the panorama with")
+    flux, weight = load_panorama(folder)
+    canvas = Canvas(flux.shape[0], flux.shape[1], run.canvas)
+    true_image = true_panorama(truth.scene, canvas, motion.alignment)
+    compared = covered(weight) & np.isfinite(true_image)
+    oracle = None
+    if render is not None:
+        true_motion = normalised(inverse(motion.alignment) @ truth.homographies)
+        oracle = render(FrameTrajectory(true_motion), canvas)
+        compared &= covered(oracle.weight)
+    if not compared.any():
+        raise InputError(f"{folder}: the panorama and the true scene have no pixel in common")
+    return Evaluation(
+        trajectory=motion,
+        panorama=image_score(flux, true_image, compared, white),
+        oracle=None if oracle is None else image_score(oracle.flux, true_image, compared, white),
+        white_flux=white,
+    )
+
+
+def _check_same_capture(folder: Path, run: RunTrajectory, truth_path: Path, truth: Truth) -> None:
+    frames, true_frames = len(run.homographies), len(truth.homographies)
+    if frames != true_frames:
+        raise InputError(
+            f"{truth_path} is the truth of {true_frames} frames, but the run in {folder} has {frames}; "
+            "they are not of the same capture"
+        )
+    if run.frame_shape != truth.frame_shape:
+        (height, width), (true_height, true_width) = run.frame_shape, truth.frame_shape
+        raise InputError(
+            f"{truth_path} is the truth of frames of {true_height}x{true_width}, but the run in {folder} has frames of "
+            f"{height}x{width}; they are not of the same capture"
+        )
+    if not run.located.any():
+        raise InputError(f"{folder}: the run located no frame, so there is nothing to score")

@@ -1,0 +1,105 @@
+"""Scores of a trajectory against the true motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.evaluation.alignment import align_planes
+from photonpano.geometry import corner_displacements
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from photonpano.values import BoolArray, FloatArray, Homography
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryScore:
+    """Corner errors of a trajectory after the best alignment of the two planes.
+
+    The error of a frame is the mean over its four corners of the distance, in pixels of the frame, between where the
+    corner is and where the estimate says it is. The figures are over the frames that the run located.
+
+    Attributes:
+        errors_px: (T,) the error of every frame, located or not.
+        located: (T,) the frames that count.
+        alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
+        mean_px: mean error.
+        median_px: median error.
+        p95_px: 95 % of the frames have at most this error.
+        max_px: error of the worst frame.
+        located_share: share of the frames that count, 0 to 1.
+    """
+
+    errors_px: FloatArray
+    located: BoolArray
+    alignment: Homography
+    mean_px: float
+    median_px: float
+    p95_px: float
+    max_px: float
+    located_share: float
+
+
+def corner_errors(
+    estimated: FloatArray, true: FloatArray, frame_shape: tuple[int, int], located: BoolArray | None = None
+) -> TrajectoryScore:
+    """Score a trajectory against the true one.
+
+    Convention:
+        Homographies map pixels of a frame to pixels of a plane; points are (x, y), integers are pixel centres.
+
+    Args:
+        estimated: (T, 3, 3), frame pixels to pixels of the estimated reference plane.
+        true: (T, 3, 3), frame pixels to pixels of the true plane.
+        frame_shape: (height, width) of a frame.
+        located: (T,) the frames that count, and to which the planes are aligned; all by default.
+
+    Raises:
+        ValueError: the trajectories differ in length, or no frame counts.
+    """
+    counted = np.ones(len(true), dtype=bool) if located is None else np.asarray(located, dtype=bool)
+    if not len(estimated) == len(true) == len(counted):
+        raise ValueError(f"{len(estimated)} estimated and {len(true)} true homographies, {len(counted)} flags: give one each")
+    alignment = align_planes(estimated[counted], true[counted], frame_shape)
+    in_frame = np.linalg.inv(true) @ (alignment @ estimated)
+    errors = corner_displacements(in_frame, np.eye(3), frame_shape).mean(axis=-1)
+    counting = errors[counted]
+    return TrajectoryScore(
+        errors_px=errors,
+        located=counted,
+        alignment=alignment,
+        mean_px=float(counting.mean()),
+        median_px=float(np.median(counting)),
+        p95_px=float(np.quantile(counting, 0.95)),
+        max_px=float(counting.max()),
+        located_share=float(counted.mean()),
+    )
+
+
+class FrameTrajectory:
+    """A trajectory that is known at every frame; between frames its parameters are linear, beyond the ends they hold.
+
+    Args:
+        homographies: (T, 3, 3) float64, frame pixels to reference pixels, h33 = 1.
+    """
+
+    def __init__(self, homographies: FloatArray) -> None:
+        self._homographies = np.asarray(homographies, dtype=np.float64)
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants, in frames: (N, 3, 3)."""
+        last = len(self._homographies) - 1
+        instants = np.clip(np.asarray(frame_indices, dtype=np.float64), 0, last)
+        before = np.floor(instants).astype(int)
+        share = (instants - before)[..., None, None]
+        after = np.minimum(before + 1, last)
+        return np.asarray((1 - share) * self._homographies[before] + share * self._homographies[after])
+
+    def located(self, frame_indices: ArrayLike) -> BoolArray:
+        """Tell which of N instants lie between the first and the last frame: (N,)."""
+        instants = np.asarray(frame_indices, dtype=np.float64)
+        return np.asarray((instants >= 0) & (instants <= len(self._homographies) - 1))

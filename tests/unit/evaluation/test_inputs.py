@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from photonpano import InputError
+from photonpano.evaluation import evaluate, load_truth
+
+
+def failure(capture) -> str:
+    with pytest.raises(InputError) as caught:
+        evaluate(capture.folder, capture.truth)
+    return str(caught.value).replace(str(capture.truth), "truth.npz").replace(str(capture.folder), "RUN")
+
+
+def test_no_folder(capture):
+    capture.folder = capture.folder / "nowhere"
+    assert failure(capture) == "RUN is not a folder; give the run folder that `photonpano run` wrote"
+
+
+def test_a_folder_without_a_trajectory(capture):
+    (capture.folder / "trajectory.npz").unlink()
+    assert failure(capture) == "RUN has no trajectory.npz, so no run finished in it; give the run folder of one that did"
+
+
+def test_no_truth(capture):
+    capture.truth.unlink()
+    assert failure(capture) == "truth.npz does not exist"
+
+
+def test_another_number_of_frames(capture):
+    capture.true["homographies"] = capture.true["homographies"][:100]
+    capture.write()
+    assert failure(capture) == (
+        "truth.npz is the truth of 100 frames, but the run in RUN has 120; they are not of the same capture"
+    )
+
+
+def test_another_frame_shape(capture):
+    capture.true["frame_shape"] = np.array([90, 60])
+    capture.write()
+    assert failure(capture) == (
+        "truth.npz is the truth of frames of 90x60, but the run in RUN has frames of 60x90; they are not of the same capture"
+    )
+
+
+def test_missing_arrays(capture):
+    del capture.true["homographies"]
+    capture.write()
+    assert failure(capture) == (
+        "truth.npz lacks homographies; a truth, as `photonpano simulate` writes it, holds homographies, frame_shape, scene, "
+        "and this file holds frame_shape, scene"
+    )
+
+
+def test_an_array_of_pickled_objects(capture):
+    capture.true["homographies"] = np.array([{"a": 1}], dtype=object)
+    capture.write()
+    assert (
+        failure(capture) == "truth.npz: homographies holds pickled Python objects, which are never loaded; save plain numbers"
+    )
+
+
+def test_a_pickle(capture):
+    capture.truth.write_bytes(pickle.dumps({"homographies": 1}))
+    assert failure(capture) == "truth.npz is not an .npz archive, or it is cut off"
+
+
+def test_an_archive_that_is_cut_off(capture):
+    capture.truth.write_bytes(capture.truth.read_bytes()[:-200])
+    assert failure(capture) == "truth.npz is not an .npz archive, or it is cut off"
+
+
+def test_an_archive_with_a_wrong_byte(capture):
+    content = bytearray(capture.truth.read_bytes())
+    content[1000] ^= 0xFF
+    capture.truth.write_bytes(content)
+    assert failure(capture).startswith("truth.npz: homographies is damaged: ")
+
+
+def test_a_single_array_instead_of_an_archive(capture):
+    with capture.truth.open("wb") as file:
+        np.save(file, capture.true["homographies"])
+    assert failure(capture) == "truth.npz is not an .npz archive, or it is cut off"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("homographies", np.eye(3), "homographies must have the shape (frames, 3, 3), got (3, 3)"),
+        ("homographies", np.zeros((120, 3, 3)), "homographies must be finite and invertible"),
+        ("homographies", np.full((120, 3, 3), np.nan), "homographies must be finite and invertible"),
+        ("frame_shape", np.array([60, 90, 1]), "frame_shape must be two positive integers (height, width), got [60, 90, 1]"),
+        ("frame_shape", np.array([60, 0]), "frame_shape must be two positive integers (height, width), got [60, 0]"),
+        ("scene", np.zeros((4, 4, 3)), "scene must be an image (height, width), got the shape (4, 4, 3)"),
+        ("scene", np.array(["a"]), "scene does not hold numbers"),
+        ("scene", np.zeros((4, 4)), "the scene is dark, so there is nothing to compare the panorama with"),
+    ],
+)
+def test_arrays_that_are_not_what_they_should_be(capture, name, value, message):
+    capture.true[name] = value
+    capture.write()
+    assert failure(capture) == f"truth.npz: {message}"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("canvas", np.eye(2), "canvas must have the shape (3, 3), got (2, 2)"),
+        ("located", np.ones(7, bool), "located must have a flag for each of 120 frames, got (7,)"),
+    ],
+)
+def test_a_damaged_run(capture, name, value, message):
+    capture.trajectory[name] = value
+    capture.write()
+    assert failure(capture) == f"RUN/trajectory.npz: {message}"
+
+
+def test_a_run_that_located_nothing(capture):
+    capture.trajectory["located"] = np.zeros(120, bool)
+    capture.write()
+    assert failure(capture) == "RUN: the run located no frame, so there is nothing to score"
+
+
+def test_a_missing_panorama(capture):
+    (capture.folder / "coverage.tiff").unlink()
+    assert failure(capture) == "RUN/coverage.tiff is missing; run the spec again, the folder is incomplete"
+
+
+def test_a_panorama_that_is_no_tiff(capture):
+    (capture.folder / "panorama.tiff").write_bytes(b"not an image")
+    assert failure(capture).startswith("RUN/panorama.tiff cannot be read as a TIFF image: ")
+
+
+def test_coverage_of_another_size(capture):
+    capture.weight = capture.weight[:-1]
+    capture.write()
+    height, width = capture.flux.shape
+    assert failure(capture) == (
+        "RUN: panorama.tiff and coverage.tiff must be images of one size, "
+        f"got the shapes {(height, width)} and {(height - 1, width)}"
+    )
+
+
+def test_a_panorama_without_a_seen_pixel(capture):
+    capture.weight[:] = 0
+    capture.write()
+    assert failure(capture) == "RUN: the panorama and the true scene have no pixel in common"
+
+
+def test_a_truth_is_read_as_it_was_written(capture):
+    truth = load_truth(capture.truth)
+    np.testing.assert_array_equal(truth.homographies, capture.true["homographies"])
+    np.testing.assert_array_equal(truth.scene, capture.true["scene"])
+    assert truth.frame_shape == (60, 90)
