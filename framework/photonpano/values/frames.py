@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from photonpano.errors import InputError
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class FrameSpan:
@@ -79,3 +81,12 @@ class StreamInfo:
     def span(self) -> FrameSpan:
         """All frames."""
         return FrameSpan(0, self.n_frames)
+
+    def require(self, span: FrameSpan) -> None:
+        """Refuse a span that the capture does not hold.
+
+        Raises:
+            InputError: the span reaches beyond the last frame.
+        """
+        if span.stop > self.n_frames:
+            raise InputError(f"{span} were asked for, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")

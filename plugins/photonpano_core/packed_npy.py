@@ -1,0 +1,190 @@
+"""Source `packed-npy`: binary frames in a .npy file, eight pixels to a byte."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from photonpano import Config, InputError, SourceContribution, SpecPath, StreamInfo
+from photonpano.photometry import BinaryResponse, packed_counts
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from photonpano import FrameSpan
+
+
+class PackedNpyConfig(Config):
+    """A capture in one .npy file: uint8 (frames, height, ceil(width / 8)), as `numpy.packbits(cube, axis=-1)` makes it."""
+
+    path: SpecPath = Field(description="the .npy file")
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
+    width: int | None = Field(
+        None, ge=1, description="columns of a frame, in px; needed only where it is not eight times the bytes of a row"
+    )
+    bad_pixels: SpecPath | None = Field(
+        None, description="a bool .npy file of frame size, true for pixels that must not be used, such as hot ones"
+    )
+
+
+class PackedNpySource:
+    """Binary frames of a memory-mapped .npy file.
+
+    Raises:
+        InputError: a file is missing or is not what the config says.
+    """
+
+    def __init__(self, config: PackedNpyConfig) -> None:
+        header, width = _layout(config)
+        n_frames, height, _ = header.shape
+        self.info = StreamInfo(n_frames, height, width, config.frame_rate_hz)
+        self.response = BinaryResponse()
+        self.valid = _valid(config.bad_pixels, self.info.frame_shape)
+        self._packed = np.memmap(config.path, np.uint8, "r", header.offset, header.shape)
+
+    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        return packed_counts(self._packed[span.start : span.stop], self.info.width)
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span: (n, H, W) of zeros and ones."""
+        self.info.require(span)
+        return np.unpackbits(self._packed[span.start : span.stop], axis=-1, count=self.info.width)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        del self._packed
+
+    def __enter__(self) -> PackedNpySource:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+class _Header(NamedTuple):
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+    fortran_order: bool
+    offset: int
+
+
+def _layout(config: PackedNpyConfig) -> tuple[_Header, int]:
+    """Return the header of the capture and the width of its frames, after everything that can be told without its data."""
+    path = config.path
+    header = _header(path)
+    if header.dtype != np.uint8:
+        raise InputError(
+            f"{path} holds {header.dtype} values, not packed uint8; pack frames of zeros and ones with "
+            "numpy.packbits(cube, axis=-1)"
+        )
+    if len(header.shape) == 4:
+        raise InputError(
+            f"{path} has 4 dimensions {header.shape}, as colour captures have; save one channel, such as cube[..., 0]"
+        )
+    if len(header.shape) != 3:
+        raise InputError(
+            f"{path} has the shape {header.shape}; a packed capture has 3 dimensions: frames, height, bytes of a row"
+        )
+    if min(header.shape) < 1:
+        raise InputError(f"{path} is empty: its shape is {header.shape} (frames, height, bytes of a row)")
+    if header.fortran_order:
+        raise InputError(f"{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)")
+    _require_whole(path, header)
+
+    row_bytes = header.shape[2]
+    width = 8 * row_bytes if config.width is None else config.width
+    if -(-width // 8) != row_bytes:
+        remedy = "it seems not to be packed: use numpy.packbits(cube, axis=-1)" if width == row_bytes else "correct the width"
+        raise InputError(
+            f"{path} has rows of {row_bytes} bytes, which hold a width of {8 * row_bytes - 7} to {8 * row_bytes}, not {width}; "
+            + remedy
+        )
+    return header, width
+
+
+def _header(path: Path) -> _Header:
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            # Version 3 differs only for structured types, which no capture has.
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, fortran_order, dtype = read(file)
+            return _Header(shape, dtype, fortran_order, file.tell())
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}; check the path") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name the .npy file in it") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    except Exception as error:  # a damaged header makes numpy's parser raise nearly anything
+        raise InputError(f"{path} is not a .npy file{_guess(path)}") from error
+
+
+def _guess(path: Path) -> str:
+    with path.open("rb") as file:
+        start = file.read(4)
+    if not start:
+        return ": it is empty"
+    if start.startswith(b"\x1f\x8b"):
+        return ": it is compressed with gzip; unpack it with gunzip"
+    if start.startswith(b"PK"):
+        return ": it is an archive; save the array in it with numpy.save"
+    if start.startswith(b"\x93NUM"):
+        return " that can be read: its header is damaged; write it again"
+    return ", by its first bytes; write it with numpy.save"
+
+
+def _require_whole(path: Path, header: _Header) -> None:
+    needed = header.offset + math.prod(header.shape) * header.dtype.itemsize
+    size = path.stat().st_size
+    if size < needed:
+        raise InputError(
+            f"{path} is cut short: its header {header.shape} promises {needed} bytes, the file has {size}; "
+            "copy or record it again"
+        )
+
+
+def _valid(bad_pixels: Path | None, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
+    if bad_pixels is None:
+        valid = np.ones(frame_shape, dtype=np.bool_)
+    else:
+        header = _header(bad_pixels)
+        if header.dtype != np.bool_ or header.shape != frame_shape:
+            raise InputError(
+                f"{bad_pixels} holds {header.dtype} values of shape {header.shape}; bad pixels are bool of the frame's shape "
+                f"{frame_shape}"
+            )
+        _require_whole(bad_pixels, header)
+        valid = ~np.load(bad_pixels, allow_pickle=False)
+        if not valid.any():
+            raise InputError(f"{bad_pixels} marks every pixel as bad; true is for pixels that must not be used")
+    valid.flags.writeable = False
+    return valid
+
+
+def _check(config: PackedNpyConfig) -> Sequence[str]:
+    """Do all but map the data: headers and masks are small."""
+    try:
+        header, width = _layout(config)
+        _valid(config.bad_pixels, (header.shape[1], width))
+    except InputError as error:
+        return (str(error),)
+    return ()
+
+
+PACKED_NPY = SourceContribution(
+    name="packed-npy",
+    summary="Binary frames in a .npy file, eight pixels to a byte as numpy.packbits makes them",
+    config=PackedNpyConfig,
+    build=lambda config, _: PackedNpySource(config),
+    check=_check,
+)

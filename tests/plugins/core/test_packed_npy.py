@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from photonpano import FrameSpan, InputError, SourceContext
+
+if TYPE_CHECKING:
+    from pathlib import Path
+from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig, PackedNpySource
+
+
+def cube(n: int = 40, height: int = 6, width: int = 24, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 2, (n, height, width), dtype=np.uint8)
+
+
+def saved(path: Path, array: np.ndarray, **options: Any) -> Path:
+    np.save(path, array, **options)
+    return path
+
+
+def opened(path: Path, **config: Any) -> PackedNpySource:
+    source = PACKED_NPY.build(PackedNpyConfig(path=path, **config), SourceContext())
+    assert isinstance(source, PackedNpySource)
+    return source
+
+
+@pytest.mark.parametrize("width", [24, 19])
+def test_gives_the_frames_and_their_sums(tmp_path: Path, width: int) -> None:
+    frames = cube(width=width)
+    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=-1))
+    with opened(path, width=width, frame_rate_hz=96800) as source:
+        assert (source.info.n_frames, source.info.frame_shape, source.info.frame_rate_hz) == (40, (6, width), 96800)
+        assert (source.info.kind, source.info.bit_depth) == ("binary", 1)
+        assert source.valid.all()
+        assert source.valid.shape == (6, width)
+        for span in (FrameSpan(0, 40), FrameSpan(7, 8), FrameSpan(13, 40)):
+            np.testing.assert_array_equal(source.frames(span), frames[span.start : span.stop])
+            np.testing.assert_array_equal(source.counts(span), frames[span.start : span.stop].sum(axis=0))
+
+
+def test_the_width_is_that_of_whole_bytes_unless_told(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", np.packbits(cube(width=19), axis=-1))
+    with opened(path) as source:
+        assert source.info.frame_shape == (6, 24)
+
+
+def test_lit_padding_bits_do_not_count(tmp_path: Path) -> None:
+    with opened(saved(tmp_path / "cube.npy", np.full((3, 2, 2), 255, np.uint8)), width=11) as source:
+        np.testing.assert_array_equal(source.counts(FrameSpan(0, 3)), np.full((2, 11), 3))
+        assert source.frames(FrameSpan(0, 3)).shape == (3, 2, 11)
+
+
+def test_many_threads_may_read_at_once(tmp_path: Path) -> None:
+    frames = cube(n=400)
+    start = threading.Barrier(4)
+
+    def read(offset: int) -> bool:
+        start.wait()
+        spans = [FrameSpan(first, first + 50) for first in range(offset, 350, 4)]
+        return all(np.array_equal(source.counts(s), frames[s.start : s.stop].sum(axis=0)) for s in spans)
+
+    with opened(saved(tmp_path / "cube.npy", np.packbits(frames, axis=-1))) as source, ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(read, range(4)))
+
+
+def test_bad_pixels_are_not_valid(tmp_path: Path) -> None:
+    bad = np.zeros((6, 24), dtype=bool)
+    bad[2, 3] = True
+    path = saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))
+    with opened(path, bad_pixels=saved(tmp_path / "bad.npy", bad)) as source:
+        np.testing.assert_array_equal(source.valid, ~bad)
+        with pytest.raises(ValueError, match="read-only"):
+            source.valid[0, 0] = False
+
+
+def test_a_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
+    with opened(saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))) as source:
+        for read in (source.counts, source.frames):
+            with pytest.raises(InputError) as caught:
+                read(FrameSpan(30, 41))
+            assert str(caught.value) == "frames 30 to 40 were asked for, but the capture has 40 frames (0 to 39)"
+
+
+PACKED = np.packbits(cube(), axis=-1)
+
+WRONG_ARRAYS = {
+    "dtype": (
+        cube().astype(bool),
+        "{path} holds bool values, not packed uint8; pack frames of zeros and ones with numpy.packbits(cube, axis=-1)",
+    ),
+    "objects": (
+        np.array([{}], dtype=object),
+        "{path} holds object values, not packed uint8; pack frames of zeros and ones with numpy.packbits(cube, axis=-1)",
+    ),
+    "colour": (
+        np.zeros((4, 6, 3, 3), np.uint8),
+        "{path} has 4 dimensions (4, 6, 3, 3), as colour captures have; save one channel, such as cube[..., 0]",
+    ),
+    "flat": (
+        np.zeros((4, 6), np.uint8),
+        "{path} has the shape (4, 6); a packed capture has 3 dimensions: frames, height, bytes of a row",
+    ),
+    "no frames": (
+        np.zeros((0, 6, 3), np.uint8),
+        "{path} is empty: its shape is (0, 6, 3) (frames, height, bytes of a row)",
+    ),
+    "Fortran order": (
+        np.asfortranarray(PACKED),
+        "{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)",
+    ),
+}
+
+
+def assert_refused(message: str, path: Path, **config: Any) -> None:
+    """The check tells what the build raises."""
+    with pytest.raises(InputError) as caught:
+        opened(path, **config)
+    assert str(caught.value) == message
+    assert list(PACKED_NPY.check(PackedNpyConfig(path=path, **config))) == [message]
+
+
+@pytest.mark.parametrize("case", WRONG_ARRAYS)
+def test_wrong_arrays_are_refused(tmp_path: Path, case: str) -> None:
+    array, message = WRONG_ARRAYS[case]
+    path = saved(tmp_path / "cube.npy", array, allow_pickle=True)
+    assert_refused(message.format(path=path), path)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    assert_refused(f"there is no file {path}; check the path", path)
+    assert_refused(f"{tmp_path} is a folder; name the .npy file in it", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "guess"),
+    [
+        (b"", ": it is empty"),
+        (b"\x1f\x8b\x08\x00 something", ": it is compressed with gzip; unpack it with gunzip"),
+        (b"PK\x03\x04 something", ": it is an archive; save the array in it with numpy.save"),
+        (b"\x93NUMPY\x01\x00\x10\x00{'descr': broken", " that can be read: its header is damaged; write it again"),
+        (bytes(1000), ", by its first bytes; write it with numpy.save"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: bytes, guess: str) -> None:
+    path = tmp_path / "cube.npy"
+    path.write_bytes(content)
+    assert_refused(f"{path} is not a .npy file{guess}", path)
+
+
+def test_a_file_cut_short_is_refused_with_both_sizes(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", PACKED)
+    whole = path.stat().st_size
+    path.write_bytes(path.read_bytes()[:-100])
+    assert_refused(
+        f"{path} is cut short: its header (40, 6, 3) promises {whole} bytes, the file has {whole - 100}; "
+        "copy or record it again",
+        path,
+    )
+
+
+@pytest.mark.parametrize("width", [16, 25])
+def test_a_width_that_does_not_fit_the_rows_is_refused(tmp_path: Path, width: int) -> None:
+    path = saved(tmp_path / "cube.npy", PACKED)
+    assert_refused(
+        f"{path} has rows of 3 bytes, which hold a width of 17 to 24, not {width}; correct the width", path, width=width
+    )
+
+
+def test_frames_that_were_not_packed_are_recognised_by_their_width(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", cube())
+    assert_refused(
+        f"{path} has rows of 24 bytes, which hold a width of 185 to 192, not 24; "
+        "it seems not to be packed: use numpy.packbits(cube, axis=-1)",
+        path,
+        width=24,
+    )
+
+
+def test_masks_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", PACKED)
+    other = saved(tmp_path / "other.npy", np.zeros((6, 23), bool))
+    assert_refused(
+        f"{other} holds bool values of shape (6, 23); bad pixels are bool of the frame's shape (6, 24)", path, bad_pixels=other
+    )
+    every = saved(tmp_path / "every.npy", np.ones((6, 24), bool))
+    assert_refused(f"{every} marks every pixel as bad; true is for pixels that must not be used", path, bad_pixels=every)
+
+
+def test_a_negative_shape_is_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", PACKED)
+    path.write_bytes(path.read_bytes().replace(b"(40, 6, 3)", b"(-4,-6, 3)"))
+    assert_refused(f"{path} is empty: its shape is (-4, -6, 3) (frames, height, bytes of a row)", path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@settings(deadline=None, max_examples=100)
+@given(changes=st.dictionaries(st.integers(0, 127), st.integers(0, 255), min_size=1, max_size=4))
+def test_damaged_headers_raise_nothing_else(folder: Path, changes: dict[int, int]) -> None:
+    path = saved(folder / "cube.npy", PACKED)
+    content = bytearray(path.read_bytes())
+    for place, value in changes.items():
+        content[place] = value
+    path.write_bytes(content)
+    try:
+        with opened(path) as source:
+            source.counts(FrameSpan(0, 1))
+    except InputError:
+        pass
