@@ -1,0 +1,60 @@
+"""Pairs that were not located, grouped so that a hundred alike are one line."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from photonpano.report.record import FailureRecord, LevelRecord
+
+MAX_EXAMPLES = 3
+"""So many pairs of a group are named."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureGroup:
+    """Pairs of one level that failed for the same reason, but for the numbers in it.
+
+    Attributes:
+        level: the level.
+        failures: the pairs, in order.
+    """
+
+    level: int
+    failures: tuple[FailureRecord, ...]
+
+    @property
+    def reason(self) -> str:
+        """The reason of the first pair, with its numbers."""
+        return self.failures[0]["reason"]
+
+    @property
+    def alike(self) -> bool:
+        """Whether all pairs have the very same reason."""
+        return len({failure["reason"] for failure in self.failures}) == 1
+
+    @property
+    def examples(self) -> tuple[FailureRecord, ...]:
+        """The first pairs."""
+        return self.failures[:MAX_EXAMPLES]
+
+    @property
+    def more(self) -> int:
+        """How many pairs are not among the examples."""
+        return len(self.failures) - len(self.examples)
+
+
+def failure_groups(levels: Sequence[LevelRecord]) -> list[FailureGroup]:
+    """Group the failures of each level by reason, the largest groups first."""
+    groups = []
+    for level in levels:
+        alike: dict[str, list[FailureRecord]] = {}
+        for failure in level["failures"]:
+            alike.setdefault(re.sub(r"[-+]?\d+(\.\d+)?", "#", failure["reason"]), []).append(failure)
+        by_size = sorted(alike.values(), key=len, reverse=True)
+        groups += [FailureGroup(level["level"], tuple(failures)) for failures in by_size]
+    return groups

@@ -1,0 +1,235 @@
+"""The figures of the report: inline SVG whose colours the page's style sheet decides, for light, dark and print."""
+
+from __future__ import annotations
+
+import io
+import re
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.geometry import apply, corners
+from photonpano.report.pictures import shrunk
+from photonpano.report.spans import true_spans
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from photonpano.report.record import LevelRecord, PanoramaRecord, RunArrays
+    from photonpano.values import FloatArray, FluxImage
+
+MAX_INSTANTS = 1500
+"""The trajectory is drawn at so many instants at most, evenly spaced."""
+
+WIDTH_IN = 10.0
+MAX_MAP_HEIGHT_IN = 5.0
+MIN_MAP_IN = 0.8
+MAP_PIXELS = 1000
+
+# matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
+INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
+SERIES = ("#010201", "#010202", "#010203", "#010204", "#010205")
+_VARIABLES = {
+    INK: "var(--ink)",
+    MUTED: "var(--muted)",
+    LINE: "var(--line)",
+    PAPER: "var(--paper)",
+    **{colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, start=1)},
+}
+
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "photonpano",
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": INK,
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.7,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "figure.facecolor": "none",
+    "lines.linewidth": 1.5,
+    "lines.solid_capstyle": "round",
+    "lines.solid_joinstyle": "round",
+    "legend.frameon": False,
+}
+
+STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
+
+
+def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
+    """Draw where the centre of the frame is, and how fast it moves, over time."""
+    instants = _instants(len(arrays.homographies))
+    centre = _centre(arrays.frame_shape)
+    path = apply(arrays.homographies[instants], centre)[:, 0] - centre[0]
+    with _figure(WIDTH_IN, 4.6) as figure:
+        position, speed = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for values, name, colour in zip(path.T, ("x", "y"), SERIES, strict=False):
+            position.plot(instants, values, color=colour)
+            end = instants[-1], values[-1]
+            position.annotate(
+                name, end, xytext=(6, 0), textcoords="offset points", va="center", color=colour, fontweight="bold"
+            )
+        position.set_ylabel("frame centre (px)")
+        if len(instants) > 1:
+            steps = np.linalg.norm(np.diff(path, axis=0), axis=1) / np.diff(instants)
+            speed.plot((instants[:-1] + instants[1:]) / 2, steps, color=SERIES[2])
+        speed.set_ylim(bottom=0)
+        speed.set_ylabel("speed (px/frame)")
+        speed.set_xlabel("frame")
+        speed.set_xlim(-0.5, len(arrays.homographies) - 0.5)
+        speed.xaxis.set_major_formatter("{x:,.0f}")
+        for axes in (position, speed):
+            _shade_not_located(axes, arrays)
+        if frame_rate_hz is not None and len(instants) > 1:
+            _add_time_axis(position, len(arrays.homographies), frame_rate_hz)
+        figure.align_ylabels()
+        return _svg(figure, "path-over-time")
+
+
+def path_on_panorama(arrays: RunArrays) -> str:
+    """Draw the way of the frame centre over the panorama, with the outlines of the first, the reference and the last frame."""
+    instants = _instants(len(arrays.homographies))
+    to_canvas = arrays.canvas @ arrays.homographies
+    path = apply(to_canvas[instants], _centre(arrays.frame_shape))[:, 0]
+    height, width = arrays.coverage.shape
+    with _map_figure(height, width) as (figure, axes):
+        picture = shrunk(arrays.preview, MAP_PIXELS)
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=_extent(height, width), alpha=0.55)
+        for index, style in ((arrays.reference, "-"), (0, ":"), (-1, ":")):
+            outline = apply(to_canvas[index], corners(arrays.frame_shape))
+            axes.plot(*np.vstack([outline, outline[:1]]).T, color=INK, linewidth=0.9, linestyle=style)
+        axes.plot(*path.T, color=PAPER, linewidth=3.5)
+        axes.plot(*path.T, color=SERIES[1], linewidth=1.6)
+        for point, name in ((path[0], "first"), (path[-1], "last")):
+            axes.plot(*point, "o", color=SERIES[1], markeredgecolor=PAPER, markersize=7)
+            axes.annotate(name, point, xytext=(0, 9), textcoords="offset points", ha="center", fontweight="bold")
+        return _svg(figure, "path-on-panorama")
+
+
+def coverage_map(coverage: FluxImage) -> str:
+    """Draw in how many frames each pixel of the panorama was seen; what was not seen is grey."""
+    height, width = coverage.shape
+    with _map_figure(height, width, side_in=0.9) as (figure, axes):
+        axes.set_facecolor(LINE)
+        small = shrunk(np.nan_to_num(coverage), MAP_PIXELS)
+        image = axes.imshow(np.ma.masked_less_equal(small, 0), cmap="viridis", vmin=0, extent=_extent(height, width))
+        bar = figure.colorbar(image, ax=axes, fraction=0.15, pad=0.02, shrink=0.9, aspect=14, format="{x:,.0f}")
+        bar.outline.set_visible(False)
+        bar.set_label("frames")
+        return _svg(figure, "coverage")
+
+
+def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) -> str:
+    """Draw the seconds of each stage of each level, and of the panorama."""
+    names = [f"level {level['level']}" for level in levels] + (["panorama"] if panorama else [])
+    with _figure(WIDTH_IN, 0.9 + 0.36 * len(names)) as figure:
+        axes = figure.subplots()
+        ends = np.zeros(len(levels))
+        for (stage, name), colour in zip(STAGE_NAMES.items(), SERIES, strict=False):
+            seconds = np.array([level["seconds"].get(stage, 0.0) for level in levels])
+            axes.barh(names[: len(levels)], seconds, left=ends, height=0.62, color=colour, label=name)
+            ends = ends + seconds
+        totals = ends.tolist()
+        if panorama:
+            axes.barh(["panorama"], panorama["seconds"], height=0.62, color=SERIES[4], label="render")
+            totals.append(panorama["seconds"])
+        for name, total in zip(names, totals, strict=True):
+            axes.annotate(f"{total:.2g}", (total, name), xytext=(5, 0), textcoords="offset points", va="center", color=MUTED)
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", colors=INK)
+        axes.set_xlabel("seconds")
+        figure.legend(loc="outside upper left", ncols=5, handlelength=1, handleheight=1, columnspacing=1.4)
+        return _svg(figure, "stage-times")
+
+
+def _instants(n_frames: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, n_frames - 1, min(n_frames, MAX_INSTANTS)).round().astype(np.int64))
+
+
+def _centre(frame_shape: tuple[int, int]) -> FloatArray:
+    return np.asarray(corners(frame_shape).mean(axis=0, keepdims=True))
+
+
+def _extent(height: int, width: int) -> tuple[float, float, float, float]:
+    """Return the edges of an image in its own pixels, whose centres are integers."""
+    return -0.5, width - 0.5, height - 0.5, -0.5
+
+
+def _shade_not_located(axes: Axes, arrays: RunArrays) -> None:
+    for span in true_spans(~arrays.located):
+        axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)
+
+
+def _add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:
+    """Add the time along the top, in seconds or milliseconds."""
+    factor, unit = (1.0, "s") if n_frames / frame_rate_hz >= 1 else (1e3, "ms")
+    scale = factor / frame_rate_hz
+
+    def to_time(frame: Any) -> Any:
+        return frame * scale
+
+    def to_frame(time: Any) -> Any:
+        return time / scale
+
+    time = axes.secondary_xaxis("top", functions=(to_time, to_frame))
+    time.set_xlabel(f"time ({unit})")
+    time.spines["top"].set_visible(False)
+
+
+@contextmanager
+def _figure(width_in: float, height_in: float) -> Iterator[Figure]:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        yield Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+@contextmanager
+def _map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[Figure, Axes]]:
+    """Lend a figure in the proportions of a panorama, with room for its axes, and for something of `side_in` beside it."""
+    margin_in = 0.9 + side_in
+    map_width = min(WIDTH_IN - margin_in, MAX_MAP_HEIGHT_IN * width / height)
+    size_in = max(map_width, MIN_MAP_IN), max(map_width * height / width, MIN_MAP_IN)
+    with _figure(size_in[0] + margin_in, size_in[1] + 0.55) as figure:
+        axes = figure.subplots()
+        axes.grid(visible=False)
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(height - 0.5, -0.5)
+        axes.set_aspect("equal")
+        axes.locator_params(axis="x", nbins=max(2, min(9, int(map_width))))
+        axes.locator_params(axis="y", nbins=5)
+        for ticks in (axes.xaxis, axes.yaxis):
+            ticks.set_major_formatter("{x:,.0f}")
+        yield figure, axes
+
+
+def _svg(figure: Figure, name: str) -> str:
+    """Return the SVG element alone, with identifiers of its own and the colours of the page."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    # Inside HTML the namespaces are known, and several drawings share one space of identifiers.
+    svg = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg).replace("xlink:href=", "href=")
+    svg = re.sub(r'\b(id="|href="#|url\(#)', rf"\g<1>{name}-", svg)
+    for stand_in, variable in _VARIABLES.items():
+        svg = svg.replace(stand_in, variable)
+    return svg.strip()

@@ -1,0 +1,92 @@
+"""The page: what it says, and in which order."""
+
+from __future__ import annotations
+
+import io
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from photonpano.report import figures, wording
+from photonpano.report.failures import failure_groups
+from photonpano.report.pictures import jpeg_uri, shrunk
+from photonpano.report.spans import true_spans
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from photonpano.report.record import RunArrays, RunRecord
+
+PICTURE_PIXELS = 1600
+"""The longer side of the panorama on the page; the files of the run folder have all pixels."""
+
+MAX_SPANS = 12
+"""So many spans of frames are named."""
+
+
+def render_report(record: RunRecord, arrays: RunArrays | None) -> str:
+    """Return the report of a run as one HTML page that needs no other file, no network and no script.
+
+    Args:
+        record: the content of `run.json`.
+        arrays: what the figures show; None for a run that made no panorama, whose page then has no figures of it.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("photonpano.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for name in ("count", "counted", "duration", "memory", "pixels", "rate", "share", "span"):
+        environment.filters[name] = getattr(wording, name)
+    page: str = environment.get_template("report.html").render(
+        record=record,
+        title=_title(record),
+        created=datetime.fromisoformat(record["created"]).strftime("%d %B %Y, %H:%M %Z").strip(),
+        capture_seconds=_capture_seconds(record),
+        stages=figures.STAGE_NAMES,
+        failures=failure_groups(record["levels"]),
+        spec_yaml=_yaml(record["spec"]),
+        stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
+        **_motion(record, arrays),
+    )
+    return page
+
+
+def _motion(record: RunRecord, arrays: RunArrays | None) -> dict[str, Any]:
+    if arrays is None:
+        return {"picture": None}
+    not_located = true_spans(~arrays.located)
+    return {
+        "picture": jpeg_uri(shrunk(arrays.preview, PICTURE_PIXELS)),
+        "picture_is_smaller": max(arrays.preview.shape) > PICTURE_PIXELS,
+        "path_on_panorama": figures.path_on_panorama(arrays),
+        "path_over_time": figures.path_over_time(arrays, record["source"]["frame_rate_hz"]),
+        "coverage_map": figures.coverage_map(arrays.coverage),
+        "reference": arrays.reference,
+        "n_not_located": int((~arrays.located).sum()),
+        "not_located": not_located[:MAX_SPANS],
+        "more_not_located": len(not_located[MAX_SPANS:]),
+    }
+
+
+def _title(record: RunRecord) -> str:
+    return Path(record["spec_file"]).stem if record["spec_file"] else "A run without a spec file"
+
+
+def _capture_seconds(record: RunRecord) -> float | None:
+    rate = record["source"]["frame_rate_hz"]
+    return None if rate is None else record["source"]["n_frames"] / rate
+
+
+def _yaml(document: Mapping[str, Any]) -> str:
+    from ruamel.yaml import YAML
+
+    yaml = YAML()
+    yaml.width = 100
+    buffer = io.StringIO()
+    yaml.dump(document, buffer)
+    return buffer.getvalue()

@@ -1,0 +1,116 @@
+"""What a report is made from: the content of `run.json`, and the arrays of the run folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypedDict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
+
+
+class SourceRecord(TypedDict):
+    """The capture."""
+
+    n_frames: int
+    height: int
+    width: int
+    frame_rate_hz: float | None
+    kind: str
+
+
+class PluginRecord(TypedDict):
+    """Who provided a stage: the component's name, its distribution and version."""
+
+    stage: str
+    use: str
+    plugin: str
+    version: str
+
+
+class FailureRecord(TypedDict):
+    """A pair that was not located. `moving` and `fixed` are half-open frame spans [start, stop)."""
+
+    moving: Sequence[int]
+    fixed: Sequence[int]
+    reason: str
+
+
+class LevelRecord(TypedDict):
+    """One level.
+
+    `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them. `change_px` is how far the level
+    moved the corners of the frames, None at the first level. `seconds` has an entry for each stage.
+    """
+
+    level: int
+    scale: float
+    groups: int
+    group_frames: int
+    pairs: int
+    located: int
+    failures: Sequence[FailureRecord]
+    change_px: float | None
+    residual_px: float | None
+    seconds: Mapping[str, float]
+
+
+class PanoramaRecord(TypedDict):
+    """The panorama; `coverage_share` is the share of its pixels that was seen, `white_flux` what is white in the PNG."""
+
+    height: int
+    width: int
+    scale: float
+    white_flux: float
+    coverage_share: float
+    seconds: float
+
+
+class RunRecord(TypedDict):
+    """The content of `run.json`. `created` is an ISO 8601 time; `panorama` is None for a run that did not get so far."""
+
+    photonpano: str
+    status: str
+    created: str
+    spec: Mapping[str, Any]
+    spec_file: str | None
+    seed: int
+    source: SourceRecord
+    plugins: Sequence[PluginRecord]
+    libraries: Mapping[str, str]
+    levels: Sequence[LevelRecord]
+    panorama: PanoramaRecord | None
+    warnings: Sequence[str]
+    seconds: float
+    peak_memory_bytes: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunArrays:
+    """The arrays that the figures show.
+
+    Convention:
+        Points are (x, y), integers are pixel centres; homographies map frame pixels to reference pixels.
+
+    Attributes:
+        preview: (H, W) or (H, W, 3) uint8, the panorama as `panorama.png` shows it.
+        coverage: (H, W) float32, how many frames each pixel was seen in.
+        homographies: (T, 3, 3) the trajectory.
+        located: (T,) False where a frame lies outside what was located.
+        canvas: (3, 3), reference pixels to panorama pixels.
+        frame_shape: (height, width) of a frame.
+        reference: the frame whose homography is the identity.
+    """
+
+    preview: NDArray[np.uint8]
+    coverage: FluxImage
+    homographies: FloatArray
+    located: BoolArray
+    canvas: Homography
+    frame_shape: tuple[int, int]
+    reference: int

@@ -1,0 +1,72 @@
+"""Numbers as a reader wants them."""
+
+from __future__ import annotations
+
+
+def count(number: int) -> str:
+    """Write a whole number with a comma at each thousand."""
+    return f"{number:,}"
+
+
+def counted(number: int, singular: str, plural: str | None = None) -> str:
+    """Write a whole number and what it counts."""
+    return f"{count(number)} {singular if number == 1 else plural or singular + 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Write a time with the unit that fits, to three digits."""
+    for limit, factor, unit in ((1e-3, 1e6, "µs"), (1, 1e3, "ms")):
+        if seconds < limit:
+            return f"{_digits(seconds * factor)} {unit}"
+    if seconds < 59.95:
+        return f"{_digits(seconds)} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{count(hours)} h {minutes:02d} min"
+
+
+def rate(hertz: float) -> str:
+    """Write a frame rate with the unit that fits."""
+    for limit, unit in ((1e6, "MHz"), (1e3, "kHz")):
+        if hertz >= limit:
+            return f"{_digits(hertz / limit)} {unit}"
+    return f"{_digits(hertz)} Hz"
+
+
+def memory(size: int) -> str:
+    """Write a number of bytes with the unit that fits."""
+    value = float(size)
+    for unit in ("B", "KiB", "MiB"):
+        if value < 1000:
+            return f"{_digits(value)} {unit}"
+        value /= 1024
+    return f"{_digits(value)} GiB"
+
+
+def pixels(value: float | None) -> str:
+    """Write a distance in pixels; a dash if there is none."""
+    return "\N{EN DASH}" if value is None else f"{value:.2g}" if abs(value) < 0.1 else _digits(value)
+
+
+def share(value: float) -> str:
+    """Write a share as a percentage; only all is 100 %, and only nothing is 0 %."""
+    percent = 100 * value
+    if 99.5 <= percent < 100:
+        return "over 99 %"
+    if 0 < percent < 0.5:
+        return "under 1 %"
+    return f"{percent:.0f} %"
+
+
+def span(start: int, stop: int) -> str:
+    """Write a half-open frame span with its first and its last frame."""
+    return count(start) if stop - start == 1 else f"{count(start)} to {count(stop - 1)}"
+
+
+def _digits(value: float) -> str:
+    """Write three digits, and never a point without need."""
+    decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    text = f"{value:,.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonpano.geometry import canvas_of, normalised, translation
+from photonpano.report import RunArrays
+
+FRAME_SHAPE = (254, 496)
+N_FRAMES = 10_000
+
+
+def make_arrays(n_frames: int = N_FRAMES) -> RunArrays:
+    """Make the arrays of a pan of 750 px with a hand shake, whose first and last frames were not located."""
+    frame = np.arange(n_frames)
+    time = frame / n_frames
+    rng = np.random.default_rng(3)
+    phases = rng.uniform(0, 6.28, (2, 3))
+    shake = [sum(np.sin(40 * (k + 1) * time + p) for k, p in enumerate(phase)) for phase in phases]
+    x = 750 * (time - 0.5) + 2 * shake[0]
+    y = 40 * np.sin(5 * time) + 2 * shake[1]
+    homographies = normalised(np.array([translation(*p) for p in zip(x, y, strict=True)]))
+    homographies[:, 2, 0] = 1e-4 * (time - 0.5)
+    reference = n_frames // 2
+    homographies = normalised(np.linalg.inv(homographies[reference]) @ homographies)
+    canvas = canvas_of(homographies, FRAME_SHAPE, 1.0)
+    columns, rows = np.meshgrid(np.arange(canvas.width), np.arange(canvas.height))
+    picture = 120 + 60 * np.sin(columns / 23) * np.cos(rows / 17) + 40 * ((columns // 64 + rows // 48) % 2)
+    picture += rng.normal(0, 8, picture.shape)
+    coverage = (
+        5000 * np.exp(-(((columns / canvas.width - 0.5) / 0.35) ** 2)) * np.exp(-(((rows / canvas.height - 0.5) / 0.4) ** 6))
+    )
+    coverage[coverage < 60] = 0
+    picture[coverage == 0] = 0
+    located = (frame >= n_frames // 80) & (frame < n_frames - n_frames // 80)
+    return RunArrays(
+        preview=np.clip(picture, 0, 255).astype(np.uint8),
+        coverage=coverage.astype(np.float32),
+        homographies=homographies,
+        located=located,
+        canvas=canvas.transform,
+        frame_shape=FRAME_SHAPE,
+        reference=reference,
+    )
+
+
+def make_record(arrays: RunArrays) -> dict[str, Any]:
+    """Make the record of a run whose second level lost many pairs."""
+    height, width = arrays.coverage.shape
+    failures = [
+        {
+            "moving": [250 * k, 250 * k + 250],
+            "fixed": [250 * k + 125, 250 * k + 375],
+            "reason": f"only {7 + k} of {31 + 3 * k} matches agree with one homography (at least 20 are needed)",
+        }
+        for k in range(9)
+    ]
+    failures.append(
+        {"moving": [9000, 9250], "fixed": [9125, 9375], "reason": "the images overlap by 4% (at least 10% is needed)"}
+    )
+    seconds = {"resample": 0.001, "merge": 2.41, "locate": 9.3, "interpolate": 0.02}
+    levels = [
+        {
+            "level": number,
+            "scale": 1.0,
+            "groups": groups,
+            "group_frames": 250,
+            "pairs": groups - 1,
+            "located": groups - (number == 2),
+            "failures": failures if number == 2 else [],
+            "change_px": change,
+            "residual_px": 0.42 / number,
+            "seconds": {stage: value * groups / 40 for stage, value in seconds.items()},
+        }
+        for number, groups, change in ((1, 40, None), (2, 79, 1.834), (3, 157, 0.0631))
+    ]
+    stages = {
+        "source": {"use": "packed-npy", "with": {"path": "cube.npy", "frame_rate_hz": 96800.0}},
+        "resample": {"use": "midpoint", "with": {"group_size": 250}},
+        "merge": {"use": "photon-mle", "with": {"tolerance_px": 0.5}},
+        "locate": {"use": "opencv-sift", "with": {"ratio": 0.8, "min_inliers": 20}},
+        "interpolate": {"use": "lucas-kanade", "with": {}},
+    }
+    return {
+        "photonpano": "0.1.0",
+        "status": "done",
+        "created": "2026-03-14T15:09:26.535897+00:00",
+        "spec": {
+            "version": 1,
+            **stages,
+            "levels": [{"scale": 0.5}, {}, {}],
+            "graph": {"offsets": [1], "disconnected": "error"},
+            "render": {"scale": 1.0, "reference": "middle"},
+            "output": {"directory": "runs/corridor-pan"},
+            "run": {"seed": 0, "threads": "auto", "memory": "2 GiB"},
+        },
+        "spec_file": "examples/pipelines/corridor-pan.yaml",
+        "seed": 0,
+        "source": {
+            "n_frames": len(arrays.homographies),
+            "height": 254,
+            "width": 496,
+            "frame_rate_hz": 96800.0,
+            "kind": "binary",
+        },
+        "plugins": [
+            {"stage": stage, "use": choice["use"], "plugin": "photonpano", "version": "0.1.0"}
+            for stage, choice in stages.items()
+        ],
+        "libraries": {"numpy": "2.4.6", "opencv-python-headless": "5.0.0.93", "scipy": "1.17.1", "python": "3.11.7"},
+        "levels": levels,
+        "panorama": {
+            "height": height,
+            "width": width,
+            "scale": 1.0,
+            "white_flux": 1.8342,
+            "coverage_share": float((arrays.coverage > 0).mean()),
+            "seconds": 4.18,
+        },
+        "warnings": ["level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it"],
+        "seconds": 83.2,
+        "peak_memory_bytes": 812 * 1024**2,
+    }
+
+
+@pytest.fixture(scope="session")
+def arrays() -> RunArrays:
+    return make_arrays()
+
+
+@pytest.fixture
+def record(arrays: RunArrays) -> dict[str, Any]:
+    return make_record(arrays)

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from photonpano.geometry import translation
+from photonpano.report import figures
+
+
+@pytest.fixture
+def small(arrays):
+    """Return two hundred frames that move 3 px to the right and 1 px down each."""
+    frame = np.arange(200)
+    return replace(
+        arrays,
+        homographies=np.array([translation(3.0 * (t - 100), 1.0 * (t - 100)) for t in frame]),
+        located=frame >= 20,
+        reference=100,
+        preview=np.full((30, 90), 128, np.uint8),
+        coverage=np.ones((30, 90), np.float32),
+    )
+
+
+def lines(svg: str, colour: str) -> list[np.ndarray]:
+    """Return the vertices of the lines of one colour, in points of the drawing."""
+    paths = re.findall(rf'<path d="([^"]*)"[^>]*style="fill: none; stroke: {re.escape(colour)};', svg)
+    return [np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", path), dtype=float) for path in paths]
+
+
+def test_colours_are_left_to_the_page(record, arrays):
+    svgs = [
+        figures.path_over_time(arrays, 96_800.0),
+        figures.path_on_panorama(arrays),
+        figures.coverage_map(arrays.coverage),
+        figures.stage_times(record["levels"], record["panorama"]),
+    ]
+    for svg in svgs:
+        ElementTree.fromstring(svg)
+        assert "#0101" not in svg
+        assert "#0102" not in svg
+        assert not re.search(r"(stroke|fill): #000000", svg)
+        assert "var(--" in svg
+
+
+def test_the_path_is_a_straight_line_at_a_constant_speed(small):
+    svg = figures.path_over_time(small, None)
+    [x], [y], [speed] = (lines(svg, f"var(--series-{number})") for number in (1, 2, 3))
+    slope = (x[-1, 1] - x[0, 1]) / (x[-1, 0] - x[0, 0])
+    assert slope / ((y[-1, 1] - y[0, 1]) / (y[-1, 0] - y[0, 0])) == pytest.approx(3, rel=1e-3)
+    assert np.ptp(speed[:, 1]) < 1e-3
+
+
+def test_long_captures_are_drawn_at_a_bounded_number_of_instants(arrays):
+    svg = figures.path_over_time(arrays, 96_800.0)
+    assert 100 < len(lines(svg, "var(--series-1)")[0]) <= figures.MAX_INSTANTS
+
+
+def test_frames_that_were_not_located_are_shaded(small):
+    shaded = '<path d="[^"]*"[^>]*style="fill: var\\(--muted\\); opacity: 0.18'
+    assert len(re.findall(shaded, figures.path_over_time(small, None))) == 2
+    assert not re.findall(shaded, figures.path_over_time(replace(small, located=np.ones(200, bool)), None))
+
+
+@pytest.mark.parametrize(("rate", "label"), [(1000.0, "time (ms)"), (20.0, "time (s)")])
+def test_time_has_the_unit_that_fits(small, rate, label):
+    assert label in figures.path_over_time(small, rate)
+
+
+def test_a_single_frame_can_be_drawn(small):
+    single = replace(small, homographies=np.eye(3)[None], located=np.ones(1, bool), reference=0)
+    for svg in (figures.path_over_time(single, 100.0), figures.path_on_panorama(single)):
+        ElementTree.fromstring(svg)
+
+
+@pytest.mark.parametrize("shape", [(20, 9000), (3000, 20), (1, 1)])
+def test_panoramas_of_any_proportions_can_be_drawn(small, shape):
+    odd = replace(small, preview=np.zeros(shape, np.uint8), coverage=np.zeros(shape, np.float32))
+    for svg in (figures.path_on_panorama(odd), figures.coverage_map(odd.coverage)):
+        _, _, width, height = map(float, re.search(r'viewBox="([^"]*)"', svg).group(1).split())
+        assert 90 < width <= 721
+        assert 90 < height <= 430
+
+
+def test_bars_are_as_long_as_their_seconds(record):
+    levels, panorama = record["levels"], record["panorama"]
+    svg = figures.stage_times(levels, panorama)
+    bars = {}
+    for colour in ("var(--series-3)", "var(--series-5)"):  # locate, render
+        paths = re.findall(rf'<path d="([^"]*)" [^>]*style="fill: {re.escape(colour)}"', svg)
+        bars[colour] = [np.ptp([float(x) for x in re.findall(r"[ML] ([-\d.]+) ", path)]) for path in paths]
+    located = bars["var(--series-3)"][:3]
+    np.testing.assert_allclose(np.array(located) / located[0], np.array([40, 79, 157]) / 40, rtol=1e-4)
+    assert bars["var(--series-5)"][0] / located[0] == pytest.approx(4.18 / 9.3, rel=1e-4)

@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from photonpano.report import figures, render_report
+
+TIMES = "\N{MULTIPLICATION SIGN}"
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Leave out the figures, whose drawing takes a second, where a test is about the words."""
+    for name in ("path_over_time", "path_on_panorama", "coverage_map", "stage_times"):
+        monkeypatch.setattr(figures, name, lambda *_: "")
+
+
+def text_of(page: str) -> str:
+    """Return what a reader sees, each run of white space as one blank."""
+    body = ElementTree.fromstring(page).find("body")
+    return " ".join(" ".join(body.itertext()).split())
+
+
+def check_self_contained(page: str) -> None:
+    """Fail unless the page is well formed, needs nothing from outside, and gives every element a name of its own."""
+    tree = ElementTree.fromstring(page)
+    references = [value for element in tree.iter() for name, value in element.attrib.items() if name in ("src", "href")]
+    references += re.findall(r"url\(([^)]*)\)", page)
+    assert all(re.match(r"#|data:image/(jpeg|png);base64,", reference) for reference in references), references
+    assert not re.search(r"@import|@font-face", page)
+    assert not {element.tag for element in tree.iter()} & {"script", "link", "iframe", "object", "base"}
+    names = [element.attrib["id"] for element in tree.iter() if "id" in element.attrib]
+    assert len(names) == len(set(names))
+    targets = {reference[1:] for reference in references if reference.startswith("#")}
+    assert targets <= set(names)
+
+
+def test_the_page_needs_nothing_else_and_is_the_same_each_time(record, arrays):
+    page = render_report(record, arrays)
+    assert page == render_report(record, arrays)
+    check_self_contained(page)
+    assert "http" not in page
+    assert page.count("data:image/jpeg") == 1
+    assert page.count("<svg") == 4
+
+
+def test_the_page_says_what_happened(record, arrays, no_figures):
+    text = text_of(render_report(record, arrays))
+    height, width = arrays.coverage.shape
+    for sentence in (
+        "photonpano 0.1.0 done corridor-pan",
+        f"10,000 binary frames of 496 {TIMES} 254 px at 96.8 kHz, 103 ms. 14 March 2026, 15:09 UTC",
+        "level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it",
+        f"The panorama, {width:,} {TIMES} {height} px at scale 1; 99 % of it was seen, "
+        "and 1.83 photons per pixel per frame are white.",
+        "located, last level 157 of 157 groups",
+        "change in the last level 0.063 px",
+        "time 1 min 23 s",
+        "peak memory 812 MiB",
+        "250 frames of 10,000 were not located: 0 to 124; 9,875 to 9,999 (counted from 0; the trajectory is",
+        "the images overlap by 4% (at least 10% is needed)",
+        "9,000 to 9,249 against 9,125 to 9,374",
+        "such as: only 7 of 31 matches agree with one homography (at least 20 are needed)",
+        "and 6 more pairs; all are in run.json",
+        "Seed 0.",
+        "opencv-sift",
+        "opencv-python-headless 5.0.0.93",
+        "From examples/pipelines/corridor-pan.yaml , with all defaults filled in.",
+    ):
+        assert sentence in text
+
+
+def test_each_level_is_a_row(record, arrays, no_figures):
+    tree = ElementTree.fromstring(render_report(record, arrays))
+    [table] = [table for table in tree.iter("table") if table.get("class") == "figures"]
+    rows = [["".join(cell.itertext()) for cell in row] for row in table.find("tbody")]
+    dash = "\N{EN DASH}"
+    assert rows == [
+        ["1", "1", "40", "250", "40", "39", "0", dash, "0.42", "0.00", "2.41", "9.30", "0.02"],
+        ["2", "1", "79", "250", "78", "78", "10", "1.83", "0.21", "0.00", "4.76", "18.37", "0.04"],
+        ["3", "1", "157", "250", "157", "156", "0", "0.063", "0.14", "0.00", "9.46", "36.50", "0.08"],
+    ]
+
+
+def test_the_spec_on_the_page_is_the_spec(record, arrays, no_figures):
+    tree = ElementTree.fromstring(render_report(record, arrays))
+    assert YAML(typ="safe").load("".join(tree.find(".//pre").itertext())) == record["spec"]
+
+
+HOSTILE = '</pre></style><script>alert("1")</script><img src="http://example.org/x.png"/>&amp;'
+
+
+def test_everything_from_outside_is_escaped(record, arrays, no_figures):
+    record["spec_file"] = HOSTILE
+    record["status"] = HOSTILE
+    record["warnings"] = [HOSTILE]
+    record["levels"][1]["failures"][0]["reason"] = HOSTILE
+    record["spec"]["source"]["with"]["path"] = HOSTILE
+    record["plugins"][0]["use"] = HOSTILE
+    record["libraries"][HOSTILE] = HOSTILE
+    page = render_report(record, arrays)
+    check_self_contained(page)
+    assert "<script>" not in page
+    assert text_of(page).count('<script>alert("1")</script>') == 8
+
+
+def test_all_frames_located(record, arrays, no_figures):
+    page = render_report(record, replace(arrays, located=np.ones_like(arrays.located)))
+    assert "All frames were located." in text_of(page)
+    assert "Shaded" not in page
+
+
+def test_many_gaps_are_counted_not_listed(record, arrays, no_figures):
+    located = np.arange(len(arrays.located)) % 100 > 0
+    text = text_of(render_report(record, replace(arrays, located=located)))
+    assert "100 frames of 10,000 were not located: 0; 100; 200;" in text
+    assert "1,000; 1,100 and 88 further spans" in text
+
+
+def test_a_capture_without_a_rate_has_no_time(record, arrays):
+    record["source"]["frame_rate_hz"] = None
+    page = render_report(record, arrays)
+    check_self_contained(page)
+    assert f"10,000 binary frames of 496 {TIMES} 254 px. 14 March" in text_of(page)
+    assert "time (" not in page
+
+
+def test_a_run_without_a_spec_file(record, arrays, no_figures):
+    record["spec_file"] = None
+    text = text_of(render_report(record, arrays))
+    assert "A run without a spec file" in text
+    assert "From " not in text
+
+
+def test_a_large_panorama_is_shown_smaller(record, arrays, no_figures):
+    large = replace(arrays, preview=np.repeat(arrays.preview, 2, axis=1))
+    assert "Shown smaller than it is; panorama.png has all pixels." in text_of(render_report(record, large))
+    assert "Shown smaller" not in render_report(record, arrays)
+
+
+def test_a_failed_run_has_a_page_without_a_panorama(record):
+    record.update(status="failed", panorama=None, levels=record["levels"][:2], warnings=["the graph fell apart"])
+    page = render_report(record, None)
+    check_self_contained(page)
+    text = text_of(page)
+    assert "photonpano 0.1.0 failed corridor-pan" in text
+    assert "located, last level 78 of 79 groups" in text
+    assert "Motion" not in text
+    assert page.count("<svg") == 1
+
+
+def test_a_run_that_failed_at_once_still_has_a_page(record):
+    record.update(status="failed", panorama=None, levels=[], warnings=[])
+    page = render_report(record, None)
+    check_self_contained(page)
+    assert "<svg" not in page
+
+
+def test_the_import_loads_no_heavy_library():
+    heavy = ["cv2", "jinja2", "matplotlib", "ruamel.yaml", "scipy"]
+    code = f"import sys, photonpano.report; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_figures_need_no_pyplot():
+    code = "import sys; from photonpano.report.figures import stage_times; stage_times([], None); print(sorted(sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "matplotlib.figure" in result.stdout
+    assert "matplotlib.pyplot" not in result.stdout

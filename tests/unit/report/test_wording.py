@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photonpano.report import wording
+from photonpano.report.failures import failure_groups
+from photonpano.report.spans import true_spans
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0, "0 µs"),
+        (0.000_25, "250 µs"),
+        (0.1033, "103 ms"),
+        (0.0421, "42.1 ms"),
+        (8.25, "8.25 s"),
+        (59.9, "59.9 s"),
+        (59.96, "1 min 00 s"),
+        (83.2, "1 min 23 s"),
+        (3599.7, "1 h 00 min"),
+        (7380, "2 h 03 min"),
+    ],
+)
+def test_durations(seconds, text):
+    assert wording.duration(seconds) == text
+
+
+@pytest.mark.parametrize(("hertz", "text"), [(96_800, "96.8 kHz"), (500, "500 Hz"), (1.5e6, "1.5 MHz"), (29.97, "30 Hz")])
+def test_rates(hertz, text):
+    assert wording.rate(hertz) == text
+
+
+@pytest.mark.parametrize(
+    ("size", "text"), [(512, "512 B"), (812 * 2**20, "812 MiB"), (1023 * 2**20, "1 GiB"), (3 * 2**29, "1.5 GiB")]
+)
+def test_memory(size, text):
+    assert wording.memory(size) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "\N{EN DASH}"), (0.0, "0"), (0.0631, "0.063"), (1.834, "1.83"), (12.34, "12.3"), (1234.5, "1,234")],
+)
+def test_pixels(value, text):
+    assert wording.pixels(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1, "100 %"), (0.998, "over 99 %"), (0.934, "93 %"), (0.003, "under 1 %"), (0, "0 %")]
+)
+def test_shares(value, text):
+    assert wording.share(value) == text
+
+
+def test_counts_and_spans():
+    assert wording.counted(1, "frame") == "1 frame"
+    assert wording.counted(12_000, "frame") == "12,000 frames"
+    assert wording.span(1000, 2000) == "1,000 to 1,999"
+    assert wording.span(7, 8) == "7"
+
+
+def test_runs_of_set_flags():
+    flags = np.array([True, False, False, True, True, True, False, True])
+    assert [(span.start, span.stop) for span in true_spans(flags)] == [(0, 1), (3, 6), (7, 8)]
+    assert true_spans(np.zeros(5, bool)) == []
+
+
+def failure(start: int, reason: str) -> dict:
+    return {"moving": [start, start + 5], "fixed": [start + 5, start + 10], "reason": reason}
+
+
+def test_failures_are_grouped_by_level_and_reason_but_not_by_the_numbers_in_it():
+    levels = [
+        {"level": 1, "failures": [failure(0, "too dark"), *(failure(k, f"only {k} of -3.5 agree") for k in range(5))]},
+        {"level": 2, "failures": [failure(9, "too dark"), failure(19, "too dark")]},
+    ]
+    groups = failure_groups(levels)
+    assert [(group.level, len(group.failures), group.reason) for group in groups] == [
+        (1, 5, "only 0 of -3.5 agree"),
+        (1, 1, "too dark"),
+        (2, 2, "too dark"),
+    ]
+    assert [group.alike for group in groups] == [False, True, True]
+    assert [group.more for group in groups] == [2, 0, 0]
+    assert [pair["moving"][0] for pair in groups[0].examples] == [0, 1, 2]
