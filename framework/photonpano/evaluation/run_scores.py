@@ -57,7 +57,7 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     Args:
         run_folder: what `photonpano run` wrote.
         truth_path: the `truth.npz` that `photonpano simulate` stored beside the capture.
-        render: renders the oracle, the panorama along the true motion; see `run_renderer`. Without it there is none.
+        render: renders the oracle, the panorama along the true motion; without it there is none.
 
     Raises:
         InputError: a file is missing or damaged, or the run and the truth are not of the same capture.
