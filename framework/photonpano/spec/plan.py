@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         SourceContribution,
     )
     from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
+    from photonpano.spec.tree import Place
 
 ContributionT = TypeVar("ContributionT")
 
@@ -61,6 +62,7 @@ class Plan:
         output: the run folder.
         run: seed, threads, memory.
         document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
+        places: where each value of the spec was written, by its path, for messages that come up later.
     """
 
     source: Choice[SourceContribution[Any]]
@@ -70,3 +72,4 @@ class Plan:
     output: OutputSettings
     run: RunSettings
     document: Mapping[str, Any]
+    places: Mapping[str, Place] = field(default_factory=dict)

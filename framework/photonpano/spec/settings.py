@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import ByteSize, Field
 
 from photonpano.contributions import Config, SpecPath
 
 
+class LevelSettings(Config):
+    """What a level says of itself, beside the stages that it overrides."""
+
+    scale: float = Field(1.0, ge=0.05, le=4, description="pixels of the level's exposures per pixel of a frame")
+
+
 class GraphSettings(Config):
     """Which pairs of exposures are registered, and what happens when too few are located."""
 
-    offsets: tuple[int, ...] = Field(
+    offsets: tuple[Annotated[int, Field(ge=1)], ...] = Field(
         (1,), min_length=1, description="register exposures that are so many places apart in time; 1 is the neighbour"
     )
     disconnected: Literal["error", "largest"] = Field(
@@ -26,7 +32,7 @@ class RenderSettings(Config):
     """The panorama."""
 
     scale: float = Field(1.0, ge=0.05, le=16, description="pixels of the panorama per pixel of the reference frame")
-    reference: Literal["first", "middle", "last"] | int = Field(
+    reference: Literal["first", "middle", "last"] | Annotated[int, Field(ge=0)] = Field(
         "middle", description="the frame whose plane the panorama lies in: first, middle, last, or a frame index"
     )
     tolerance_px: float = Field(
@@ -45,7 +51,9 @@ class RunSettings(Config):
     """How the run uses the machine."""
 
     seed: int = Field(0, ge=0, description="all randomness of the run derives from it")
-    threads: Literal["auto"] | int = Field("auto", description="threads to use; auto takes one for each core")
+    threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = Field(
+        "auto", description="threads to use; auto takes one for each core"
+    )
     memory: ByteSize = Field(
         ByteSize(2 * 1024**3),
         ge=64 * 1024**2,

@@ -1,0 +1,48 @@
+"""The five kinds of components, and what each is called in hooks and in specs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from photonpano.contributions import (
+    Contribution,
+    InterpolatorContribution,
+    LocatorContribution,
+    MergerContribution,
+    ResamplerContribution,
+    SourceContribution,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of component.
+
+    Attributes:
+        name: what a component of this kind is, such as `locator`.
+        section: where a spec chooses it, such as `locate`.
+        hook: the hook that offers it, such as `photonpano_locators`.
+        contribution: the record that the hook yields.
+    """
+
+    name: str
+    section: str
+    hook: str
+    contribution: type[Contribution[Any, Any, Any]]
+
+
+KINDS: Mapping[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("source", "source", "photonpano_sources", SourceContribution),
+        Kind("resampler", "resample", "photonpano_resamplers", ResamplerContribution),
+        Kind("merger", "merge", "photonpano_mergers", MergerContribution),
+        Kind("locator", "locate", "photonpano_locators", LocatorContribution),
+        Kind("interpolator", "interpolate", "photonpano_interpolators", InterpolatorContribution),
+    )
+}
+"""All kinds by name, in the order in which a run needs them."""

@@ -1,0 +1,34 @@
+"""What to offer to somebody who mistyped a name."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+def listed(words: Iterable[str], last: str = "and") -> str:
+    """Join words as a sentence does: `a, b and c`."""
+    words = list(words)
+    return f" {last} ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Complete "there is no such name": the nearest of the known names, else all of them.
+
+    Case, and the choice between hyphen and underscore, do not count as a difference.
+
+    Returns:
+        `did you mean 'x'?` or `known: x, y and z`; empty if nothing is known.
+    """
+    by_shape = {_shape(each): each for each in sorted(known)}
+    near = difflib.get_close_matches(_shape(name), by_shape, n=3)
+    if near:
+        return f"did you mean {listed((repr(by_shape[shape]) for shape in near), 'or')}?"
+    return f"known: {listed(by_shape.values())}" if by_shape else ""
+
+
+def _shape(name: str) -> str:
+    return name.lower().replace("_", "-")

@@ -1,0 +1,49 @@
+"""Ask the components what is wrong: of the source before it is opened, of the stages once the capture is known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from photonpano.registry.kinds import KINDS
+from photonpano.spec.tree import Place
+
+if TYPE_CHECKING:
+    from photonpano.errors import Problem
+    from photonpano.spec.plan import Choice, Plan
+    from photonpano.values import StreamInfo
+
+STAGES = tuple(kind.section for kind in KINDS.values() if kind.section != "source")
+"""The sections of a spec that choose the components of a level, in the order of the loop."""
+
+
+def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
+    """Check a plan against its capture: every stage of every level, and the frame that the panorama lies in.
+
+    Reads no data. What levels share is checked once.
+
+    Returns:
+        The problems, each at its place in the spec; empty if there are none.
+    """
+    sentences: dict[tuple[str, str], str] = {}
+    for index, (level, written) in enumerate(zip(plan.levels, plan.document["levels"], strict=True)):
+        for stage in STAGES:
+            where = f"levels.{index}.{stage}" if stage in written else stage
+            for sentence in complaints(getattr(level, stage), info):
+                sentences.setdefault((stage, sentence), where)
+    problems = [plan.places.get(where, Place(where)).problem(sentence) for (_, sentence), where in sentences.items()]
+    reference = plan.render.reference
+    if isinstance(reference, int) and reference >= info.n_frames:
+        place = plan.places.get("render.reference", Place("render.reference"))
+        problems.append(place.problem(f"expected a frame of the capture, 0 to {info.n_frames - 1}, got {reference}"))
+    return problems
+
+
+def complaints(choice: Choice[Any], *stream: StreamInfo) -> tuple[str, ...]:
+    """Run the `check` of a component; one that fails is a complaint itself."""
+    contribution = choice.contribution
+    try:
+        found = contribution.check(choice.config, *stream)
+        return (found,) if isinstance(found, str) else tuple(map(str, found))
+    except Exception as error:
+        origin = f"{contribution.kind} {contribution.name!r} of {choice.plugin} {choice.version}"
+        return (f"the check of the {origin} raised {type(error).__name__}: {error}",)

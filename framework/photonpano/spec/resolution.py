@@ -1,0 +1,241 @@
+"""Resolve a spec against a catalog: from values with places to a plan, or to all of its problems."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from photonpano.errors import PluginError, SpecError
+from photonpano.registry.kinds import KINDS
+from photonpano.registry.suggestions import listed
+from photonpano.spec.checks import STAGES, complaints
+from photonpano.spec.plan import Choice, LevelPlan, Plan
+from photonpano.spec.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
+from photonpano.spec.tree import Value, given, joined
+from photonpano.spec.validation import unknown_key, validate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from pydantic import BaseModel
+
+    from photonpano.errors import Problem
+    from photonpano.registry import Catalog, Entry, Kind
+
+VERSION = 1
+LEVELS = 3
+MAX_LEVELS = 10
+DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "opencv-sift", "interpolate": "lucas-kanade"}
+"""The components of a spec that does not choose."""
+KIND_OF = {kind.section: kind for kind in KINDS.values()}
+"""The kind of component that a section chooses."""
+SETTINGS: dict[str, type[BaseModel]] = {
+    "graph": GraphSettings,
+    "render": RenderSettings,
+    "output": OutputSettings,
+    "run": RunSettings,
+}
+"""The framework's own sections."""
+SECTIONS = ("version", *KIND_OF, "levels", *SETTINGS)
+"""All sections of a spec, in the order in which they are written."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Selection:
+    """What a section chooses: found in the catalog or not, its keys, and the choice if all of it is right."""
+
+    entry: Entry | None
+    keys: Value
+    choice: Choice[Any] | None
+
+
+def resolve(root: Value, directory: Path, catalog: Catalog, problems: list[Problem]) -> Plan:
+    """Make the plan of a spec.
+
+    Args:
+        root: the spec.
+        directory: what relative paths count from.
+        catalog: what can be chosen.
+        problems: what reading the spec has found already.
+
+    Raises:
+        SpecError: with these problems and all others, in the order of the file.
+    """
+    unreadable = tuple(f"{where}." for where in root.unreadable())
+    found: list[Problem] = []
+    plan = _Resolver(root, directory, catalog, found).plan()
+    problems += [problem for problem in found if not f"{problem.where}.".startswith(unreadable)]
+    if plan is None or problems:
+        raise SpecError(sorted(dict.fromkeys(problems), key=_order))
+    return plan
+
+
+def _order(problem: Problem) -> tuple[bool, int, int]:
+    """Order by line; what concerns the whole file comes first, what an override brought in comes last."""
+    return problem.file is None and problem.line is None, problem.line or 0, problem.column or 0
+
+
+class _Resolver:
+    """Resolves one spec; every method reports what it finds and goes on."""
+
+    def __init__(self, root: Value, directory: Path, catalog: Catalog, problems: list[Problem]) -> None:
+        self.root = root
+        self.directory = directory
+        self.catalog = catalog
+        self.problems = problems
+
+    def plan(self) -> Plan | None:
+        """Resolve everything; None if there are problems."""
+        written = self.mapping(self.root)
+        if written is None:
+            return None
+        self.known_keys(written, SECTIONS)
+        self.version(written.get("version"))
+        sections = {name: written.get(name) or Value(None, replace(self.root.head, where=name)) for name in SECTIONS}
+        source = self.select("source", sections["source"]).choice
+        if source is not None:
+            self.problems += map(sections["source"].head.problem, complaints(source))
+        stages = {name: self.select(name, sections[name]) for name in STAGES}
+        levels = [self.level(each, stages) for each in self.levels(sections["levels"])]
+        settings: dict[str, Any] = {name: self.validated(model, sections[name]) for name, model in SETTINGS.items()}
+        if source is None or self.problems:
+            return None
+        plan = Plan(source, tuple(filter(None, levels)), **settings, document={}, places=self.root.places())
+        return replace(plan, document=self.document(plan, stages))
+
+    def version(self, value: Value | None) -> None:
+        """Refuse a format that is not ours."""
+        if value is None:
+            self.problems.append(self.root.head.problem(f"required: {VERSION}, the version of the format", "version"))
+        elif type(value.content) is not int or value.content != VERSION:
+            got = given(value.content)
+            self.problems.append(value.place.problem(f"expected {VERSION}, the version of the format, got {got}"))
+
+    def select(self, section: str, value: Value, base: _Selection | None = None) -> _Selection:
+        """Resolve a section that chooses a component.
+
+        Args:
+            section: such as "locate".
+            value: what is written there.
+            base: what a level goes on from: without `use`, it updates the keys of that.
+        """
+        kind = KIND_OF[section]
+        content = self.mapping(value, " such as {use: NAME}")
+        if content is None:
+            return _Selection(None, value, None)
+        here = replace(value.head, where=joined(value.head.where, "with"))
+        keys = content.get("with") or Value({}, here, here)
+        if "use" in content:
+            entry = self.entry(kind, content["use"])
+        elif base is not None:
+            entry, keys = base.entry, _updated(base, keys)
+        elif section in DEFAULTS:
+            entry = self.entry(kind, Value(DEFAULTS[section], value.head))
+        else:
+            known = listed(self.catalog.names(kind.name)) or "none"
+            self.problems.append(value.head.problem(f"required: the name of the {kind.name}; known: {known}", "use"))
+            entry = None
+        self.known_keys(content, ("use", "with"), entry.contribution.config.model_fields if entry else ())
+        return _Selection(entry, keys, self.choice(entry, keys, base) if entry else None)
+
+    def choice(self, entry: Entry, keys: Value, base: _Selection | None) -> Choice[Any] | None:
+        """Validate the keys of a component; what is wrong in the base of a level is not said again."""
+        found: list[Problem] = []
+        try:
+            config = validate(entry.contribution.config, keys, self.directory, found)
+        except Exception as error:
+            origin = f"{entry.kind} {entry.name!r} of {entry.plugin} {entry.version}"
+            found.append(keys.head.problem(f"the config of the {origin} raised {type(error).__name__}: {error}"))
+            config = None
+        if base is not None:
+            said = {(each.where.removeprefix(base.keys.head.where), each.message) for each in self.problems}
+            found = [each for each in found if (each.where.removeprefix(keys.head.where), each.message) not in said]
+        self.problems += found
+        return None if config is None else Choice(entry.contribution, config, entry.plugin, entry.version)
+
+    def entry(self, kind: Kind, use: Value) -> Entry | None:
+        """Look a component up."""
+        if not isinstance(use.content, str):
+            self.problems.append(use.place.problem(f"expected the name of the {kind.name}, got {given(use.content)}"))
+            return None
+        try:
+            entry = self.catalog.find(kind.name, use.content)
+        except PluginError as error:
+            self.problems.append(use.place.problem(str(error)))
+            return None
+        if entry.unavailable:
+            self.problems.append(use.place.problem(entry.unavailable))
+        return entry
+
+    def levels(self, value: Value) -> list[Value]:
+        """Return what is written for each level."""
+        content = LEVELS if value.content is None else value.content
+        if type(content) is int and 1 <= content <= MAX_LEVELS:
+            return [Value({}, value.place)] * content
+        if isinstance(content, list) and 1 <= len(content) <= MAX_LEVELS:
+            return content
+        expected = f"an integer from 1 to {MAX_LEVELS}, or a list with an entry for each level"
+        self.problems.append(value.place.problem(f"expected {expected}, got {given(value.content)}"))
+        return []
+
+    def level(self, value: Value, stages: dict[str, _Selection]) -> LevelPlan | None:
+        """Resolve one level: the stages, as far as it does not say otherwise."""
+        content = self.mapping(value)
+        if content is None:
+            return None
+        own = {key: item for key, item in content.items() if key in LevelSettings.model_fields}
+        self.known_keys(content, (*LevelSettings.model_fields, *STAGES))
+        settings = self.validated(LevelSettings, Value(dict(own), value.place, value.key))
+        selected = {
+            name: self.select(name, content[name], stages[name]) if name in content else stages[name] for name in STAGES
+        }
+        choices: dict[str, Any] = {name: selection.choice for name, selection in selected.items()}
+        return None if settings is None or None in choices.values() else LevelPlan(**choices, scale=settings.scale)
+
+    def document(self, plan: Plan, stages: dict[str, _Selection]) -> dict[str, Any]:
+        """Write a plan down as plain data: every default is filled in, and a level has the stages in which it differs."""
+        chosen: dict[str, Any] = {name: stages[name].choice for name in STAGES}
+        levels = [
+            {"scale": level.scale}
+            | {name: _written(getattr(level, name)) for name in STAGES if getattr(level, name) != chosen[name]}
+            for level in plan.levels
+        ]
+        return {
+            "version": VERSION,
+            "source": _written(plan.source),
+            **{name: _written(choice) for name, choice in chosen.items()},
+            "levels": levels,
+            **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
+        }
+
+    def mapping(self, value: Value, example: str = "") -> dict[str, Value] | None:
+        """Return the keys of a section; null counts as an empty one, and None is returned for anything else."""
+        if value.content is None:
+            return {}
+        if isinstance(value.content, dict):
+            return value.content
+        self.problems.append(value.place.problem(f"expected a mapping{example}, got {given(value.content)}"))
+        return None
+
+    def known_keys(self, content: dict[str, Value], known: Iterable[str], config: Iterable[str] = ()) -> None:
+        """Report unknown keys; those of the component's config belong one storey down."""
+        for key, value in content.items():
+            if key not in known:
+                message = "unknown key; it belongs under `with`" if key in config else unknown_key(key, known)
+                self.problems.append(value.head.problem(message))
+
+    def validated(self, model: type[BaseModel], value: Value) -> Any:
+        """Validate a section; None if it has problems."""
+        return validate(model, value, self.directory, self.problems)
+
+
+def _updated(base: _Selection, keys: Value) -> Value:
+    """Lay keys over those of the base."""
+    if not isinstance(keys.content, dict) or not isinstance(base.keys.content, dict):
+        return base.keys if keys.content is None else keys
+    return Value(base.keys.content | keys.content, keys.place, keys.key)
+
+
+def _written(choice: Choice[Any]) -> dict[str, Any]:
+    return {"use": choice.contribution.name, "with": choice.config.model_dump(mode="json", by_alias=True)}

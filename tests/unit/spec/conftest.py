@@ -1,0 +1,116 @@
+"""A catalog of toys that stand in for the first-party components, so that these tests need no plugin."""
+
+from typing import Literal
+
+import pytest
+from photonpano import (
+    Config,
+    InterpolatorContribution,
+    LocatorContribution,
+    MergerContribution,
+    Requirement,
+    ResamplerContribution,
+    SourceContribution,
+    SpecPath,
+)
+from photonpano.registry import Catalog
+from photonpano.registry.catalog import make_entry
+from pydantic import Field, model_validator
+
+
+class PackedNpyConfig(Config):
+    path: SpecPath = Field(description="the capture")
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames a second")
+
+
+class Flip(Config):
+    rows: bool = Field(False, description="upside down")
+
+
+class SimulatorConfig(Config):
+    frames: int = Field(1000, ge=1, le=10_000_000, description="number of frames")
+    flux: float = Field(0.5, gt=0, le=100, description="photons per pixel and frame")
+    camera: Literal["pan", "loop"] = Field("pan", description="the path of the camera")
+    size: tuple[int, int] = Field((254, 496), description="height and width in px")
+    flip: Flip = Field(Flip(), description="turned frames")
+
+
+class MidpointConfig(Config):
+    group_size: int = Field(500, ge=1, description="frames of a group")
+    stride: int = Field(1, ge=1, description="frames between groups")
+
+    @model_validator(mode="after")
+    def stride_within_group(self) -> "MidpointConfig":
+        if self.stride > self.group_size:
+            raise ValueError(f"stride ({self.stride}) must not exceed group_size ({self.group_size})")
+        return self
+
+
+class PhotonMleConfig(Config):
+    kernel: Literal["linear", "cubic"] = Field("linear", description="how frames are warped")
+
+
+class SiftConfig(Config):
+    ratio: float = Field(0.8, gt=0, lt=1, description="of the nearest to the second match")
+    max_keypoints: int = Field(4000, ge=10, description="the strongest are kept")
+
+
+class DirectConfig(Config):
+    max_steps: int = Field(30, ge=1, description="of the optimisation")
+
+
+class LoftrConfig(Config):
+    weights: SpecPath = Field(description="a local file")
+
+
+class LucasKanadeConfig(Config):
+    hold_frames: float = Field(0, ge=0, description="how long the velocity is held, in frames")
+
+
+class MoodyConfig(Config):
+    mood: str = ""
+
+    @model_validator(mode="after")
+    def raises(self) -> "MoodyConfig":
+        raise RuntimeError("not today")
+
+
+def unbuilt(config, context):
+    raise AssertionError("nothing is built while a spec is read")
+
+
+def missing_file(config):
+    return [] if config.path.exists() else [f"there is no file {config.path.name}"]
+
+
+def too_few_frames(config, info):
+    if config.group_size > info.n_frames:
+        return [f"a group of {config.group_size} frames does not fit into the capture, which has {info.n_frames}"]
+    return []
+
+
+CONTRIBUTIONS = [
+    SourceContribution(name="packed-npy", summary="Toy", config=PackedNpyConfig, build=unbuilt, check=missing_file),
+    SourceContribution(name="simulator", summary="Toy", config=SimulatorConfig, build=unbuilt),
+    ResamplerContribution(name="midpoint", summary="Toy", config=MidpointConfig, build=unbuilt, check=too_few_frames),
+    MergerContribution(name="photon-mle", summary="Toy", config=PhotonMleConfig, build=unbuilt),
+    LocatorContribution(name="opencv-sift", summary="Toy", config=SiftConfig, build=unbuilt),
+    LocatorContribution(name="direct", summary="Toy", config=DirectConfig, build=unbuilt),
+    LocatorContribution(
+        name="kornia-loftr",
+        summary="Toy",
+        config=LoftrConfig,
+        build=unbuilt,
+        requires=(Requirement("no_such_library", "photonpano[kornia]"),),
+    ),
+    LocatorContribution(name="moody", summary="Toy", config=MoodyConfig, build=unbuilt),
+    InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
+]
+TWICE = LocatorContribution(name="twice", summary="Toy", config=DirectConfig, build=unbuilt)
+
+
+@pytest.fixture(scope="session")
+def catalog() -> Catalog:
+    rows = [make_entry(each, "photonpano", "0.1.0", "toys = toys.hooks") for each in CONTRIBUTIONS]
+    rows += [make_entry(TWICE, plugin, "2.0", f"{plugin} = {plugin}.hooks") for plugin in ("alpha", "beta")]
+    return Catalog(tuple(rows))
