@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from photonpano.spec.plan import Plan
 
 
+MAX_BYTES = 2**20
+"""No spec is as long as this; a capture that is given by mistake is."""
+
+
 def load_spec(
     path: str | Path,
     overrides: Sequence[str] = (),
@@ -68,7 +72,8 @@ def parse_spec(
 
 def _read(path: Path) -> str:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         problem = Problem("", "there is no such file", path)
     except IsADirectoryError:
@@ -77,7 +82,10 @@ def _read(path: Path) -> str:
         problem = Problem("", f"cannot be read: {error.strerror}", path)
     else:
         try:
-            return data.decode("utf-8-sig")
+            text = data.decode("utf-8-sig")
+            if len(data) <= MAX_BYTES:
+                return text
+            problem = Problem("", f"no spec: longer than {MAX_BYTES} bytes", path)
         except UnicodeDecodeError as error:
             start = data.rfind(b"\n", 0, error.start) + 1
             line = data.count(b"\n", 0, error.start) + 1

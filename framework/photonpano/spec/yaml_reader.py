@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
-MAX_VALUES = 100_000
+MAX_VALUES = 20_000
 """Aliases of aliases multiply; no spec is as long as this."""
 
 

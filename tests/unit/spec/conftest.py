@@ -3,6 +3,8 @@
 from typing import Literal
 
 import pytest
+from pydantic import Field, model_validator
+
 from photonpano import (
     Config,
     InterpolatorContribution,
@@ -15,7 +17,6 @@ from photonpano import (
 )
 from photonpano.registry import Catalog
 from photonpano.registry.catalog import make_entry
-from pydantic import Field, model_validator
 
 
 class PackedNpyConfig(Config):

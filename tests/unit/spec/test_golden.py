@@ -4,9 +4,10 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from ruamel.yaml import YAML, YAMLError
+
 from photonpano import SpecError
 from photonpano.spec import json_schema, load_spec, parse_spec
-from ruamel.yaml import YAML, YAMLError
 
 SPECS = Path(__file__).parents[2] / "specs"
 GOOD = sorted((SPECS / "good").glob("*.yaml"))

@@ -1,0 +1,61 @@
+"""What editors are told."""
+
+import jsonschema
+import pytest
+from pydantic import Field
+
+from photonpano import Config, MergerContribution
+from photonpano.registry import Catalog
+from photonpano.spec import json_schema
+
+SPEC = {"version": 1, "source": {"use": "simulator"}}
+
+
+class Odd:
+    """A type of which pydantic knows nothing."""
+
+
+class OddConfig(Config):
+    model_config = {"arbitrary_types_allowed": True}
+
+    odd: Odd | None = Field(None, description="no JSON Schema can say this")
+    even: int = Field(0, multiple_of=2)
+
+
+ODD = MergerContribution(name="odd", summary="Toy", config=OddConfig, build=lambda *_: None)
+
+
+def is_valid(spec, catalog):
+    return jsonschema.Draft202012Validator(json_schema(catalog)).is_valid(spec)
+
+
+@pytest.mark.parametrize(
+    ("change", "valid"),
+    [
+        ({}, True),
+        ({"locate": {"with": {"ratio": 0.5}}}, True),
+        ({"locate": {"with": {"max_steps": 5}}}, False),
+        ({"locate": {"use": "direct", "with": {"max_steps": 5}}}, True),
+        ({"locate": {"use": "direct", "with": {"ratio": 0.5}}}, False),
+        ({"locate": {"use": "kornia-loftr"}}, False),
+        ({"locate": {"use": "twice"}}, False),
+        ({"levels": [{"locate": {"with": {"max_steps": 5}}}]}, True),
+        ({"levels": [{"locate": {"use": "opencv-sift", "with": {"max_steps": 5}}}]}, False),
+        ({"levels": [{"source": {"use": "simulator"}}]}, False),
+        ({"output": {}}, True),
+        ({"source": {"with": {"flux": 1}}}, False),
+    ],
+)
+def test_schema_binds_the_keys_to_the_component(change, valid, catalog):
+    assert is_valid(SPEC | change, catalog) == valid
+
+
+def test_field_that_no_schema_can_express_leaves_the_rest_checked(catalog):
+    catalog = Catalog(catalog.rows).including(ODD)
+    assert is_valid(SPEC | {"merge": {"use": "odd", "with": {"even": 4}}}, catalog)
+    assert not is_valid(SPEC | {"merge": {"use": "odd", "with": {"even": 3}}}, catalog)
+
+
+def test_schema_of_an_empty_catalog_is_a_schema():
+    jsonschema.Draft202012Validator.check_schema(json_schema(Catalog()))
+    assert not is_valid(SPEC, Catalog())
