@@ -91,4 +91,5 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     if default is not None:
         use["default"] = default
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
-    return {"type": SECTION, "additionalProperties": False, "properties": keys, "allOf": bindings}
+    section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
+    return section | {"allOf": bindings} if bindings else section

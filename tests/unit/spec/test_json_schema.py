@@ -2,7 +2,7 @@
 
 import jsonschema
 import pytest
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from photonpano import Config, MergerContribution
 from photonpano.registry import Catalog
@@ -16,7 +16,7 @@ class Odd:
 
 
 class OddConfig(Config):
-    model_config = {"arbitrary_types_allowed": True}
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     odd: Odd | None = Field(None, description="no JSON Schema can say this")
     even: int = Field(0, multiple_of=2)

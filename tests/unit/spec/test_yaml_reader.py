@@ -86,8 +86,6 @@ scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False)
 documents = st.recursive(
     scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3), max_leaves=12
 )
-    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3), max_leaves=12
-)
 
 
 @given(documents)
