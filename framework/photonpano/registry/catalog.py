@@ -151,7 +151,8 @@ class Catalog:
         if hint:
             message += f"; {hint}"
         if self.broken:
-            message += f". Broken plugins may have offered it: {listed(map(str, self.broken))}"
+            stop = " " if message.endswith("?") else ". "
+            message += f"{stop}Broken plugins may have offered it: {listed(map(str, self.broken))}"
         return message
 
 

@@ -10,7 +10,7 @@ from photonpano import hookspecs
 from photonpano.contributions import Contribution
 from photonpano.errors import PluginError
 from photonpano.registry.kinds import KINDS, Kind
-from photonpano.registry.suggestions import suggestion
+from photonpano.registry.suggestions import listed
 
 if TYPE_CHECKING:
     from photonpano.contributions import AnyContribution
@@ -47,7 +47,7 @@ def _check_names(plugin: object, manager: pluggy.PluginManager) -> None:
         if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
             continue
         if name not in hooks:
-            raise PluginError(f"there is no hook {name!r}; {suggestion(name, hooks)}")
+            raise PluginError(f"there is no hook {name!r}; known: {listed(hooks)}")
         if manager.parse_hookimpl_opts(plugin, name) is None:
             raise PluginError(f"{name} is not marked with @photonpano.hookimpl")
 

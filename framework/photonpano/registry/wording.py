@@ -31,9 +31,10 @@ class TolerantJsonSchema(GenerateJsonSchema):
         return {}
 
 
-def config_schema(config: type[BaseModel]) -> dict[str, Any]:
-    """Return the JSON Schema of a config."""
-    return config.model_json_schema(schema_generator=TolerantJsonSchema)
+def config_schema(config: type[BaseModel]) -> Schema:
+    """Return the JSON Schema of a config; what it refers to stands in its `$defs`."""
+    schema = config.model_json_schema(schema_generator=TolerantJsonSchema)
+    return resolved(schema, schema)
 
 
 def subschema(schema: Schema, key: str | int, root: Schema) -> Schema:

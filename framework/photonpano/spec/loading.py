@@ -106,7 +106,8 @@ def _load(
     problems: list[Problem] = []
     root = read_yaml(spec, problems, place) if isinstance(spec, str) else from_data(spec, problems, place)
     if root is None or root.content is None:
-        raise SpecError(problems or [place.problem("the spec is empty; it needs at least `version` and `source`")])
+        start = place if root is None else root.place
+        raise SpecError(problems or [start.problem("the spec is empty; it needs at least `version` and `source`")])
     for override in overrides:
         apply_override(root, override, problems)
     _set_output(root, None if output is None else Path(output).absolute(), Path("runs", name))

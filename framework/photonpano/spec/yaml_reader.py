@@ -173,7 +173,7 @@ class _Reader:
                 case "int":
                     digits = text.replace("_", "")
                     return int(digits, 0 if digits.lstrip("+-")[:2] in ("0x", "0o", "0b") else 10)
-                case "float" if WHOLE.fullmatch(text):
+                case "float" if WHOLE.fullmatch(text) and abs(float(text)) < 2**53:
                     return int(float(text))  # 1e3 frames are as good as 1000
                 case "float":
                     return float(text.replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))

@@ -29,6 +29,7 @@ def read(text):
         ("~", None),
         ("1e3", 1000),
         ("1E+3", 1000),
+        ("1e30", 1e30),
         ("-2e2", -200),
         ("1.0e3", 1000.0),
         ("1e-3", 0.001),
@@ -82,7 +83,8 @@ def test_places_of_values_and_keys():
 
 
 keys = st.text(string.ascii_letters, min_size=1, max_size=5)
-scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text("aé𐀀 1.:#-'\"\n\t", max_size=8)
+texts = st.text("aé𐀀 1.:#-'\"\n\t", max_size=8)
+scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | texts
 documents = st.recursive(
     scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3), max_leaves=12
 )

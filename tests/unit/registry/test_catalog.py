@@ -1,0 +1,97 @@
+"""Looking components up."""
+
+import sys
+from types import ModuleType
+
+import pytest
+
+from photonpano import Config, LocatorContribution, MergerContribution, PluginError, Requirement, hookimpl
+from photonpano.registry import BrokenPlugin, Catalog
+
+
+class Keys(Config):
+    pass
+
+
+def unbuilt(config, context):
+    raise AssertionError
+
+
+def locator(name, *requires):
+    return LocatorContribution(name=name, summary="A toy", config=Keys, build=unbuilt, requires=requires)
+
+
+MERGER = MergerContribution(name="sum", summary="A toy", config=Keys, build=unbuilt)
+KORNIA = Requirement("no_such_kornia", "photonpano[kornia]")
+
+
+@pytest.fixture
+def catalog():
+    return Catalog().including(locator("opencv-sift"), locator("direct"), MERGER)
+
+
+def message(catalog, kind, name):
+    with pytest.raises(PluginError) as caught:
+        catalog.get(kind, name)
+    return str(caught.value)
+
+
+def test_including_contributions_leaves_the_catalog_as_it_was(catalog):
+    extended = catalog.including(locator("phase"))
+    assert extended.names("locator") == ("direct", "opencv-sift", "phase")
+    assert catalog.names("locator") == ("direct", "opencv-sift")
+    entry = extended.get("locator", "phase")
+    assert (entry.plugin, entry.version) == (__name__, "unreleased")
+
+
+def test_including_a_plugin():
+    plugin = ModuleType("my_hooks")
+    plugin.photonpano_mergers = hookimpl(lambda: [MERGER])
+    assert Catalog().including(plugin).get("merger", "sum").contribution is MERGER
+
+
+def test_including_a_broken_plugin_is_an_error():
+    plugin = ModuleType("my_hooks")
+    plugin.photonpano_mergers = lambda: [MERGER]
+    with pytest.raises(PluginError, match=r"^photonpano_mergers is not marked with @photonpano\.hookimpl$"):
+        Catalog().including(plugin)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "expected"),
+    [
+        ("locator", "opencv-sfit", "there is no locator 'opencv-sfit'; did you mean 'opencv-sift'?"),
+        ("locator", "Opencv_Sift", "there is no locator 'Opencv_Sift'; did you mean 'opencv-sift'?"),
+        ("locator", "loftr", "there is no locator 'loftr'; known: direct and opencv-sift"),
+        ("locator", "sum", "there is no locator 'sum'; it is one of the mergers"),
+        ("source", "cube", "there is no source 'cube'"),
+    ],
+)
+def test_unknown_name_says_what_is_near(kind, name, expected, catalog):
+    assert message(catalog, kind, name) == expected
+
+
+def test_unknown_name_of_a_catalog_with_broken_plugins():
+    broken = (BrokenPlugin("a", "1", "a = a.hooks", "ImportError: x"), BrokenPlugin("b", "2", "b = b.hooks", "ValueError: y"))
+    assert message(Catalog(broken=broken), "source", "cube") == (
+        "there is no source 'cube'. Broken plugins may have offered it: "
+        "a 1 (a = a.hooks): ImportError: x and b 2 (b = b.hooks): ValueError: y"
+    )
+
+
+def test_missing_library_says_how_to_install_it():
+    catalog = Catalog().including(locator("loftr", KORNIA), locator("both", KORNIA, Requirement("no.such.module", "other>=2")))
+    assert message(catalog, "locator", "loftr") == (
+        "the locator 'loftr' needs no_such_kornia, which is not installed: pip install \"photonpano[kornia]\""
+    )
+    assert message(catalog, "locator", "both") == (
+        "the locator 'both' needs no_such_kornia and no.such.module, which are not installed: "
+        'pip install "photonpano[kornia]" "other>=2"'
+    )
+    assert catalog.find("locator", "loftr").missing == (KORNIA,)
+
+
+def test_installed_library_is_found_without_importing_it():
+    assert "this" not in sys.modules
+    assert Catalog().including(locator("zen", Requirement("this", "python"))).get("locator", "zen").unavailable is None
+    assert "this" not in sys.modules

@@ -1,0 +1,123 @@
+"""Plugins as they come: whole, broken, and in each other's way."""
+
+import pytest
+
+from photonpano import PluginError
+from photonpano.registry import BrokenPlugin, discover
+
+GOOD = """
+@hookimpl
+def photonpano_sources():
+    yield source("toy-camera")
+
+@hookimpl
+def photonpano_locators():
+    return [locator("toy-locator"), locator("another")]
+"""
+
+
+def of_toys(rows):
+    """Leave out what is really installed."""
+    return [row for row in rows if row.entry_point.endswith("_hooks")]
+
+
+def test_good_plugin_is_on_offer_with_its_distribution(install):
+    install("alpha", "1.2", GOOD)
+    catalog = discover()
+    rows = [(row.kind, row.name, row.plugin, row.version, row.entry_point) for row in of_toys(catalog.rows)]
+    assert rows == [
+        ("source", "toy-camera", "alpha", "1.2", "alpha = alpha_hooks"),
+        ("locator", "another", "alpha", "1.2", "alpha = alpha_hooks"),
+        ("locator", "toy-locator", "alpha", "1.2", "alpha = alpha_hooks"),
+    ]
+    assert catalog.get("source", "toy-camera").contribution.summary == "A toy"
+    assert of_toys(catalog.broken) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "error"),
+    [
+        ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("def photonpano_sources(:", "SyntaxError: invalid syntax (broken_hooks.py, line 15)"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        (
+            "@hookimpl\ndef photonpano_sources(config): return []",
+            "Plugin 'broken_hooks' for hook 'photonpano_sources' hookimpl definition: photonpano_sources(config) "
+            "Argument(s) {'config'} are declared in the hookimpl but can not be found in the hookspec",
+        ),
+        (
+            "@hookimpl\ndef photonpano_source(): return []",
+            "there is no hook 'photonpano_source'; known: photonpano_sources, photonpano_resamplers, photonpano_mergers, "
+            "photonpano_locators and photonpano_interpolators",
+        ),
+        ("def photonpano_sources(): return []", "photonpano_sources is not marked with @photonpano.hookimpl"),
+        ("@hookimpl\ndef camera(): return []", "unknown hook 'camera' in plugin <module 'broken_hooks' from '{path}'>"),
+        ("@hookimpl\ndef photonpano_sources(): return 1 / 0", "photonpano_sources raised ZeroDivisionError: division by zero"),
+        (
+            "@hookimpl\ndef photonpano_sources():\n    yield source('fine')\n    raise KeyError('late')",
+            "photonpano_sources raised KeyError: 'late'",
+        ),
+        ("@hookimpl\ndef photonpano_sources(): return 3", "photonpano_sources raised TypeError: 'int' object is not iterable"),
+        ("@hookimpl\ndef photonpano_sources(): return ['x']", "photonpano_sources offers 'x', expected a SourceContribution"),
+        (
+            "@hookimpl\ndef photonpano_mergers(): return [locator('lost')]",
+            "photonpano_mergers offers the locator 'lost', expected a MergerContribution",
+        ),
+        (
+            "@hookimpl\ndef photonpano_sources(): return [source('Toy')]",
+            "photonpano_sources raised ValueError: the name of a contribution is kebab-case, such as 'my-source'; got 'Toy'",
+        ),
+        (
+            "@hookimpl\ndef photonpano_sources(): return [source('x', requires=['torch'])]",
+            "AttributeError: 'str' object has no attribute 'module'",
+        ),
+    ],
+)
+def test_broken_plugin_is_a_row_and_harms_no_other(code, error, install, tmp_path):
+    install("alpha", "1.2", GOOD)
+    install("broken", "0.3", code)
+    catalog = discover()
+    error = error.format(path=tmp_path / "broken_hooks.py") if "{path}" in error else error
+    assert of_toys(catalog.broken) == [BrokenPlugin("broken", "0.3", "broken = broken_hooks", error)]
+    assert {row.plugin for row in of_toys(catalog.rows)} == {"alpha"}
+
+
+def test_hook_module_that_is_not_there(install, tmp_path):
+    install("alpha", "1.2", GOOD)
+    (tmp_path / "alpha_hooks.py").unlink()
+    (row,) = of_toys(discover().broken)
+    assert str(row) == "alpha 1.2 (alpha = alpha_hooks): ModuleNotFoundError: No module named 'alpha_hooks'"
+
+
+def test_distribution_without_metadata_is_still_used(install):
+    install("alpha", "1.2", GOOD, metadata=False)
+    assert {(row.plugin, row.version) for row in of_toys(discover().rows)} == {("unknown", "unknown")}
+
+
+def test_one_contribution_instead_of_a_list_will_do(install):
+    install("alpha", "1.2", "@hookimpl\ndef photonpano_sources(): return source('single')")
+    assert discover().get("source", "single").plugin == "alpha"
+
+
+def test_name_of_two_plugins_is_an_error_on_use_alone(install):
+    install("alpha", "1.2", GOOD)
+    install("beta", "2.0", GOOD)
+    catalog = discover()
+    assert len(of_toys(catalog.rows)) == 6
+    with pytest.raises(PluginError) as caught:
+        catalog.get("source", "toy-camera")
+    assert str(caught.value) == (
+        "the source 'toy-camera' is offered by alpha 1.2 (alpha = alpha_hooks) and beta 2.0 (beta = beta_hooks); "
+        "uninstall all but one"
+    )
+
+
+def test_unknown_name_mentions_the_broken_plugins(install):
+    install("alpha", "1.2", GOOD)
+    install("broken", "0.3", "raise RuntimeError('two\\nlines')")
+    with pytest.raises(PluginError) as caught:
+        discover().get("locator", "toy-lokator")
+    assert str(caught.value).endswith(
+        "there is no locator 'toy-lokator'; did you mean 'toy-locator'? "
+        "Broken plugins may have offered it: broken 0.3 (broken = broken_hooks): RuntimeError: two lines"
+    )
