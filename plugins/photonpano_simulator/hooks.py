@@ -1,1 +1,56 @@
 """What this plugin contributes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from photonpano import InputError, SourceContribution, hookimpl
+from photonpano_simulator.config import FilePath, PhotoScene, SimulatorConfig, StreetScene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from photonpano import SourceContext
+    from photonpano_simulator.source import SimulatorSource
+
+_CHECKED_FRAMES = 5000
+"""Frames of a path that are checked before a run: enough to see that it leaves the scene."""
+
+
+def _build(config: SimulatorConfig, context: SourceContext) -> SimulatorSource:
+    from photonpano_simulator.source import SimulatorSource
+
+    return SimulatorSource(config, context)
+
+
+def _check(config: SimulatorConfig) -> Sequence[str]:
+    """Look for missing files, and for a path that leaves the scene where its size is known."""
+    files = [config.sensor.dark_rates, config.sensor.hot_pixels]
+    if isinstance(config.scene, PhotoScene):
+        files.append(config.scene.file)
+    if isinstance(config.path, FilePath):
+        files.append(config.path.file)
+    problems = [f"there is no file {file}; check the path" for file in files if file is not None and not file.is_file()]
+    if isinstance(config.scene, StreetScene) and not isinstance(config.path, FilePath):
+        from photonpano_simulator.paths import camera_path
+
+        # The shake depends on the seed of the run, which is not known yet.
+        still = config.path.model_copy(update={"shake": None})
+        checked = config.model_copy(update={"path": still, "n_frames": min(config.n_frames, _CHECKED_FRAMES)})
+        try:
+            camera_path(checked, (config.scene.height, config.scene.width), seed=0)
+        except InputError as error:
+            problems.append(str(error))
+    return problems
+
+
+@hookimpl
+def photonpano_sources() -> Iterator[SourceContribution[SimulatorConfig]]:
+    """Offer the simulator."""
+    yield SourceContribution(
+        name="simulator",
+        summary="A simulated single-photon camera that turns before a photograph or a street that is built in",
+        config=SimulatorConfig,
+        build=_build,
+        check=_check,
+    )

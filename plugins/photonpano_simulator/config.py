@@ -1,0 +1,151 @@
+"""The config of the simulator: scene, camera path, sensor."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from photonpano import Config, SpecPath
+
+
+class StreetScene(Config):
+    """The scene that is built in: a street of shops, drawn anew for every seed."""
+
+    kind: Literal["street"] = "street"
+    width: int = Field(2048, ge=64, le=16384, description="in px; a wider street has more houses")
+    height: int = Field(1365, ge=64, le=16384, description="in px; a higher street is the same one, larger")
+    seed: int = Field(0, ge=0, description="another seed is another street")
+
+
+class PhotoScene(Config):
+    """A photograph: sRGB of 8 or 16 bits, undone to linear, of which the luminance is kept."""
+
+    kind: Literal["photo"] = "photo"
+    file: SpecPath = Field(description="an image file that OpenCV reads, such as JPEG, PNG or TIFF")
+    width: int | None = Field(
+        None, ge=64, le=16384, description="in px: the photograph is resized to this width; by default as it is"
+    )
+
+
+Frequency = Annotated[float, Field(gt=0, le=1e6)]
+Rate = Annotated[float, Field(gt=0, le=100)]
+Side = Annotated[int, Field(ge=8, le=8192)]
+
+
+class Shake(Config):
+    """The trembling of a hand: along x, along y and as a roll, three sines each, with phases by chance."""
+
+    rms_px: float = Field(1.0, gt=0, le=100, description="root mean square of the displacement along x, and along y, in px")
+    roll_rms_deg: float = Field(0.05, ge=0, le=5, description="root mean square of the roll about the optical axis, in degrees")
+    frequencies_hz: tuple[Frequency, Frequency, Frequency] = Field(
+        (25.0, 90.0, 210.0), description="the three frequencies, in Hz; each carries a third of the power"
+    )
+
+
+class _Path(Config):
+    shake: Shake | None = Field(None, description="a hand's trembling on top; none by default")
+
+
+class _Line(_Path):
+    length_px: float = Field(
+        300.0, gt=0, le=1e6, description="length of the way of the frame's centre over the scene, without the shake, in px"
+    )
+    centre: tuple[float, float] | None = Field(
+        None, description="(x, y) of the middle of the path in the scene, in px; by default the middle of the scene"
+    )
+
+
+class PanPath(_Line):
+    """A straight pan at constant speed."""
+
+    kind: Literal["pan"] = "pan"
+    angle_deg: float = Field(0.0, ge=-360, le=360, description="direction in degrees: 0 is to the right, 90 is down")
+
+
+class ScanPath(_Line):
+    """A raster at constant speed: rows to and fro, joined by half circles; neighbouring rows see the same places again."""
+
+    kind: Literal["scan"] = "scan"
+    rows: int = Field(3, ge=2, le=100, description="number of rows")
+    row_spacing_px: float = Field(100.0, gt=0, le=1e4, description="distance of neighbouring rows, in px")
+
+
+class LoopPath(_Line):
+    """An ellipse at constant speed, once around: the last frame lies where the first does."""
+
+    kind: Literal["loop"] = "loop"
+    aspect: float = Field(2.0, ge=0.1, le=10, description="width of the ellipse divided by its height")
+
+
+class SplinePath(_Line):
+    """A smooth path by chance, whose speed changes on the way."""
+
+    kind: Literal["random-spline"] = "random-spline"
+    knots: int = Field(6, ge=3, le=1000, description="number of points by chance that the spline goes through")
+    seed: int = Field(0, ge=0, description="another seed is another path")
+
+
+class HandShakePath(Config):
+    """A camera that somebody tries to hold still."""
+
+    kind: Literal["hand-shake"] = "hand-shake"
+    shake: Shake = Field(Shake(rms_px=5.0), description="the trembling")
+    centre: tuple[float, float] | None = Field(
+        None, description="(x, y) of the place looked at, in px of the scene; by default the middle of the scene"
+    )
+
+
+class FilePath(_Path):
+    """Homographies from a file."""
+
+    kind: Literal["file"] = "file"
+    file: SpecPath = Field(
+        description="a .npy file (n_frames, 3, 3), or an .npz file with such an array `homographies`: pixels of a frame to "
+        "pixels of the scene; the truth of another simulation is such a file"
+    )
+
+
+class Sensor(Config):
+    """A single-photon camera whose pixels tell whether they detected a photon."""
+
+    quantum_efficiency: float = Field(1.0, gt=0, le=1, description="detected share of the photons that reach a pixel")
+    dark_rate: float = Field(0.0, ge=0, le=100, description="dark counts per pixel per frame period")
+    dark_rates: SpecPath | None = Field(
+        None, description="a .npy file of frame shape: dark counts per frame period of each pixel, on top of dark_rate"
+    )
+    hot_fraction: float = Field(0.0, ge=0, le=1, description="share of the pixels that are hot, placed by chance")
+    hot_pixels: SpecPath | None = Field(
+        None, description="a bool .npy file of frame shape, true for pixels that are hot as well"
+    )
+    hot_rate: tuple[Rate, Rate] = Field(
+        (0.05, 2.0),
+        description="dark counts of a hot pixel per frame period: drawn between these two, evenly on a logarithmic scale",
+    )
+    mask_hot_pixels: bool = Field(False, description="whether the capture says which pixels are hot, so that they are not used")
+
+
+class SimulatorConfig(Config):
+    """A single-photon camera that turns before a scene."""
+
+    scene: Annotated[StreetScene | PhotoScene, Field(discriminator="kind")] = Field(StreetScene(), description="what is seen")
+    path: Annotated[PanPath | ScanPath | LoopPath | SplinePath | HandShakePath | FilePath, Field(discriminator="kind")] = Field(
+        PanPath(), description="where the camera looks"
+    )
+    flux: float = Field(
+        0.5,
+        gt=0,
+        le=1000,
+        description="photons that reach a pixel in a frame period, on average over the whole scene; the sensor detects "
+        "quantum_efficiency times as many",
+    )
+    n_frames: int = Field(2000, ge=1, le=10_000_000, description="number of frames")
+    frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")
+    frame_rate_hz: float = Field(96_800.0, gt=0, le=1e9, description="frames a second, in Hz")
+    focal_length_px: float = Field(
+        4464.0, ge=100, le=1e6, description="focal length of the camera, in px: how strong the perspective of its turning is"
+    )
+    sensor: Sensor = Field(Sensor(), description="the single-photon camera")
+    seed: int | None = Field(
+        None, ge=0, description="photons, hot pixels and shake derive from it; by default the seed of the run"
+    )

@@ -1,0 +1,173 @@
+"""Camera paths: where each frame lies in the scene.
+
+Convention:
+    Points are (x, y), x right, y down; integers are pixel centres; sizes are (height, width). Homographies map pixels of a
+    frame to pixels of the scene, h33 = 1. The camera only turns: a homography is K' R K^-1, where the scene is the image that
+    the same lens makes when it looks straight at the middle of the scene.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano import InputError
+from photonpano.geometry import apply, corners, normalised
+from photonpano_simulator.chance import Draw, generator
+from photonpano_simulator.config import FilePath, HandShakePath, LoopPath, PanPath, ScanPath, SplinePath
+from photonpano_simulator.files import read_homographies
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano_simulator.config import Shake, SimulatorConfig
+
+    FloatArray = NDArray[np.float64]
+
+_DENSE = 100_000
+"""Points of a curve before it is sampled at constant speed: the error is far below a thousandth of a pixel."""
+
+
+def camera_path(config: SimulatorConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
+    """Return the true homographies of all frames: (T, 3, 3), frame pixels to scene pixels.
+
+    Raises:
+        InputError: a frame reaches beyond the scene, or the file of the path cannot be used.
+    """
+    path, focal = config.path, config.focal_length_px
+    frame = _intrinsics(config.frame_shape, focal)
+    if isinstance(path, FilePath):
+        homographies = read_homographies(path.file, config.n_frames)
+    else:
+        middle = _middle(scene_shape)
+        target = middle if path.centre is None else np.asarray(path.centre, dtype=np.float64)
+        turns = _turns(target - middle + _way(path, config.n_frames), focal)
+        homographies = _intrinsics(scene_shape, focal) @ turns @ np.linalg.inv(frame)
+    if path.shake is not None:
+        trembling = _trembling(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
+        homographies = homographies @ frame @ trembling @ np.linalg.inv(frame)
+    homographies = normalised(homographies)
+    _require_inside(homographies, config.frame_shape, scene_shape)
+    return homographies
+
+
+def _way(path: PanPath | ScanPath | LoopPath | SplinePath | HandShakePath, n_frames: int) -> FloatArray:
+    """Return the centres of the frames relative to the middle of the path: (T, 2) px."""
+    match path:
+        case PanPath():
+            angle = np.deg2rad(path.angle_deg)
+            half = path.length_px / 2 * np.array([np.cos(angle), np.sin(angle)])
+            return np.linspace(-half, half, n_frames)
+        case ScanPath():
+            return _at_constant_speed(_raster(path), n_frames)
+        case LoopPath():
+            angles = np.linspace(0, 2 * np.pi, _DENSE)
+            ellipse = np.stack([path.aspect * np.cos(angles), np.sin(angles)], axis=1)
+            return _at_constant_speed(ellipse * (path.length_px / _length(ellipse)), n_frames)
+        case SplinePath():
+            return _spline(path, n_frames)
+        case HandShakePath():
+            return np.zeros((n_frames, 2))
+
+
+def _raster(path: ScanPath) -> FloatArray:
+    """Return points along a raster, dense in its half circles."""
+    radius = path.row_spacing_px / 2
+    row = (path.length_px - (path.rows - 1) * np.pi * radius) / path.rows
+    if row <= 0:
+        raise InputError(
+            f"the path of {path.length_px:g} px is too short for a scan of {path.rows} rows {path.row_spacing_px:g} px apart, "
+            f"whose turns alone take {(path.rows - 1) * np.pi * radius:.0f} px; raise path.length_px, or lower path.rows"
+        )
+    angles = np.linspace(-np.pi / 2, np.pi / 2, _DENSE // path.rows)
+    points = []
+    for index in range(path.rows):
+        side = 1 if index % 2 == 0 else -1
+        y = path.row_spacing_px * (index - (path.rows - 1) / 2)
+        points.append(np.array([[-side * row / 2, y]]))
+        if index < path.rows - 1:
+            points.append(np.stack([side * (row / 2 + radius * np.cos(angles)), y + radius * (1 + np.sin(angles))], axis=1))
+        else:
+            points.append(np.array([[side * row / 2, y]]))
+    return np.concatenate(points)
+
+
+def _spline(path: SplinePath, n_frames: int) -> FloatArray:
+    """Return a cubic spline through points by chance, evenly spaced in time."""
+    from scipy.interpolate import CubicSpline
+
+    knots = generator(path.seed, Draw.PATH).uniform((-1.0, -0.5), (1.0, 0.5), (path.knots, 2))
+    spline = CubicSpline(np.linspace(0, 1, path.knots), knots, bc_type="natural")
+    dense = spline(np.linspace(0, 1, _DENSE))
+    middle = (dense.min(axis=0) + dense.max(axis=0)) / 2
+    return np.asarray((spline(np.linspace(0, 1, n_frames)) - middle) * (path.length_px / _length(dense)))
+
+
+def _length(points: FloatArray) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _at_constant_speed(points: FloatArray, n_frames: int) -> FloatArray:
+    """Sample a curve that is given by dense points at equal distances along it."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    wanted = np.linspace(0, travelled[-1], n_frames)
+    return np.stack([np.interp(wanted, travelled, coordinate) for coordinate in points.T], axis=1)
+
+
+def _middle(shape: tuple[int, int]) -> FloatArray:
+    height, width = shape
+    return np.array([(width - 1) / 2, (height - 1) / 2])
+
+
+def _intrinsics(shape: tuple[int, int], focal: float) -> FloatArray:
+    x, y = _middle(shape)
+    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
+
+
+def _turns(displacements: FloatArray, focal: float) -> FloatArray:
+    """Return rotations, first about x and then about y, that move the centre of the image by (T, 2) px: (T, 3, 3)."""
+    x, y = displacements.T
+    side = np.hypot(x, focal)
+    reach = np.hypot(side, y)
+    sin_yaw, cos_yaw, sin_pitch, cos_pitch = x / side, focal / side, y / reach, side / reach
+    zero = np.zeros_like(x)
+    return _stacked(
+        [
+            [cos_yaw, -sin_yaw * sin_pitch, sin_yaw * cos_pitch],
+            [zero, cos_pitch, sin_pitch],
+            [-sin_yaw, -cos_yaw * sin_pitch, cos_yaw * cos_pitch],
+        ]
+    )
+
+
+def _trembling(shake: Shake, n_frames: int, frame_rate_hz: float, focal: float, rng: np.random.Generator) -> FloatArray:
+    """Return the rotations of a shaking camera: (T, 3, 3)."""
+    phases = rng.uniform(0, 2 * np.pi, (3, len(shake.frequencies_hz), 1))
+    turns = 2 * np.pi * np.asarray(shake.frequencies_hz)[:, None] * np.arange(n_frames) / frame_rate_hz
+    # Sines of amplitude sqrt(2 / n) have together the root mean square 1.
+    x, y, roll = np.sqrt(2 / len(phases[0])) * np.sin(turns + phases).sum(axis=1)
+    roll = np.deg2rad(shake.roll_rms_deg) * roll
+    zero, one = np.zeros(n_frames), np.ones(n_frames)
+    rolls = _stacked([[np.cos(roll), -np.sin(roll), zero], [np.sin(roll), np.cos(roll), zero], [zero, zero, one]])
+    return np.asarray(_turns(shake.rms_px * np.stack([x, y], axis=1), focal) @ rolls)
+
+
+def _stacked(rows: list[list[FloatArray]]) -> FloatArray:
+    """Return (T, 3, 3) from three rows of three arrays (T,)."""
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _require_inside(homographies: FloatArray, frame_shape: tuple[int, int], scene_shape: tuple[int, int]) -> None:
+    points = apply(homographies, corners(frame_shape))
+    height, width = scene_shape
+    beyond = np.stack([-points[..., 0], points[..., 0] - (width - 1), -points[..., 1], points[..., 1] - (height - 1)])
+    worst = beyond.max(axis=2)
+    side = int(worst.max(axis=1).argmax())
+    if worst[side].max() > 1e-6:
+        progress = worst[side].argmax() / max(1, len(homographies) - 1)
+        raise InputError(
+            f"the camera path leaves the scene of {width}x{height} px by {worst[side].max():.1f} px at the "
+            f"{('left', 'right', 'top', 'bottom')[side]}, {progress:.0%} of the way along; "
+            "shorten or move the path, or take a larger scene"
+        )

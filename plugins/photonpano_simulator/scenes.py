@@ -1,0 +1,74 @@
+"""Scenes: the flux of a photograph, or of the street that is built in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano import InputError
+from photonpano.photometry import srgb_to_linear
+from photonpano_simulator.config import PhotoScene, StreetScene
+from photonpano_simulator.street import street
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_LUMINANCE = (0.0722, 0.7152, 0.2126)
+"""Shares of blue, green and red, in the order of OpenCV (IEC 61966-2-1)."""
+_LARGEST = 16384
+"""OpenCV's warps take no image with a side of 32768 px; this is also more than a camera gives."""
+
+
+def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float32]:
+    """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame period, with the mean `flux`.
+
+    Raises:
+        InputError: the photograph cannot be used.
+    """
+    if isinstance(scene, StreetScene):
+        linear = srgb_to_linear(street((scene.height, scene.width), scene.seed))
+    else:
+        linear = _photo(scene.file, scene.width)
+    mean = float(linear.mean(dtype=np.float64))
+    if mean == 0 and isinstance(scene, PhotoScene):
+        raise InputError(f"{scene.file} is black: no flux can be made of it; take another photograph")
+    linear *= np.float32(flux / mean)
+    return linear
+
+
+def _photo(path: Path, width: int | None) -> NDArray[np.float32]:
+    """Return the linear luminance of a photograph, from 0 to 1."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}; check the path") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"{path} is not an image that OpenCV reads; save it as PNG or JPEG")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path} holds {image.dtype} values; a photograph has 8 or 16 bits: save it as PNG")
+    # A table of all grey levels spares the conversion of every pixel.
+    linear_of = srgb_to_linear(np.linspace(0, 1, 256**image.dtype.itemsize, dtype=np.float32))
+    linear = np.zeros(image.shape[:2], np.float32)
+    for channel, share in enumerate(_LUMINANCE):
+        linear += (np.float32(share) * linear_of)[image[..., channel]]
+    if width is not None:
+        height = max(1, round(linear.shape[0] * width / linear.shape[1]))
+        shrinks = width < linear.shape[1]
+        linear = cv2.resize(linear, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR).astype(
+            np.float32
+        )
+    if max(linear.shape) > _LARGEST:
+        raise InputError(
+            f"{path} is {linear.shape[1]}x{linear.shape[0]} px; set scene.width so that no side exceeds {_LARGEST} px"
+        )
+    return linear
