@@ -47,7 +47,7 @@ class PackedNpySource:
         self.info = StreamInfo(n_frames, height, width, config.frame_rate_hz)
         self.response = BinaryResponse()
         self.valid = _valid(config.bad_pixels, self.info.frame_shape)
-        self._packed = np.memmap(config.path, np.uint8, "r", header.offset, header.shape)
+        self._packed: NDArray[np.uint8] = np.memmap(config.path, np.uint8, "r", header.offset, header.shape)
 
     def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
         """Sum the frames of a span: (H, W) uint32."""
@@ -61,7 +61,7 @@ class PackedNpySource:
 
     def close(self) -> None:
         """Let go of the file."""
-        del self._packed
+        self._packed = np.empty((0, 0, 0), np.uint8)
 
     def __enter__(self) -> PackedNpySource:
         return self
