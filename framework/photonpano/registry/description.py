@@ -4,17 +4,33 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from photonpano.registry.kinds import KINDS
-from photonpano.registry.wording import bounds_words, config_schema, expectation, type_words, word
+from photonpano.registry.suggestions import listed
+from photonpano.registry.wording import (
+    alternative,
+    alternatives,
+    bounds_words,
+    config_schema,
+    discriminator,
+    expectation,
+    type_words,
+    word,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from photonpano.contributions import AnyContribution
     from photonpano.registry.wording import Schema
 
 PLAIN_TEXT = re.compile(r"[A-Za-z/][\w./-]*")
+COMPUTED = "computed"
+"""What stands for a default that only the config itself can tell."""
+MAX_DEPTH = 4
+"""A config may contain itself; mappings are described down to here."""
 NOT_PLAIN = {"true", "false", "null", "yes", "no", "on", "off", "y", "n"}
 
 
@@ -23,9 +39,9 @@ class ConfigRow:
     """One key of a config, in words.
 
     Attributes:
-        key: the key under `with`.
+        key: the key under `with`; that of a mapping in a mapping with dots, such as `filter.size`.
         type: such as "integer" or "first, last or number".
-        default: as it is written in YAML; None if the key is required.
+        default: as it is written in YAML, or "computed"; None if the key is required.
         bounds: such as "at least 1"; empty if there are none.
         description: what the key means.
     """
@@ -46,7 +62,7 @@ class Description:
         name: what specs call it.
         summary: one line.
         rows: the keys of its config.
-        snippet: its section of a spec with all defaults, to paste; what is required stands there as `<...>`.
+        snippet: its section of a spec with its defaults, to paste; what is required stands there as `<...>`.
         install: what to pass to `pip install` for the libraries that it needs.
     """
 
@@ -61,35 +77,69 @@ class Description:
 def describe(contribution: AnyContribution) -> Description:
     """Describe a component: a table of its config, and a snippet of YAML to paste."""
     root = config_schema(contribution.config)
-    fields: dict[str, Any] = root.get("properties", {})
-    required = root.get("required", [])
-    rows = tuple(_row(key, schema, key in required, root) for key, schema in fields.items())
-    placeholders = {key: flow(f"<{expectation(fields[key], root)}>") for key in required}
+    snippet = [f"{KINDS[contribution.kind].section}:", f"  use: {contribution.name}"]
+    if root.get("properties"):
+        snippet += ["  with:", *_lines(root, {}, root, "    ")]
     return Description(
         contribution.kind,
         contribution.name,
         contribution.summary,
-        rows,
-        _snippet(KINDS[contribution.kind].section, contribution.name, rows, placeholders),
+        tuple(_rows(root, root)),
+        "\n".join(snippet) + "\n",
         tuple(dict.fromkeys(requirement.install for requirement in contribution.requires)),
     )
 
 
-def _row(key: str, schema: Schema, required: bool, root: Schema) -> ConfigRow:
-    default = None if required else flow(schema.get("default"))
-    description = " ".join(schema.get("description", "").split())
-    return ConfigRow(key, type_words(schema, root), default, bounds_words(schema, root), description)
+def _rows(schema: Schema, root: Schema, prefix: str = "", depth: int = 0) -> list[ConfigRow]:
+    """Return the rows of a mapping, and below each those of the mappings in it.
+
+    A row that only some alternatives of a union have names them at its end.
+    """
+    options = [option for option in alternatives(schema, root) if "properties" in option]
+    if depth == MAX_DEPTH:
+        return []
+    tag_key, tags = discriminator(schema, root)
+    rows = [ConfigRow(f"{prefix}{tag_key}", listed(tags, "or"), None, "", "which of these")] if tag_key else []
+    found: dict[ConfigRow, list[str]] = {}
+    for option in options:
+        tag = option["properties"].get(tag_key, {}).get("const", option.get("title", ""))
+        for key, field in option["properties"].items():
+            if key == tag_key:
+                continue
+            required = key in option.get("required", ())
+            default = None if required else flow(field["default"]) if "default" in field else COMPUTED
+            row = ConfigRow(f"{prefix}{key}", type_words(field, root), default, bounds_words(field, root), _meaning(field))
+            for each in (row, *_rows(field, root, f"{row.key}.", depth + 1)):
+                found.setdefault(each, []).append(str(tag))
+    for row, owners in found.items():
+        note = "" if len(owners) == len(options) else f" ({listed(owners)})"
+        rows.append(replace(row, description=f"{row.description}{note}".strip()))
+    return rows
 
 
-def _snippet(section: str, name: str, rows: tuple[ConfigRow, ...], placeholders: dict[str, str]) -> str:
-    lines = [f"{section}:", f"  use: {name}"]
-    if rows:
-        lines.append("  with:")
-    for row in rows:
-        value = placeholders[row.key] if row.default is None else row.default
-        comment = f"  # {row.description}" if row.description else ""
-        lines.append(f"    {row.key}: {value}{comment}")
-    return "\n".join(lines) + "\n"
+def _lines(schema: Schema, value: dict[str, Any], root: Schema, indent: str) -> Iterator[str]:
+    """Write a mapping as YAML: what the value says, else the default, else what is expected."""
+    fields = schema["properties"]
+    for key in sorted(fields, key=lambda key: "const" not in fields[key]):  # first the key that tells a union apart
+        field = fields[key]
+        default = value.get(key, field.get("default"))
+        comment = f"  # {_meaning(field)}" if _meaning(field) else ""
+        if key in schema.get("required", ()) and key not in value:
+            yield f"{indent}{key}: {flow(f'<{expectation(field, root)}>')}{comment}"
+        elif isinstance(default, dict) and "properties" in (inner := _alternative_of(field, default, root)):
+            yield f"{indent}{key}:{comment}"
+            yield from _lines(inner, default, root, f"{indent}  ")
+        elif key in value or "default" in field:
+            yield f"{indent}{key}: {flow(default)}{comment}"
+
+
+def _alternative_of(schema: Schema, value: dict[str, Any], root: Schema) -> Schema:
+    tag_key, _ = discriminator(schema, root)
+    return alternative(schema, value.get(tag_key or ""), root)
+
+
+def _meaning(schema: Schema) -> str:
+    return " ".join(schema.get("description", "").split())
 
 
 def flow(value: Any) -> str:

@@ -26,6 +26,13 @@ DEPTH = 4
 class TolerantJsonSchema(GenerateJsonSchema):
     """Describes what JSON Schema can express, and leaves the rest open, so that one odd field spoils nothing else."""
 
+    def tagged_union_schema(self, schema: core_schema.TaggedUnionSchema) -> dict[str, Any]:
+        """Require the key that tells the alternatives apart, as validation does whatever its default."""
+        described = super().tagged_union_schema(schema)
+        if "discriminator" in described:
+            described["required"] = [described["discriminator"]["propertyName"]]
+        return described
+
     def handle_invalid_for_json_schema(self, schema: core_schema.CoreSchema, error_info: str) -> dict[str, Any]:  # noqa: ARG002
         """Accept anything."""
         return {}
@@ -37,35 +44,53 @@ def config_schema(config: type[BaseModel]) -> Schema:
     return resolved(schema, schema)
 
 
-def subschema(schema: Schema, key: str | int, root: Schema) -> Schema:
-    """Return the schema of one key or entry; empty, which allows anything, if there is none."""
-    schema = resolved(schema, root)
-    if isinstance(key, int):
-        first = schema.get("prefixItems", ())
-        found = first[key] if key < len(first) else schema.get("items")
-    else:
-        found = schema.get("properties", {}).get(key) or schema.get("additionalProperties")
-    if isinstance(found, dict):
-        return found
-    for option in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
-        if inner := subschema(option, key, root):
-            return inner
-    return {}
-
-
-def keys_of(schema: Schema, root: Schema) -> list[str]:
-    """Return the keys that a mapping may have."""
-    schema = resolved(schema, root)
-    alternatives = (*schema.get("anyOf", ()), *schema.get("oneOf", ()))
-    return [*schema.get("properties", ()), *(key for each in alternatives for key in keys_of(each, root))]
-
-
 def resolved(schema: Schema, root: Schema) -> Schema:
     """Follow a `$ref` into the definitions of the root."""
     if "$ref" not in schema:
         return schema
     target = root["$defs"][schema["$ref"].rpartition("/")[2]]
     return {**target, **{key: value for key, value in schema.items() if key != "$ref"}}
+
+
+def alternatives(schema: Schema, root: Schema) -> list[Schema]:
+    """Return what a union consists of; anything else consists of itself."""
+    schema = resolved(schema, root)
+    options = schema.get("anyOf") or schema.get("oneOf")
+    return [each for option in options for each in alternatives(option, root)] if options else [schema]
+
+
+def discriminator(schema: Schema, root: Schema) -> tuple[str | None, list[str]]:
+    """Return the key that tells the alternatives of a union of mappings apart, and its values; None if there is none."""
+    found = resolved(schema, root).get("discriminator", {})
+    return found.get("propertyName"), list(found.get("mapping", ()))
+
+
+def alternative(schema: Schema, tag: object, root: Schema) -> Schema:
+    """Return the alternative of a union that has this tag, or is the only mapping; else the schema itself."""
+    schema = resolved(schema, root)
+    reference = schema.get("discriminator", {}).get("mapping", {}).get(tag)
+    if reference is not None:
+        return resolved({"$ref": reference}, root)
+    mappings = [option for option in alternatives(schema, root) if "properties" in option]
+    return mappings[0] if len(mappings) == 1 else schema
+
+
+def subschema(schema: Schema, key: str | int, root: Schema) -> Schema:
+    """Return the schema of one key or item; empty, which allows anything, if there is none."""
+    for option in alternatives(schema, root):
+        if isinstance(key, int):
+            first = option.get("prefixItems", ())
+            found = first[key] if key < len(first) else option.get("items")
+        else:
+            found = option.get("properties", {}).get(key) or option.get("additionalProperties")
+        if isinstance(found, dict):
+            return found
+    return {}
+
+
+def keys_of(schema: Schema, root: Schema) -> list[str]:
+    """Return the keys that a mapping may have."""
+    return [key for option in alternatives(schema, root) for key in option.get("properties", ())]
 
 
 def expectation(schema: Schema, root: Schema) -> str:
@@ -100,13 +125,13 @@ class _Option:
 
 def _options(schema: Schema, root: Schema, depth: int = 0) -> list[_Option]:
     schema = resolved(schema, root)
-    alternatives = schema.get("anyOf") or schema.get("oneOf")
+    union = schema.get("anyOf") or schema.get("oneOf")
     if depth == DEPTH:
         return [_Option("value", article="a", plural="values")]
-    if alternatives and alternatives == _byte_size():
+    if union and union == _byte_size():
         return [_Option("size", _byte_bounds(schema), "a", "sizes")]
-    if alternatives:
-        return [option for each in alternatives for option in _options(each, root, depth + 1)]
+    if union:
+        return list(dict.fromkeys(option for each in union for option in _options(each, root, depth + 1)))
     if "enum" in schema or "const" in schema:
         return [_Option(word(value)) for value in schema.get("enum", [schema.get("const")])]
     match schema.get("type"):

@@ -144,6 +144,8 @@ class _Resolver:
         found: list[Problem] = []
         try:
             config = validate(entry.contribution.config, keys, self.directory, found)
+            if config is not None:
+                config.model_dump(mode="json")  # a run records it
         except Exception as error:
             origin = f"{entry.kind} {entry.name!r} of {entry.plugin} {entry.version}"
             found.append(keys.head.problem(f"the config of the {origin} raised {type(error).__name__}: {error}"))

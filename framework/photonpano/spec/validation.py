@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from photonpano.registry.suggestions import suggestion
-from photonpano.registry.wording import config_schema, expectation, keys_of, subschema
+from photonpano.registry.suggestions import listed, suggestion
+from photonpano.registry.wording import alternative, config_schema, discriminator, expectation, keys_of, subschema
 from photonpano.spec.tree import Value, given
 
 if TYPE_CHECKING:
@@ -69,9 +69,16 @@ def _problem(error: ErrorDetails, section: Value, root: Schema) -> Problem:
     value, schema, parent = section, root, root
     for step in error["loc"]:  # steps that lead nowhere name an alternative of a union, or a key that is missing
         child = _child(value, step)
-        if child is not None:
+        if child is None:
+            schema = alternative(schema, step, root)
+        else:
             parent, value, schema = schema, child, subschema(schema, step, root)
     kind = error["type"]
+    tag_key, tags = discriminator(schema, root)
+    if kind == "union_tag_not_found" and tag_key:
+        return value.head.problem(f"required: {listed(tags, 'or')}", tag_key)
+    if kind == "union_tag_invalid" and tag_key and (tag := _child(value, tag_key)):
+        return tag.place.problem(f"expected {listed(tags, 'or')}, got {given(tag.content)}")
     if kind == "missing" and isinstance(key := error["loc"][-1], str):
         return value.head.problem(f"required: {expectation(subschema(schema, key, root), root)}", key)
     if kind == "extra_forbidden":

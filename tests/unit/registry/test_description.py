@@ -2,6 +2,7 @@
 
 from enum import Enum
 from pathlib import Path
+from textwrap import dedent
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -22,12 +23,25 @@ class Mode(Enum):
     EXACT = "exact"
 
 
+class Near(Config):
+    kind: Literal["near"] = "near"
+    seed: int = 0
+    radius_px: float = Field(5, gt=0, description="of the search")
+
+
+class Far(Config):
+    kind: Literal["far"] = "far"
+    seed: int = 0
+    map: SpecPath
+
+
 class LocatorConfig(Config):
     weights: SpecPath = Field(description="a local file")
     ratio: float = Field(0.8, gt=0, lt=1, description="nearest to second match")
     method: Literal["ransac", "magsac"] = Field("magsac", description="how outliers are found")
     start: Literal["auto"] | Annotated[int, Field(ge=0)] = Field("auto", description="first frame:\nauto # or a number")
     inner: Inner = Inner()
+    search: Near | Far = Field(Near(radius_px=7), discriminator="kind", description="where to look")
     label: str | None = Field(None, description="a text for records")
     masks: tuple[str, ...] = Field(("yes", "a b"), description="files")
 
@@ -55,6 +69,12 @@ def test_rows_say_type_default_and_bounds():
         ConfigRow("method", "ransac or magsac", "magsac", "", "how outliers are found"),
         ConfigRow("start", "auto or integer", "auto", "at least 0", "first frame: auto # or a number"),
         ConfigRow("inner", "mapping", "{depth: 1}", "", ""),
+        ConfigRow("inner.depth", "integer", "1", "", ""),
+        ConfigRow("search", "mapping", "{kind: near, seed: 0, radius_px: 7}", "", "where to look"),
+        ConfigRow("search.kind", "far or near", None, "", "which of these"),
+        ConfigRow("search.seed", "integer", "0", "", ""),
+        ConfigRow("search.radius_px", "number", "5", "above 0", "of the search (near)"),
+        ConfigRow("search.map", "path", None, "", "(far)"),
         ConfigRow("label", "text or null", "null", "", "a text for records"),
         ConfigRow("masks", "list of texts", '["yes", "a b"]', "", "files"),
     )
@@ -62,12 +82,23 @@ def test_rows_say_type_default_and_bounds():
 
 def test_snippet_is_yaml_with_the_defaults():
     snippet = describe(LOCATOR).snippet
-    assert snippet.splitlines()[:4] == [
-        "locate:",
-        "  use: my-locator",
-        "  with:",
-        '    weights: "<a path>"  # a local file',
-    ]
+    assert snippet == dedent("""\
+        locate:
+          use: my-locator
+          with:
+            weights: "<a path>"  # a local file
+            ratio: 0.8  # nearest to second match
+            method: magsac  # how outliers are found
+            start: auto  # first frame: auto # or a number
+            inner:
+              depth: 1
+            search:  # where to look
+              kind: near
+              seed: 0
+              radius_px: 7  # of the search
+            label: null  # a text for records
+            masks: ["yes", "a b"]  # files
+        """)
     section = YAML(typ="safe", pure=True).load(snippet)["locate"]
     assert section.pop("use") == "my-locator"
     assert LocatorConfig(**section["with"] | {"weights": "w"}) == LocatorConfig(weights=Path("w"))
@@ -138,7 +169,35 @@ class Tree(Config):
     children: "tuple[Tree, ...]" = ()
 
 
-def test_config_that_contains_itself():
-    assert describe(LocatorContribution(name="tree", summary="A toy", config=Tree, build=unbuilt)).rows == (
-        ConfigRow("children", "list of mappings", "[]", "", ""),
+class Elaborate(Config):
+    when: int = Field(default_factory=lambda: 4, description="of the day")
+    inner: Inner | None = Inner(depth=3)
+    many: Inner | Near = Inner()
+
+
+def test_defaults_that_are_computed_or_mappings_among_alternatives():
+    described = describe(LocatorContribution(name="bare", summary="A toy", config=Elaborate, build=unbuilt))
+    assert [(row.key, row.default) for row in described.rows][:3] == [
+        ("when", "computed"),
+        ("inner", "{depth: 3}"),
+        ("inner.depth", "1"),
+    ]
+    assert described.rows[3:5] == (
+        ConfigRow("many", "mapping", "{depth: 1}", "", ""),
+        ConfigRow("many.depth", "integer", "1", "", "(Inner)"),
     )
+    section = YAML(typ="safe", pure=True).load(described.snippet)["locate"]["with"]
+    assert section == {"inner": {"depth": 3}, "many": {"depth": 1}}
+
+
+class Nest(Config):
+    inner: "Nest | None" = None
+
+
+def test_configs_that_contain_themselves():
+    tree, nest = (
+        describe(LocatorContribution(name="self", summary="A toy", config=each, build=unbuilt)).rows for each in (Tree, Nest)
+    )
+    assert tree == (ConfigRow("children", "list of mappings", "[]", "", ""),)
+    assert nest[1] == ConfigRow("inner.inner", "mapping or null", "null", "", "")
+    assert len(nest) == 4

@@ -28,11 +28,22 @@ class Flip(Config):
     rows: bool = Field(False, description="upside down")
 
 
+class Pan(Config):
+    kind: Literal["pan"] = "pan"
+    length_px: float = Field(300, gt=0, description="how far")
+
+
+class Orbit(Config):
+    kind: Literal["orbit"] = "orbit"
+    radius_px: float = Field(100, gt=0, description="how wide")
+
+
 class SimulatorConfig(Config):
     frames: int = Field(1000, ge=1, le=10_000_000, description="number of frames")
     flux: float = Field(0.5, gt=0, le=100, description="photons per pixel and frame")
     camera: Literal["pan", "loop"] = Field("pan", description="the path of the camera")
     size: tuple[int, int] = Field((254, 496), description="height and width in px")
+    path: Pan | Orbit = Field(Pan(), discriminator="kind", description="the way of the camera")
     flip: Flip = Field(Flip(), description="turned frames")
 
 
