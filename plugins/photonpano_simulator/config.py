@@ -12,7 +12,7 @@ from photonpano import Config, SpecPath
 class StreetScene(Config):
     """The scene that is built in: a street of shops, drawn anew for every seed."""
 
-    kind: Literal["street"] = "street"
+    kind: Literal["street"] = Field("street", description="the scene that is built in")
     width: int = Field(2048, ge=64, le=16384, description="in px; a wider street has more houses")
     height: int = Field(1365, ge=64, le=16384, description="in px; a higher street is the same one, larger")
     seed: int = Field(0, ge=0, description="another seed is another street")
@@ -21,7 +21,7 @@ class StreetScene(Config):
 class PhotoScene(Config):
     """A photograph: sRGB of 8 or 16 bits, undone to linear, of which the luminance is kept."""
 
-    kind: Literal["photo"] = "photo"
+    kind: Literal["photo"] = Field("photo", description="a photograph")
     file: SpecPath = Field(description="an image file that OpenCV reads, such as JPEG, PNG or TIFF")
     width: int | None = Field(
         None, ge=64, le=16384, description="in px: the photograph is resized to this width; by default as it is"
@@ -49,7 +49,7 @@ class _Path(Config):
 
 class _Line(_Path):
     length_px: float = Field(
-        300.0, gt=0, le=1e6, description="length of the way of the frame's centre over the scene, without the shake, in px"
+        300.0, gt=0, le=1e6, description="how far the frame's centre travels over the scene, without the shake, in px"
     )
     centre: tuple[float, float] | None = Field(
         None, description="(x, y) of the middle of the path in the scene, in px; by default the middle of the scene"
@@ -59,14 +59,14 @@ class _Line(_Path):
 class PanPath(_Line):
     """A straight pan at constant speed."""
 
-    kind: Literal["pan"] = "pan"
+    kind: Literal["pan"] = Field("pan", description="a straight line")
     angle_deg: float = Field(0.0, ge=-360, le=360, description="direction in degrees: 0 is to the right, 90 is down")
 
 
 class ScanPath(_Line):
     """A raster at constant speed: rows to and fro, joined by half circles; neighbouring rows see the same places again."""
 
-    kind: Literal["scan"] = "scan"
+    kind: Literal["scan"] = Field("scan", description="a raster")
     rows: int = Field(3, ge=2, le=100, description="number of rows")
     row_spacing_px: float = Field(100.0, gt=0, le=1e4, description="distance of neighbouring rows, in px")
 
@@ -74,14 +74,14 @@ class ScanPath(_Line):
 class LoopPath(_Line):
     """An ellipse at constant speed, once around: the last frame lies where the first does."""
 
-    kind: Literal["loop"] = "loop"
+    kind: Literal["loop"] = Field("loop", description="an ellipse, once around")
     aspect: float = Field(2.0, ge=0.1, le=10, description="width of the ellipse divided by its height")
 
 
 class SplinePath(_Line):
     """A smooth path by chance, whose speed changes on the way."""
 
-    kind: Literal["random-spline"] = "random-spline"
+    kind: Literal["random-spline"] = Field("random-spline", description="a smooth path by chance")
     knots: int = Field(6, ge=3, le=1000, description="number of points by chance that the spline goes through")
     seed: int = Field(0, ge=0, description="another seed is another path")
 
@@ -89,7 +89,7 @@ class SplinePath(_Line):
 class HandShakePath(Config):
     """A camera that somebody tries to hold still."""
 
-    kind: Literal["hand-shake"] = "hand-shake"
+    kind: Literal["hand-shake"] = Field("hand-shake", description="no path but the trembling")
     shake: Shake = Field(Shake(rms_px=5.0), description="the trembling")
     centre: tuple[float, float] | None = Field(
         None, description="(x, y) of the place looked at, in px of the scene; by default the middle of the scene"
@@ -99,7 +99,7 @@ class HandShakePath(Config):
 class FilePath(_Path):
     """Homographies from a file."""
 
-    kind: Literal["file"] = "file"
+    kind: Literal["file"] = Field("file", description="homographies from a file")
     file: SpecPath = Field(
         description="a .npy file (n_frames, 3, 3), or an .npz file with such an array `homographies`: pixels of a frame to "
         "pixels of the scene; the truth of another simulation is such a file"

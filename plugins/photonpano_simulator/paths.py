@@ -81,15 +81,12 @@ def _raster(path: ScanPath) -> FloatArray:
             f"whose turns alone take {(path.rows - 1) * np.pi * radius:.0f} px; raise path.length_px, or lower path.rows"
         )
     angles = np.linspace(-np.pi / 2, np.pi / 2, _DENSE // path.rows)
-    points = []
-    for index in range(path.rows):
-        side = 1 if index % 2 == 0 else -1
-        y = path.row_spacing_px * (index - (path.rows - 1) / 2)
-        points.append(np.array([[-side * row / 2, y]]))
-        if index < path.rows - 1:
-            points.append(np.stack([side * (row / 2 + radius * np.cos(angles)), y + radius * (1 + np.sin(angles))], axis=1))
-        else:
-            points.append(np.array([[side * row / 2, y]]))
+    heights = path.row_spacing_px * (np.arange(path.rows) - (path.rows - 1) / 2)
+    sides = np.where(np.arange(path.rows) % 2 == 0, 1, -1)
+    points = [np.array([[-row / 2, heights[0]]])]
+    for side, height in zip(sides[:-1], heights[:-1], strict=True):
+        points.append(np.stack([side * (row / 2 + radius * np.cos(angles)), height + radius * (1 + np.sin(angles))], axis=1))
+    points.append(np.array([[sides[-1] * row / 2, heights[-1]]]))
     return np.concatenate(points)
 
 
@@ -159,10 +156,13 @@ def _stacked(rows: list[list[FloatArray]]) -> FloatArray:
 
 
 def _require_inside(homographies: FloatArray, frame_shape: tuple[int, int], scene_shape: tuple[int, int]) -> None:
-    points = apply(homographies, corners(frame_shape))
+    frame = corners(frame_shape)
+    x, y = np.moveaxis(apply(homographies, frame), -1, 0)
     height, width = scene_shape
-    beyond = np.stack([-points[..., 0], points[..., 0] - (width - 1), -points[..., 1], points[..., 1] - (height - 1)])
-    worst = beyond.max(axis=2)
+    worst = np.stack([-x, x - (width - 1), -y, y - (height - 1)]).max(axis=2)
+    # Behind the camera, coordinates mean nothing.
+    depth = (homographies[:, 2, :2] @ frame.T + homographies[:, 2, 2:]).min(axis=1)
+    worst[:, depth <= 0] = np.inf
     side = int(worst.max(axis=1).argmax())
     if worst[side].max() > 1e-6:
         progress = worst[side].argmax() / max(1, len(homographies) - 1)

@@ -198,6 +198,10 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             homographies({"kind": "file", "file": path}, 5)
         assert str(caught.value) == message.format(path=path)
+    behind = np.tile(translation(100, 100), (5, 1, 1))
+    behind[:, 2, 0] = -0.01
+    with pytest.raises(InputError, match="leaves the scene of 2048x1365 px by inf px"):
+        homographies({"kind": "file", "file": saved(tmp_path / "behind.npy", behind)}, 5)
     path = tmp_path / "other.npz"
     np.savez(path, scene=np.zeros(3))
     with pytest.raises(InputError) as caught:

@@ -7,7 +7,7 @@ import pytest
 from photonpano_simulator.street import street
 
 
-@pytest.mark.parametrize("shape", [(240, 320), (333, 500), (64, 640), (300, 64)])
+@pytest.mark.parametrize("shape", [(240, 320), (333, 500), (64, 160), (300, 64)])
 def test_it_is_drawn_at_any_size(shape: tuple[int, int]) -> None:
     image = street(shape, seed=0)
     assert (image.shape, image.dtype) == (shape, np.float32)
