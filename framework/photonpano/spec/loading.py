@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from photonpano.spec.plan import Plan
 
-
 MAX_BYTES = 2**20
 """No spec is as long as this; a capture that is given by mistake is."""
 
@@ -81,11 +80,10 @@ def _read(path: Path) -> str:
     except OSError as error:
         problem = Problem("", f"cannot be read: {error.strerror}", path)
     else:
+        if len(data) > MAX_BYTES:
+            raise SpecError([Problem("", f"no spec: longer than {MAX_BYTES} bytes", path)])
         try:
-            text = data.decode("utf-8-sig")
-            if len(data) <= MAX_BYTES:
-                return text
-            problem = Problem("", f"no spec: longer than {MAX_BYTES} bytes", path)
+            return data.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             start = data.rfind(b"\n", 0, error.start) + 1
             line = data.count(b"\n", 0, error.start) + 1

@@ -1,5 +1,6 @@
 """Distributions that are as good as installed: a folder on `sys.path` with a real `.dist-info`."""
 
+import importlib
 import sys
 from collections.abc import Callable
 from textwrap import dedent
@@ -37,6 +38,7 @@ def install(tmp_path, monkeypatch) -> Callable[..., None]:
         (info / "entry_points.txt").write_text(f"[photonpano]\n{name} = {module}\n")
         if metadata:
             (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        importlib.invalidate_caches()
 
     yield install
     for module in [each for each in sys.modules if each.endswith("_hooks")]:
