@@ -47,12 +47,15 @@ class _Path(Config):
     shake: Shake | None = Field(None, description="a hand's trembling on top; none by default")
 
 
-class _Line(_Path):
-    length_px: float = Field(
-        300.0, gt=0, le=1e6, description="how far the frame's centre travels over the scene, without the shake, in px"
-    )
+class _Aimed(Config):
     centre: tuple[float, float] | None = Field(
         None, description="(x, y) of the middle of the path in the scene, in px; by default the middle of the scene"
+    )
+
+
+class _Line(_Path, _Aimed):
+    length_px: float = Field(
+        300.0, gt=0, le=1e6, description="how far the frame's centre travels over the scene, without the shake, in px"
     )
 
 
@@ -86,14 +89,11 @@ class SplinePath(_Line):
     seed: int = Field(0, ge=0, description="another seed is another path")
 
 
-class HandShakePath(Config):
+class HandShakePath(_Aimed):
     """A camera that somebody tries to hold still."""
 
     kind: Literal["hand-shake"] = Field("hand-shake", description="no path but the trembling")
     shake: Shake = Field(Shake(rms_px=5.0), description="the trembling")
-    centre: tuple[float, float] | None = Field(
-        None, description="(x, y) of the place looked at, in px of the scene; by default the middle of the scene"
-    )
 
 
 class FilePath(_Path):
