@@ -91,7 +91,7 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             "version": 1,
             **stages,
             "levels": [{"scale": 0.5}, {}, {}],
-            "graph": {"offsets": [1], "disconnected": "error"},
+            "graph": {"skips": [], "disconnected": "error"},
             "render": {"scale": 1.0, "reference": "middle"},
             "output": {"directory": "runs/corridor-pan"},
             "run": {"seed": 0, "threads": "auto", "memory": "2 GiB"},
