@@ -68,6 +68,27 @@ def apply(homographies: Homography, points: ArrayLike) -> FloatArray:
         return np.asarray(mapped / depth)
 
 
+def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
+    """Return the derivatives of the mapped points with respect to p1..p8 of `parameters`: (N, 2, 8).
+
+    Args:
+        homography: (3, 3).
+        points: (N, 2).
+    """
+    points = np.asarray(points, dtype=np.float64)
+    depth = points @ homography[2, :2] + homography[2, 2]
+    x, y = points.T / depth
+    u, v = apply(homography, points).T
+    zero, one = np.zeros_like(x), 1 / depth
+    return np.stack(
+        [
+            np.stack([x, zero, y, zero, one, zero, -u * x, -u * y], axis=-1),
+            np.stack([zero, x, zero, y, zero, one, -v * x, -v * y], axis=-1),
+        ],
+        axis=1,
+    )
+
+
 def corners(shape: tuple[int, int]) -> FloatArray:
     """Return the centres of the corner pixels of a (height, width) image, clockwise from the top left: (4, 2)."""
     height, width = shape

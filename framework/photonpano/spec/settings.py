@@ -18,8 +18,10 @@ class LevelSettings(Config):
 class GraphSettings(Config):
     """Which pairs of exposures are registered, and what happens when too few are located."""
 
-    offsets: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        (1,), min_length=1, description="register exposures that are so many places apart in time; 1 is the neighbour"
+    skips: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (1.0, 2.0),
+        description="besides its neighbour, each exposure is registered with the ones so many group lengths away; "
+        "an empty list leaves a chain of neighbours",
     )
     disconnected: Literal["error", "largest"] = Field(
         "error",

@@ -16,7 +16,7 @@ SPEC = {
     "resample": {"use": "midpoint", "with": {"group_size": 5, "stride": 2}},
     "locate": {"with": {"ratio": 0.7}},
     "levels": [{"scale": 0.5, "locate": {"use": "direct", "with": {"max_steps": 3}}}, {}],
-    "graph": {"offsets": [1, 2], "disconnected": "largest"},
+    "graph": {"skips": [1.0, 2.0], "disconnected": "largest"},
     "render": {"scale": 2.0, "reference": "first"},
     "output": {"directory": "out"},
     "run": {"seed": 1, "threads": 2, "memory": "1 GiB"},

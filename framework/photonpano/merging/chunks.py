@@ -1,0 +1,52 @@
+"""Chunks: runs of frames within which the motion stays under a fraction of a pixel, so that one warp serves them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry import corner_displacements
+from photonpano.values import FrameSpan
+
+if TYPE_CHECKING:
+    from photonpano.protocols import Trajectory
+    from photonpano.values import Homography
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chunk:
+    """Frames that are summed before they are warped.
+
+    Attributes:
+        span: the frames.
+        homography: (3, 3), pixels of the frame at the centre of the span to pixels of the reference plane.
+    """
+
+    span: FrameSpan
+    homography: Homography
+
+
+def chunks_of(
+    span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float
+) -> tuple[Chunk, ...]:
+    """Split a span so that no corner of a frame moves further than `tolerance_px` within a chunk.
+
+    Args:
+        span: the frames to split.
+        trajectory: the motion along which they are summed.
+        frame_shape: (height, width) of a frame.
+        tolerance_px: length of the way of a corner, in pixels of a frame, that one warp may ignore. A chunk is warped at its
+            centre instant, so that no photon is misplaced by more than about half of it.
+    """
+    frames = np.arange(span.start, span.stop)
+    homographies = trajectory.at(frames)
+    # Seen from frame t, in its own pixels: how far frame t + 1 has moved.
+    steps = np.linalg.solve(homographies[:-1], homographies[1:])
+    way = np.concatenate([[0.0], np.cumsum(corner_displacements(steps, np.eye(3), frame_shape).max(axis=-1))])
+    starts = np.flatnonzero(np.diff(np.floor(way / tolerance_px), prepend=-1.0))
+    stops = np.append(starts[1:], len(frames))
+    spans = [FrameSpan(int(frames[start]), int(frames[stop - 1]) + 1) for start, stop in zip(starts, stops, strict=True)]
+    centres = trajectory.at([chunk.centre for chunk in spans])
+    return tuple(Chunk(chunk, homography) for chunk, homography in zip(spans, centres, strict=True))

@@ -1,0 +1,35 @@
+"""How a long run tells what it is doing: the command line draws bars, notebooks and pipes may stay quiet."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
+
+
+class Progress(Protocol):
+    """Is told of stages as they start, advance and end. One stage at a time; calls come from any thread."""
+
+    def stage(self, title: str, total: int, unit: str) -> AbstractContextManager[Callable[[int], None]]:
+        """Enter a stage of `total` units, such as "level 2: locate" of 81 exposures; call the value with units done."""
+        ...
+
+    def note(self, message: str) -> None:
+        """Say one line that the user should see, such as the result of a level or a warning."""
+        ...
+
+
+class Quiet:
+    """Progress that says nothing."""
+
+    @contextmanager
+    def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+        """Ignore a stage."""
+        del title, total, unit
+        yield lambda _: None
+
+    def note(self, message: str) -> None:
+        """Ignore a line."""
