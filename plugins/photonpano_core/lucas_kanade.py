@@ -5,27 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 from scipy.interpolate import make_interp_spline
 
-from photonpano import Config
 from photonpano.geometry import from_parameters, parameters
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from photonpano import StageContext
-
-
-class LucasKanadeConfig(Config):
-    """A spline through the eight parameters p1..p8."""
-
-    hold_frames: float | None = Field(
-        None,
-        ge=0,
-        description="how many frames beyond the last located instant the velocity is held before the motion stops; "
-        "by default the mean distance of located instants",
-    )
+    from photonpano_core.configs import LucasKanadeConfig
 
 
 class LucasKanadeTrajectory:
@@ -73,9 +60,3 @@ class LucasKanadeInterpolator:
         """Interpolate; the information is not used, since the spline goes through every knot."""
         del information
         return LucasKanadeTrajectory(instants, homographies, self._config.hold_frames)
-
-
-def build(config: LucasKanadeConfig, context: StageContext) -> LucasKanadeInterpolator:
-    """Build the interpolator."""
-    del context
-    return LucasKanadeInterpolator(config)

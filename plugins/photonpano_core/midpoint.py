@@ -5,28 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
-from photonpano import Config, FrameSpan, Group, InputError
+from photonpano import FrameSpan, Group, InputError
 
 if TYPE_CHECKING:
-    from photonpano import StageContext, StreamInfo
-
-
-class MidpointConfig(Config):
-    """Groups of equal size, twice as dense at each level."""
-
-    group_size: int = Field(500, ge=1, description="frames of a group: more for the dark, fewer for fast motion")
-    endpoints: bool = Field(
-        True,
-        description="from the second level on, also locate the first and the last frame, with off-centre windows "
-        "(supplement S2)",
-    )
-    densify: bool = Field(
-        True,
-        description="add groups between those of the level before; false keeps their number constant, which is the "
-        "paper's failing ablation",
-    )
+    from photonpano_core.configs import MidpointConfig
 
 
 class MidpointResampler:
@@ -69,15 +52,3 @@ def too_short(group_size: int, n_frames: int) -> str | None:
         f"the capture has {n_frames} frames, fewer than one group of {group_size}; "
         f"set group_size to {max(1, n_frames // 4)} or less, so that at least four groups fit"
     )
-
-
-def build(config: MidpointConfig, context: StageContext) -> MidpointResampler:
-    """Build the resampler."""
-    del context
-    return MidpointResampler(config)
-
-
-def check(config: MidpointConfig, stream: StreamInfo) -> list[str]:
-    """Find a group size that does not fit the capture."""
-    problem = too_short(config.group_size, stream.n_frames)
-    return [problem] if problem else []

@@ -5,25 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
-from photonpano import Config, VirtualExposure
+from photonpano import VirtualExposure
 from photonpano.geometry import inverse, rescaling
 from photonpano.merging import Chunk, accumulate, chunks_of
 
 if TYPE_CHECKING:
-    from photonpano import Group, Source, StageContext, Trajectory
-
-
-class PhotonMleConfig(Config):
-    """One maximum-likelihood estimate of all photons of a pixel."""
-
-    tolerance_px: float = Field(
-        0.5, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
-    )
-    compensate: bool = Field(
-        True, description="warp along the motion known so far; false averages naively, the paper's baseline"
-    )
+    from photonpano import Group, Source, Trajectory
+    from photonpano_core.configs import PhotonMleConfig
 
 
 class PhotonMleMerger:
@@ -53,9 +42,3 @@ class PhotonMleMerger:
 def _scaled_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
     height, width = shape
     return max(1, round(height * scale)), max(1, round(width * scale))
-
-
-def build(config: PhotonMleConfig, context: StageContext) -> PhotonMleMerger:
-    """Build the merger."""
-    del context
-    return PhotonMleMerger(config)

@@ -110,7 +110,7 @@ def _bounding_box(to_grid: Homography, frame: tuple[int, int], grid: tuple[int, 
 def _shrink_factor(to_grid: Homography, frame: tuple[int, int]) -> int:
     """Return how many pixels in a row fall on one grid pixel: bilinear sampling alone would skip photons."""
     centre = np.array([[(frame[1] - 1) / 2, (frame[0] - 1) / 2]])
-    around = apply(to_grid, centre + [[0, 0], [1, 0], [0, 1]])
+    around = apply(to_grid, centre + np.array([[0, 0], [1, 0], [0, 1]]))
     step = np.linalg.norm(around[1:] - around[0], axis=1).max()
     return max(1, int(1 / step + 1e-6))
 

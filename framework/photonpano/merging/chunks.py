@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano.geometry import corner_displacements
+from photonpano.geometry import corner_displacements, inverse
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ class Chunk:
     homography: Homography
 
 
-def chunks_of(
-    span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float
-) -> tuple[Chunk, ...]:
+def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float) -> tuple[Chunk, ...]:
     """Split a span so that no corner of a frame moves further than `tolerance_px` within a chunk.
 
     Args:
@@ -43,7 +41,7 @@ def chunks_of(
     frames = np.arange(span.start, span.stop)
     homographies = trajectory.at(frames)
     # Seen from frame t, in its own pixels: how far frame t + 1 has moved.
-    steps = np.linalg.solve(homographies[:-1], homographies[1:])
+    steps = inverse(homographies[:-1]) @ homographies[1:]
     way = np.concatenate([[0.0], np.cumsum(corner_displacements(steps, np.eye(3), frame_shape).max(axis=-1))])
     starts = np.flatnonzero(np.diff(np.floor(way / tolerance_px), prepend=-1.0))
     stops = np.append(starts[1:], len(frames))

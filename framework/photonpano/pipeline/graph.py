@@ -16,6 +16,8 @@ from photonpano.values import Located
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
     from photonpano.values import BoolArray, Edge, FloatArray
 
 MAX_ITERATIONS = 30
@@ -48,7 +50,9 @@ class GraphSolution:
 
 def largest_component(n_nodes: int, edges: Sequence[Edge]) -> BoolArray:
     """Return the nodes of the largest set that located edges tie together: (N,)."""
-    pairs = np.array([(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]).reshape(-1, 2)
+    pairs = np.array([(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)], dtype=int).reshape(
+        -1, 2
+    )
     _, labels = connected_components(_adjacency(n_nodes, pairs), directed=False)
     return np.asarray(labels == np.argmax(np.bincount(labels)))
 
@@ -66,7 +70,7 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
         frame_shape: (height, width) of a frame.
     """
     located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
-    pairs = np.array([(edge.moving, edge.fixed) for _, edge in located_edges]).reshape(-1, 2)
+    pairs = np.array([(edge.moving, edge.fixed) for _, edge in located_edges], dtype=int).reshape(-1, 2)
     order, parents = breadth_first_order(_adjacency(n_nodes, pairs), anchor, directed=False)
     located = np.zeros(n_nodes, dtype=bool)
     located[order] = True
@@ -90,13 +94,17 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
     return GraphSolution(homographies, located, contradictions, problem.residual_px(homographies[located]))
 
 
-def _adjacency(n_nodes: int, pairs: FloatArray) -> sparse.csr_array:
+def _adjacency(n_nodes: int, pairs: NDArray[np.integer]) -> sparse.csr_array:
     ones = np.ones(len(pairs))
-    return sparse.csr_array((ones, (pairs[:, 0].astype(int), pairs[:, 1].astype(int))), shape=(n_nodes, n_nodes))
+    return sparse.csr_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(n_nodes, n_nodes))
 
 
 def _compose_tree(
-    homographies: FloatArray, order: FloatArray, parents: FloatArray, pairs: FloatArray, observed: FloatArray
+    homographies: FloatArray,
+    order: NDArray[np.integer],
+    parents: NDArray[np.integer],
+    pairs: NDArray[np.integer],
+    observed: FloatArray,
 ) -> None:
     """Fill in the homographies of the nodes of `order`, each from its parent along one edge."""
     edge_of = {(int(moving), int(fixed)): index for index, (moving, fixed) in enumerate(pairs)}
@@ -112,13 +120,13 @@ class _Problem:
 
     def __init__(
         self,
-        pairs: FloatArray,
+        pairs: NDArray[np.integer],
         anchor: int,
         observed: FloatArray,
         motions: Sequence[Located],
         frame_shape: tuple[int, int],
     ) -> None:
-        self._moving, self._fixed = pairs.T.astype(int)
+        self._moving, self._fixed = pairs.T
         self._anchor = anchor
         self._corners = corners(frame_shape)
         self._targets = apply(observed, self._corners)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.spec.tree import Place
 
-ContributionT = TypeVar("ContributionT")
+ContributionT = TypeVar("ContributionT", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,129 @@
+"""Why exposures could not be located, in words: what failed, with which numbers, and what to try."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+
+from photonpano.errors import LocationError
+from photonpano.values import FrameSpan, NotLocated
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from photonpano.values import BoolArray, Edge, Group, VirtualExposure
+
+_BLUR_PX = 2.0
+TOLERATED_RUN = 2
+"""So many exposures in a row may be lost: the motion is interpolated across them."""
+_NOISY = 1.5
+"""Below this ratio of signal to noise, darkness is to blame; above it, blur or a scene without texture."""
+_SHOWN = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Contrast:
+    """How much there is to see in an exposure.
+
+    Attributes:
+        signal_to_noise: standard deviation of the scene over that of the photon noise, both at the scale of a few pixels.
+        blank: why there is nothing to see at all; None if there is something.
+    """
+
+    signal_to_noise: float
+    blank: str | None = None
+
+
+def contrast_of(exposure: VirtualExposure) -> Contrast:
+    """Measure how far the variations of an exposure exceed its photon noise."""
+    known = exposure.weight > 0
+    if not known.any():
+        return Contrast(0.0, "no pixel was seen")
+    flux = exposure.flux[known]
+    if flux.max() <= 0:
+        return Contrast(0.0, "no pixel saw a photon; is the shutter closed, or the file the right one?")
+    darkest = exposure.response.mean_count(flux.min(keepdims=True))
+    if 1 - darkest[0] <= 0.5 / exposure.weight[known].max():
+        return Contrast(0.0, "every pixel is lit in every frame, so that its flux is unknown; use a darker aperture")
+    weight = known.astype(np.float32)
+    stabilised = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0))
+    smooth_weight = cv2.GaussianBlur(weight, (0, 0), _BLUR_PX)
+    smooth = cv2.GaussianBlur(stabilised, (0, 0), _BLUR_PX) / np.maximum(smooth_weight, 1e-6)
+    noise = float(np.median(exposure.response.stabilised_std(exposure.weight[known]))) / (2 * np.sqrt(np.pi) * _BLUR_PX)
+    variance = float(smooth[known].var()) - noise**2
+    return Contrast(float(np.sqrt(max(variance, 0.0))) / noise)
+
+
+def require_tied(
+    level: int,
+    groups: Sequence[Group],
+    edges: Sequence[Edge],
+    tied: BoolArray,
+    contrasts: Mapping[int, Contrast],
+    disconnected: Literal["error", "largest"],
+) -> None:
+    """Refuse to go on when too many exposures are tied to nothing.
+
+    Single exposures may be lost, since the motion is interpolated across them. A longer run is an error unless the spec
+    asks for the largest part; less than two located exposures is always one.
+    """
+    if len(groups) == 1:
+        return
+    runs = _runs(~tied)
+    longest = max((stop - start for start, stop in runs), default=0)
+    if tied.sum() >= 2 and (longest <= TOLERATED_RUN or disconnected == "largest"):
+        return
+    failures = [edge for edge in edges if isinstance(edge.motion, NotLocated)]
+    lost = [_frames(groups, start, stop) for start, stop in runs]
+    lines = [
+        f"level {level}: {len(failures)} of {len(edges)} pairs of exposures could not be located, "
+        f"so that {_listed(lost)} cannot be tied to the rest"
+        if tied.sum() >= 2
+        else f"level {level}: none of the {len(edges)} pairs of exposures could be located"
+    ]
+    lines += [_pair(edge, groups) for edge in failures[:_SHOWN]]
+    if len(failures) > _SHOWN:
+        lines.append(f"  ... and {len(failures) - _SHOWN} more")
+    lines += _advice(groups, tied, contrasts)
+    if tied.sum() >= 2:
+        lines.append("To go on with the largest part alone, set graph.disconnected to largest.")
+    raise LocationError("\n".join(lines))
+
+
+def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Contrast]) -> list[str]:
+    lost = [contrasts[int(index)] for index in np.flatnonzero(~tied)] if not tied.all() else list(contrasts.values())
+    if all(contrast.blank for contrast in lost):
+        return []
+    ratio = float(np.median([contrast.signal_to_noise for contrast in lost if not contrast.blank]))
+    size = int(np.median([len(group.span) for group in groups]))
+    seen = f"In these exposures of {size} frames the scene stands out {ratio:.1f} times above the photon noise"
+    if ratio < _NOISY:
+        return [f"{seen}: they are too dark. Try larger groups, such as resample.with.group_size={2 * size}."]
+    return [
+        f"{seen}, so darkness is not the cause: either motion blurs them (try smaller groups, such as "
+        f"resample.with.group_size={max(1, size // 2)}), or the scene has no texture there."
+    ]
+
+
+def _pair(edge: Edge, groups: Sequence[Group]) -> str:
+    assert isinstance(edge.motion, NotLocated)
+    return f"  {groups[edge.moving]} onto {groups[edge.fixed]}: {edge.motion.reason}"
+
+
+def _runs(mask: BoolArray) -> list[tuple[int, int]]:
+    """Return the half-open runs of True."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(start), int(stop)) for start, stop in zip(steps[::2], steps[1::2], strict=True)]
+
+
+def _frames(groups: Sequence[Group], start: int, stop: int) -> str:
+    return str(FrameSpan(groups[start].span.start, groups[stop - 1].span.stop))
+
+
+def _listed(parts: Sequence[str]) -> str:
+    if len(parts) > _SHOWN:
+        return f"{', '.join(parts[:_SHOWN])} and {len(parts) - _SHOWN} more spans"
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)

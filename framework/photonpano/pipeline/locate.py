@@ -1,0 +1,204 @@
+"""The locate step: register pairs of exposures, and find where all of them lie."""
+
+from __future__ import annotations
+
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.errors import PluginError
+from photonpano.geometry import implausibility, inverse, normalised, rescaled
+from photonpano.pipeline.diagnosis import Contrast, contrast_of, require_tied
+from photonpano.pipeline.graph import largest_component, solve
+from photonpano.pipeline.pairs import pairs_of, shared_share
+from photonpano.values import Edge, Located, NotLocated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from concurrent.futures import Future
+
+    from photonpano.pipeline.components import Level
+    from photonpano.pipeline.graph import GraphSolution
+    from photonpano.pipeline.merge import VirtualExposures
+    from photonpano.pipeline.progress import Progress
+    from photonpano.pipeline.stopwatch import Stopwatch
+    from photonpano.protocols import Trajectory
+    from photonpano.spec.settings import GraphSettings
+    from photonpano.values import FloatArray, Group, Homography
+
+BRIDGE = 3
+"""An exposure that none of its pairs ties to an earlier one is tried against so many predecessors."""
+SHARED_PHOTONS = 0.05
+"""The least weight of a pair. Photons that two exposures share say where the motion known so far puts them, and nothing new."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocatedLevel:
+    """Where the exposures of a level lie.
+
+    Attributes:
+        groups: the groups of the level.
+        edges: every pair that was tried, with its motion or the reason why there is none.
+        solution: one homography an exposure.
+    """
+
+    groups: Sequence[Group]
+    edges: tuple[Edge, ...]
+    solution: GraphSolution
+
+    @property
+    def instants(self) -> FloatArray:
+        """The reference instants of the located exposures: (N,)."""
+        return np.array([group.reference for group in self.groups])[self.solution.located]
+
+    @property
+    def homographies(self) -> FloatArray:
+        """Their homographies to the plane of one of them: (N, 3, 3)."""
+        return self.solution.homographies[self.solution.located]
+
+    @property
+    def n_located(self) -> int:
+        """How many exposures are tied together."""
+        return int(self.solution.located.sum())
+
+    @property
+    def failures(self) -> tuple[Edge, ...]:
+        """The pairs that were not located."""
+        return tuple(edge for edge in self.edges if isinstance(edge.motion, NotLocated))
+
+
+def locate(
+    level: Level,
+    exposures: VirtualExposures,
+    known: Trajectory | None,
+    graph: GraphSettings,
+    threads: int,
+    clock: Stopwatch,
+    progress: Progress,
+) -> LocatedLevel:
+    """Register the pairs of a level, and solve the motion graph.
+
+    Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and forgotten after the last.
+
+    Raises:
+        LocationError: exposures cannot be tied to each other, and the settings do not allow to go on without them.
+    """
+    groups = exposures.groups
+    registrar = _Registrar(level, exposures, known, clock)
+    pairs = pairs_of(groups, graph.skips)
+    title = f"level {level.number}: merge and locate"
+    with ThreadPoolExecutor(threads) as pool, progress.stage(title, len(groups), "exposures") as advance:
+        edges = tuple(registrar.edges(pairs, pool, threads, advance))
+    with clock("locate"):
+        tied = largest_component(len(groups), edges)
+        require_tied(level.number, groups, edges, tied, registrar.contrasts, graph.disconnected)
+        candidates = np.flatnonzero(tied)
+        anchor = int(candidates[len(candidates) // 2])
+        solution = solve(len(groups), edges, anchor, exposures.frame_shape)
+    return LocatedLevel(groups, edges, solution)
+
+
+class _Registrar:
+    """Describes exposures and registers pairs of them, in px of frames."""
+
+    def __init__(self, level: Level, exposures: VirtualExposures, known: Trajectory | None, clock: Stopwatch) -> None:
+        self._level = level
+        self._exposures = exposures
+        self._known = known
+        self._clock = clock
+        self._features: dict[int, Any] = {}
+        self.contrasts: dict[int, Contrast] = {}
+
+    def edges(
+        self, pairs: Sequence[tuple[int, int]], pool: ThreadPoolExecutor, threads: int, advance: Callable[[int], None]
+    ) -> Iterator[Edge]:
+        """Yield the pairs in order, as located or not."""
+        partners: dict[int, list[int]] = {moving: [] for moving in range(len(self._exposures))}
+        needed_until = {index: index + BRIDGE for index in partners}
+        for moving, fixed in pairs:
+            partners[moving].append(fixed)
+            needed_until[fixed] = max(needed_until[fixed], moving)
+        described = _in_order(pool, self._describe, range(len(self._exposures)), threads)
+        for moving, (features, contrast) in enumerate(described):
+            self._features[moving], self.contrasts[moving] = features, contrast
+            found = list(pool.map(lambda fixed, moving=moving: self._register(moving, fixed), partners[moving]))
+            if not any(isinstance(edge.motion, Located) for edge in found):
+                found += self._bridge(moving, partners[moving])
+            yield from found
+            for index in [index for index in self._features if needed_until[index] <= moving]:
+                del self._features[index]
+            advance(1)
+
+    def _bridge(self, moving: int, tried: Sequence[int]) -> Iterator[Edge]:
+        for fixed in range(moving - 1, max(moving - BRIDGE, 0) - 1, -1):
+            if fixed not in tried:
+                edge = self._register(moving, fixed)
+                yield edge
+                if isinstance(edge.motion, Located):
+                    return
+
+    def _describe(self, index: int) -> tuple[Any, Contrast]:
+        exposure = self._exposures[index]
+        with self._clock("locate"):
+            contrast = contrast_of(exposure)
+            return (None if contrast.blank else self._level.locator.describe(exposure)), contrast
+
+    def _register(self, moving: int, fixed: int) -> Edge:
+        with self._clock("locate"):
+            for index in (moving, fixed):
+                if blank := self.contrasts[index].blank:
+                    return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
+            scale = self._level.scale
+            initial = self._initial(moving, fixed)
+            motion = self._level.locator.register(
+                self._features[moving], self._features[fixed], None if initial is None else rescaled(initial, scale)
+            )
+            if isinstance(motion, Located):
+                motion = self._checked(motion, moving, fixed)
+            return Edge(moving, fixed, motion)
+
+    def _initial(self, moving: int, fixed: int) -> Homography | None:
+        if self._known is None:
+            return None
+        instants = [self._exposures.groups[index].reference for index in (moving, fixed)]
+        to_plane = self._known.at(instants)
+        return normalised(inverse(to_plane[1]) @ to_plane[0])
+
+    def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
+        """Convert a motion to px of frames, and refuse what no camera does."""
+        matrix = np.asarray(motion.homography)
+        if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)) or matrix[2, 2] == 0:
+            raise PluginError(
+                f"the locator {type(self._level.locator).__module__} returned {matrix.tolist()} for a located pair; "
+                "a homography is a finite (3, 3) matrix with h33 = 1, and a failure is NotLocated"
+            )
+        homography = rescaled(matrix, 1 / self._level.scale)
+        if reason := implausibility(homography, self._exposures.frame_shape):
+            return NotLocated(reason, motion.evidence)
+        groups = self._exposures.groups
+        new = max(1 - shared_share(groups[moving].span, groups[fixed].span), SHARED_PHOTONS)
+        information = motion.information
+        if information is not None:
+            # p1..p8 in px of exposures to px of frames: to first order only translation and perspective change.
+            units = np.array([1, 1, 1, 1, self._level.scale, self._level.scale, 1 / self._level.scale, 1 / self._level.scale])
+            information = information * np.outer(units, units) * new
+        residual_px = None if motion.residual_px is None else motion.residual_px / self._level.scale
+        return replace(motion, homography=homography, information=information, residual_px=residual_px)
+
+
+def _in_order(pool: ThreadPoolExecutor, work: Callable[[int], Any], items: Iterable[int], ahead: int) -> Iterator[Any]:
+    """Yield `work(item)` in order, with a few items worked on ahead."""
+    running: deque[Future[Any]] = deque()
+    try:
+        for item in items:
+            running.append(pool.submit(work, item))
+            if len(running) > ahead:
+                yield running.popleft().result()
+        while running:
+            yield running.popleft().result()
+    finally:
+        for future in running:
+            future.cancel()

@@ -1,0 +1,94 @@
+"""The loop of the paper (section 4): re-sample, merge, locate, interpolate, and again with denser groups."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry import corner_displacements, inverse
+from photonpano.pipeline.locate import locate
+from photonpano.pipeline.merge import VirtualExposures
+from photonpano.pipeline.stopwatch import Stopwatch
+from photonpano.pipeline.trajectory import ReferencedTrajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from photonpano.pipeline.components import Level
+    from photonpano.pipeline.locate import LocatedLevel
+    from photonpano.pipeline.progress import Progress
+    from photonpano.protocols import Source, Trajectory
+    from photonpano.spec.settings import GraphSettings
+    from photonpano.values import Group
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LevelResult:
+    """What one level found.
+
+    Attributes:
+        level: its components.
+        groups: what was merged.
+        located: pairs, motions, and where the exposures lie.
+        trajectory: the motion known after the level; the reference frame's homography is the identity.
+        change_px: how far the level moved the corners of the frames, on average, in px of a frame; None at the first.
+        seconds: time spent in each stage.
+    """
+
+    level: Level
+    groups: tuple[Group, ...]
+    located: LocatedLevel
+    trajectory: Trajectory
+    change_px: float | None
+    seconds: dict[str, float]
+
+
+def estimate_motion(
+    source: Source, levels: Sequence[Level], graph: GraphSettings, reference: int, threads: int, progress: Progress
+) -> list[LevelResult]:
+    """Estimate the motion of a capture, level by level.
+
+    Args:
+        source: the capture.
+        levels: the components of each level.
+        graph: which pairs are registered, and what happens when exposures cannot be tied to the others.
+        reference: the frame whose homography is the identity.
+        threads: how many exposures are worked on at once; the result does not depend on it.
+        progress: is told of the stages.
+
+    Raises:
+        LocationError: too few exposures could be located.
+    """
+    results: list[LevelResult] = []
+    known: Trajectory | None = None
+    for level in levels:
+        clock = Stopwatch(threads)
+        with clock("resample"):
+            groups = level.resampler.groups(source.info.n_frames, level.number)
+        exposures = VirtualExposures(level, source, groups, known, clock)
+        located = locate(level, exposures, known, graph, threads, clock, progress)
+        with clock("interpolate"):
+            free = level.interpolator.fit(located.instants, located.homographies, None)
+            trajectory = ReferencedTrajectory(free, reference)
+            change_px = None if known is None else _change_px(known, trajectory, source)
+        results.append(LevelResult(level, groups, located, trajectory, change_px, clock.seconds))
+        progress.note(_summary(results[-1]))
+        known = trajectory
+    return results
+
+
+def _change_px(before: Trajectory, after: Trajectory, source: Source) -> float:
+    """Return the mean distance between where two trajectories put the corners of the frames, in px of a frame."""
+    frames = np.unique(np.linspace(0, source.info.n_frames - 1, 1000).astype(int))
+    moved = inverse(before.at(frames)) @ after.at(frames)
+    return float(corner_displacements(moved, np.eye(3), source.info.frame_shape).mean())
+
+
+def _summary(result: LevelResult) -> str:
+    located = result.located
+    text = f"level {result.level.number}: {located.n_located} of {len(result.groups)} exposures located"
+    if located.failures:
+        text += f", {len(located.failures)} of {len(located.edges)} pairs failed"
+    return text if result.change_px is None else f"{text}, the motion changed by {result.change_px:.2f} px"

@@ -1,0 +1,37 @@
+"""The merge step: virtual exposures of a level, made when they are asked for, so that no level is held in memory."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from photonpano.pipeline.components import Level
+    from photonpano.pipeline.stopwatch import Stopwatch
+    from photonpano.protocols import Source, Trajectory
+    from photonpano.values import Group, VirtualExposure
+
+
+class VirtualExposures:
+    """The virtual exposures of a level: `exposures[i]` merges group i along the motion known so far.
+
+    Nothing is kept; ask for each one once. May be used from several threads.
+    """
+
+    def __init__(
+        self, level: Level, source: Source, groups: Sequence[Group], known: Trajectory | None, clock: Stopwatch
+    ) -> None:
+        self._level = level
+        self._source = source
+        self._known = known
+        self._clock = clock
+        self.groups = groups
+        self.frame_shape = source.info.frame_shape
+
+    def __len__(self) -> int:
+        return len(self.groups)
+
+    def __getitem__(self, index: int) -> VirtualExposure:
+        with self._clock("merge"):
+            return self._level.merger.merge(self._source, self.groups[index], self._known, self._level.scale)

@@ -1,0 +1,114 @@
+"""What `run.json` says of a run: enough to repeat it, and to see where it was weak."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.values import NotLocated
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from photonpano.pipeline.loop import LevelResult
+    from photonpano.spec.plan import Plan
+    from photonpano.values import Group, StreamInfo
+
+_LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "pydantic", "pluggy", "tifffile")
+
+
+def source_record(stream: StreamInfo) -> dict[str, Any]:
+    """Describe the capture."""
+    return {
+        "n_frames": stream.n_frames,
+        "height": stream.height,
+        "width": stream.width,
+        "frame_rate_hz": stream.frame_rate_hz,
+        "kind": stream.kind,
+    }
+
+
+def plugin_records(plan: Plan) -> list[dict[str, str]]:
+    """Say who provided each stage, each component once."""
+    seen: dict[tuple[str, str], dict[str, str]] = {}
+    chosen: list[tuple[str, Any]] = [("source", plan.source)]
+    for level in plan.levels:
+        chosen += [(stage, getattr(level, stage)) for stage in ("resample", "merge", "locate", "interpolate")]
+    for stage, choice in chosen:
+        name = choice.contribution.name
+        seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.plugin, "version": choice.version}
+    return list(seen.values())
+
+
+def library_versions() -> dict[str, str]:
+    """Return the versions of Python and of the libraries that the result depends on."""
+    versions = {"python": sys.version.split()[0]}
+    for name in _LIBRARIES:
+        versions[name] = importlib.metadata.version(name)
+    return versions
+
+
+def level_record(result: LevelResult) -> dict[str, Any]:
+    """Describe one level."""
+    located = result.located
+    return {
+        "level": result.level.number,
+        "scale": result.level.scale,
+        "groups": len(result.groups),
+        "group_frames": int(np.median([len(group.span) for group in result.groups])),
+        "pairs": len(located.edges),
+        "located": located.n_located,
+        "failures": list(_failures(result)),
+        "change_px": result.change_px,
+        "residual_px": located.solution.residual_px,
+        "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
+    }
+
+
+def warnings_of(results: Sequence[LevelResult]) -> list[str]:
+    """Say what a user should know of a run that went through."""
+    warnings = []
+    for result in results:
+        located = result.located
+        lost = [str(group) for group, tied in zip(result.groups, located.solution.located, strict=True) if not tied]
+        if lost:
+            warnings.append(
+                f"level {result.level.number}: {len(lost)} of {len(result.groups)} exposures are not located "
+                f"({lost[0]}{' and others' if len(lost) > 1 else ''}); the motion is interpolated across them"
+            )
+        if located.solution.contradictions:
+            edge = located.edges[located.solution.contradictions[0]]
+            warnings.append(
+                f"level {result.level.number}: {len(located.solution.contradictions)} of {len(located.edges)} pairs contradict "
+                f"the others and were outvoted ({_pair(result.groups, edge.moving, edge.fixed)} and others)"
+            )
+    return warnings
+
+
+def peak_memory_bytes() -> int | None:
+    """Return the largest resident size of this process so far; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _failures(result: LevelResult) -> Iterator[dict[str, Any]]:
+    for edge in result.located.failures:
+        moving, fixed = result.groups[edge.moving].span, result.groups[edge.fixed].span
+        assert isinstance(edge.motion, NotLocated)
+        yield {
+            "moving": [moving.start, moving.stop],
+            "fixed": [fixed.start, fixed.stop],
+            "reason": edge.motion.reason,
+            "evidence": dict(edge.motion.evidence),
+        }
+
+
+def _pair(groups: Sequence[Group], moving: int, fixed: int) -> str:
+    return f"{groups[moving]} onto {groups[fixed]}"

@@ -1,0 +1,152 @@
+"""One run, from the capture to the run folder."""
+
+from __future__ import annotations
+
+import datetime
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.errors import InputError
+from photonpano.photometry import tone_mapped
+from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.loop import estimate_motion
+from photonpano.pipeline.panorama import plan_canvas, render
+from photonpano.pipeline.record import (
+    level_record,
+    library_versions,
+    peak_memory_bytes,
+    plugin_records,
+    source_record,
+    warnings_of,
+)
+from photonpano.pipeline.threads import one_thread_inside, thread_count
+from photonpano.values import FrameSpan
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano.pipeline.progress import Progress
+    from photonpano.pipeline.run_folder import RunFolder
+    from photonpano.protocols import Source
+    from photonpano.spec.plan import Plan
+    from photonpano.values import BoolArray, FloatArray, Panorama
+
+_PROBES = 16
+_PROBE_FRAMES = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunOutcome:
+    """What a run found, and what it records of itself.
+
+    Attributes:
+        panorama: flux and weight on the canvas.
+        homographies: (T, 3, 3), frame pixels to reference pixels.
+        located: (T,), False where a frame lies outside what was located.
+        reference: the frame whose homography is the identity.
+        record: the content of `run.json`.
+    """
+
+    panorama: Panorama
+    homographies: FloatArray
+    located: BoolArray
+    reference: int
+    record: dict[str, Any]
+
+    @property
+    def picture(self) -> NDArray[np.uint8]:
+        """The panorama in sRGB, (H, W) uint8."""
+        return tone_mapped(self.panorama.flux, self.record["panorama"]["white_flux"])
+
+
+def execute(plan: Plan, source: Source, version: str, progress: Progress) -> RunOutcome:
+    """Run a plan on its open source: the loop, then the panorama.
+
+    Raises:
+        InputError: the capture shows nothing, or does not suit the plan.
+        LocationError: the motion could not be found.
+        CanvasTooLargeError: the panorama would exceed the memory of the spec.
+    """
+    start = time.perf_counter()
+    threads = thread_count(plan.run)
+    stream = source.info
+    reference = _reference_frame(plan, stream.n_frames)
+    require_photons(source)
+    levels = build_levels(plan, source)
+    with one_thread_inside():
+        results = estimate_motion(source, levels, plan.graph, reference, threads, progress)
+    trajectory = results[-1].trajectory
+    rendering = time.perf_counter()
+    canvas = plan_canvas(trajectory, stream, plan.render.scale, int(plan.run.memory))
+    panorama = render(source, trajectory, canvas, plan.render.tolerance_px, progress)
+    seen = panorama.weight > 0
+    white_flux = float(np.quantile(panorama.flux[seen], plan.render.white_quantile)) or 1.0
+    frames = np.arange(stream.n_frames)
+    located = trajectory.located(frames)
+    warnings = warnings_of(results)
+    if not located.all():
+        warnings.append(f"{np.sum(~located)} of {stream.n_frames} frames lie outside what was located and are left out")
+    now = time.perf_counter()
+    record = {
+        "photonpano": version,
+        "status": "done",
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "spec": plan.document,
+        "spec_file": None,
+        "seed": plan.run.seed,
+        "source": source_record(stream),
+        "plugins": plugin_records(plan),
+        "libraries": library_versions(),
+        "levels": [level_record(result) for result in results],
+        "panorama": {
+            "height": canvas.height,
+            "width": canvas.width,
+            "scale": plan.render.scale,
+            "white_flux": white_flux,
+            "coverage_share": float(seen.mean()),
+            "seconds": round(now - rendering, 3),
+        },
+        "warnings": warnings,
+        "seconds": round(now - start, 3),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+    return RunOutcome(panorama, trajectory.at(frames), located, reference, record)
+
+
+def write_outcome(folder: RunFolder, outcome: RunOutcome, frame_shape: tuple[int, int]) -> None:
+    """Write everything but the report into a run folder."""
+    folder.write_panorama(outcome.panorama, outcome.picture)
+    folder.write_trajectory(outcome.homographies, outcome.located, outcome.panorama.canvas, frame_shape, outcome.reference)
+    folder.write_record(outcome.record)
+
+
+def require_photons(source: Source) -> None:
+    """Look at a few frames all over the capture, and refuse one that is all dark or all lit.
+
+    Raises:
+        InputError: no pixel, or every pixel, is lit in all of them.
+    """
+    n_frames, valid = source.info.n_frames, source.valid
+    starts = np.unique(np.linspace(0, max(0, n_frames - _PROBE_FRAMES), _PROBES).astype(int))
+    spans = [FrameSpan(int(start), min(int(start) + _PROBE_FRAMES, n_frames)) for start in starts]
+    lit = sum(int(source.counts(span)[valid].sum()) for span in spans)
+    seen = sum(len(span) for span in spans)
+    if lit == 0:
+        raise InputError(
+            f"no pixel is lit in any of {seen} frames looked at all over the capture; "
+            "check that the file is the right one, and that the lens was open"
+        )
+    if source.info.kind == "binary" and lit == seen * int(valid.sum()):
+        raise InputError(
+            f"every pixel is lit in all of {seen} frames looked at all over the capture, so that no flux can be told; "
+            "check the layout of the file, or expose less"
+        )
+
+
+def _reference_frame(plan: Plan, n_frames: int) -> int:
+    named = {"first": 0, "middle": n_frames // 2, "last": n_frames - 1}
+    reference = plan.render.reference
+    return named[reference] if isinstance(reference, str) else reference

@@ -1,0 +1,147 @@
+"""The run folder: every file is written whole, and all of them arrive together."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import tifffile
+
+from photonpano.errors import OutputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from photonpano.values import BoolArray, FloatArray, FluxImage, Homography, Panorama
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """A folder in which the files of a run are gathered before they get their final names.
+
+    Attributes:
+        directory: where they end up.
+        staging: where they are written.
+    """
+
+    directory: Path
+    staging: Path
+
+    def write_panorama(self, panorama: Panorama, picture: NDArray[np.uint8]) -> None:
+        """Write panorama.tiff and coverage.tiff (float32), and panorama.png (8 bits, sRGB)."""
+        encoded, png = cv2.imencode(".png", picture)
+        if not encoded:
+            raise OutputError(f"OpenCV could not encode the panorama of {picture.shape} as PNG")
+        with _writing(self.directory):
+            _write_tiff(self.staging / "panorama.tiff", panorama.flux)
+            _write_tiff(self.staging / "coverage.tiff", panorama.weight)
+            (self.staging / "panorama.png").write_bytes(png.tobytes())
+
+    def write_trajectory(
+        self,
+        homographies: FloatArray,
+        located: BoolArray,
+        canvas: Homography,
+        frame_shape: tuple[int, int],
+        reference: int,
+    ) -> None:
+        """Write trajectory.npz.
+
+        Convention:
+            Homographies map frame pixels to reference pixels, the canvas maps reference pixels to panorama pixels; points are
+            (x, y), integers are pixel centres.
+
+        Args:
+            homographies: (T, 3, 3) float64.
+            located: (T,), False where a frame lies outside what was located.
+            canvas: (3, 3) float64.
+            frame_shape: (height, width) of a frame.
+            reference: the frame whose homography is the identity.
+        """
+        with _writing(self.directory):
+            np.savez(
+                self.staging / "trajectory.npz",
+                homographies=homographies,
+                canvas=canvas,
+                frame_shape=np.array(frame_shape),
+                reference=np.array(reference),
+                located=located,
+            )
+
+    def write_record(self, record: Mapping[str, Any]) -> None:
+        """Write run.json."""
+        self._write_text("run.json", json.dumps(record, indent=2, allow_nan=False) + "\n")
+
+    def write_report(self, page: str) -> None:
+        """Write report.html."""
+        self._write_text("report.html", page)
+
+    def _write_text(self, name: str, text: str) -> None:
+        with _writing(self.directory):
+            (self.staging / name).write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def run_folder(directory: Path) -> Iterator[RunFolder]:
+    """Gather the files of a run, and give them their final names when the block ends well.
+
+    The folder is made, and proved to be writable, before the work starts. When the block raises, what was there before stays
+    as it was, and a folder that was not there is gone again.
+
+    Raises:
+        OutputError: the folder cannot be made or written to, or the disk is full.
+    """
+    existed = directory.exists()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=".part-", dir=directory))
+    except OSError as error:
+        raise OutputError(
+            f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
+        ) from error
+    done = False
+    try:
+        yield RunFolder(directory, staging)
+        with _writing(directory):
+            for file in staging.iterdir():
+                _to_disk(file)
+            # The record comes last: where it is new, everything is.
+            for file in sorted(staging.iterdir(), key=lambda file: file.name == "run.json"):
+                file.replace(directory / file.name)
+        done = True
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if not done and not existed:
+            with suppress(OSError):
+                directory.rmdir()
+
+
+@contextmanager
+def _writing(directory: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{directory}: the results could not be written ({error.strerror or error}); what was there before is unchanged. "
+            "Make room, or choose another folder with --output"
+        ) from error
+
+
+def _to_disk(file: Path) -> None:
+    """Make sure that the content has arrived before the name does: a full disk may show as late as here."""
+    with file.open("rb+") as stream:
+        os.fsync(stream.fileno())
+
+
+def _write_tiff(path: Path, image: FluxImage) -> None:
+    tifffile.imwrite(path, image, photometric="minisblack", metadata=None)

@@ -1,0 +1,45 @@
+"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from photonpano import Config
+
+
+class MidpointConfig(Config):
+    """Groups of equal size, twice as dense at each level."""
+
+    group_size: int = Field(500, ge=1, description="frames of a group: more for the dark, fewer for fast motion")
+    endpoints: bool = Field(
+        True,
+        description="from the second level on, also locate the first and the last frame, with off-centre windows "
+        "(supplement S2)",
+    )
+    densify: bool = Field(
+        True,
+        description="add groups between those of the level before; false keeps their number constant, which is the "
+        "paper's failing ablation",
+    )
+
+
+class PhotonMleConfig(Config):
+    """One maximum-likelihood estimate of all photons of a pixel."""
+
+    tolerance_px: float = Field(
+        0.5, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
+    )
+    compensate: bool = Field(
+        True, description="warp along the motion known so far; false averages naively, the paper's baseline"
+    )
+
+
+class LucasKanadeConfig(Config):
+    """A spline through the eight parameters p1..p8."""
+
+    hold_frames: float | None = Field(
+        None,
+        ge=0,
+        description="how many frames beyond the last located instant the velocity is held before the motion stops; "
+        "by default the mean distance of located instants",
+    )

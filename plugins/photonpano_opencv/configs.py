@@ -1,0 +1,28 @@
+"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from photonpano import Config
+
+
+class OpencvSiftConfig(Config):
+    """SIFT keypoints, ratio test, MAGSAC, least squares."""
+
+    max_keypoints: int = Field(2000, ge=16, le=100_000, description="the strongest keypoints of an exposure that are kept")
+    contrast_threshold: float = Field(
+        0.02, ge=0, le=1, description="keypoints with less contrast are dropped; OpenCV's own default is 0.04"
+    )
+    blur_px: float = Field(
+        1.5, ge=0, le=16, description="standard deviation of the Gaussian that quiets photon noise before detection, in px"
+    )
+    ratio: float = Field(0.8, gt=0, le=1, description="a match must be so many times nearer than the second best (Lowe 2004)")
+    search_px: float = Field(
+        20.0, gt=0, description="from the second level on, matches are looked for so far from where the motion known puts them"
+    )
+    threshold_px: float = Field(2.0, gt=0, le=50, description="a match that fits better than this can be an inlier, in px")
+    min_inliers: int = Field(12, ge=5, description="a pair with fewer inliers is not located")
+    max_std_px: float = Field(
+        10.0, gt=0, description="a pair whose matches pin the corners of the frame down less well than this is not located"
+    )

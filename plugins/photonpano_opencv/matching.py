@@ -1,0 +1,82 @@
+"""Which keypoint is which: mutual nearest neighbours with the ratio test, everywhere or near where they should be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def unit_descriptors(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return RootSIFT (Arandjelovic and Zisserman 2012): square roots, so that the scalar product is Hellinger's kernel."""
+    raw = descriptors.astype(np.float32)
+    return np.asarray(np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1)))
+
+
+def match_everywhere(moving: NDArray[np.float32], fixed: NDArray[np.float32], ratio: float) -> NDArray[np.intp]:
+    """Match unit descriptors (M, 128) and (N, 128): pairs of indices (K, 2)."""
+    if min(len(moving), len(fixed)) < 2:
+        return np.zeros((0, 2), dtype=np.intp)
+    similarity = moving @ fixed.T
+    rows = np.arange(len(moving))
+    best = similarity.argmax(axis=1)
+    mutual = similarity.argmax(axis=0)[best] == rows
+    first = similarity[rows, best]
+    similarity[rows, best] = -1
+    second = similarity.max(axis=1)
+    # Unit vectors: the squared distance is 2 - 2 * similarity, and Lowe's ratio is one of distances.
+    clear = (1 - first) <= ratio**2 * (1 - second)
+    chosen = np.flatnonzero(mutual & clear)
+    return np.stack([chosen, best[chosen]], axis=1)
+
+
+def match_nearby(
+    moving: NDArray[np.float32],
+    fixed: NDArray[np.float32],
+    predicted: NDArray[np.float64],
+    points: NDArray[np.float32],
+    radius_px: float,
+    ratio: float,
+) -> NDArray[np.intp]:
+    """Match unit descriptors among fixed keypoints within a radius of where the moving ones are predicted: pairs (K, 2).
+
+    Args:
+        moving: (M, 128) descriptors.
+        fixed: (N, 128) descriptors.
+        predicted: (M, 2) where the moving keypoints should lie in the fixed image, px.
+        points: (N, 2) where the fixed keypoints lie, px.
+        radius_px: how far to look.
+        ratio: of the distances to the best and to the second best candidate; a single candidate needs no second.
+    """
+    if min(len(moving), len(fixed)) == 0:
+        return np.zeros((0, 2), dtype=np.intp)
+    near = cKDTree(predicted).sparse_distance_matrix(cKDTree(points), radius_px, output_type="ndarray")
+    i, j = near["i"], near["j"]
+    similarity = np.einsum("kd,kd->k", moving[i], fixed[j])
+    first, best = _best_two(i, similarity, len(moving))
+    partner, _ = _best_two(j, similarity, len(fixed))
+    k = first[first >= 0]
+    second = best[i[k], 1]
+    mutual = partner[j[k]] == k
+    clear = (1 - similarity[k]) <= ratio**2 * (1 - second)
+    k = k[mutual & clear]
+    return np.stack([i[k], j[k]], axis=1)
+
+
+def _best_two(
+    owner: NDArray[np.intp], similarity: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return, for each owner, which candidate is best (-1 if none), and the similarities of the best and second best."""
+    order = np.lexsort((-similarity, owner))
+    starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
+    best = np.full(count, -1, dtype=np.intp)
+    best[owner[order[starts]]] = order[starts]
+    values = np.full((count, 2), -1, dtype=np.float32)
+    values[owner[order[starts]], 0] = similarity[order[starts]]
+    seconds = starts[np.diff(np.append(starts, len(order))) > 1] + 1
+    values[owner[order[seconds]], 1] = similarity[order[seconds]]
+    return best, values

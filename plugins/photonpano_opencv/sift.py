@@ -1,0 +1,131 @@
+"""SIFT features, matched and fitted: the off-the-shelf locator of the paper, with its accuracy got back by least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import apply, implausibility, normalised
+from photonpano_opencv.fitting import fit_homography
+from photonpano_opencv.matching import match_everywhere, match_nearby, unit_descriptors
+from photonpano_opencv.viewing import stabilised_8_bit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano import VirtualExposure
+    from photonpano_opencv.configs import OpencvSiftConfig
+
+GUIDED_RADII = (1.5, 1.0)
+"""Once a motion is fitted, more matches are looked for near where it puts them; radii in units of `threshold_px`."""
+GUIDED_RATIO = 0.9
+"""Near the right place a match may be less distinct."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiftFeatures:
+    """Keypoints of one exposure.
+
+    Attributes:
+        points: (N, 2) float32, pixel centres are integers.
+        sizes: (N,) float32, diameters of the keypoints in px; their positions err in proportion.
+        descriptors: (N, 128) uint8: what OpenCV returns in float32 holds whole numbers only.
+        shape: (height, width) of the exposure.
+    """
+
+    points: NDArray[np.float32]
+    sizes: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    shape: tuple[int, int]
+
+
+class SiftLocator:
+    """Detects once, matches with the ratio test, finds a consensus, fits all inliers, and checks what came out."""
+
+    def __init__(self, config: OpencvSiftConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+
+    def describe(self, exposure: VirtualExposure) -> SiftFeatures:
+        """Detect keypoints on the variance-stabilised image, where it was seen."""
+        config = self._config
+        image, mask = stabilised_8_bit(exposure, config.blur_px)
+        # A detector for each call: OpenCV does not promise that one may be shared by threads.
+        sift = cv2.SIFT.create(config.max_keypoints, 3, config.contrast_threshold, enable_precise_upscale=True)
+        keypoints, descriptors = sift.detectAndCompute(image, mask)
+        # OpenCV keeps all keypoints that are as strong as the weakest, so there may be more than asked for.
+        keypoints = keypoints[: config.max_keypoints]
+        if descriptors is None:
+            descriptors = np.zeros((0, 128))
+        return SiftFeatures(
+            points=np.array([keypoint.pt for keypoint in keypoints], dtype=np.float32).reshape(-1, 2),
+            sizes=np.array([keypoint.size for keypoint in keypoints], dtype=np.float32),
+            descriptors=descriptors[: config.max_keypoints].astype(np.uint8),
+            shape=exposure.flux.shape,
+        )
+
+    def register(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+        """Match and fit; see `photonpano.Locator`.
+
+        Returns:
+            `NotLocated` with the numbers that decided when too few keypoints match or agree, when they leave the corners of the
+            frame uncertain, or when no camera moves like that.
+        """
+        config = self._config
+        evidence = {"keypoints_moving": float(len(moving.points)), "keypoints_fixed": float(len(fixed.points))}
+        descriptors = unit_descriptors(moving.descriptors), unit_descriptors(fixed.descriptors)
+        if initial is None:
+            pairs = match_everywhere(*descriptors, config.ratio)
+        else:
+            predicted = apply(initial, moving.points)
+            pairs = match_nearby(*descriptors, predicted, fixed.points, config.search_px, config.ratio)
+        evidence["matches"] = float(len(pairs))
+        if len(pairs) < config.min_inliers:
+            return NotLocated(self._too_few("matches", evidence), evidence)
+        homography = self._consensus(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]])
+        if homography is None:
+            return NotLocated(f"{len(pairs)} matches do not agree on any motion", evidence)
+        for radius in GUIDED_RADII:
+            if reason := implausibility(homography, moving.shape):
+                return NotLocated(f"{reason}, from {len(pairs)} matches", evidence)
+            predicted = apply(homography, moving.points)
+            pairs = match_nearby(*descriptors, predicted, fixed.points, radius * config.threshold_px, GUIDED_RATIO)
+            evidence["inliers"] = float(len(pairs))
+            if len(pairs) < config.min_inliers:
+                return NotLocated(self._too_few("inliers", evidence), evidence)
+            fit = fit_homography(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]], homography)
+            homography = fit.homography
+        std_px = fit.corner_std_px(moving.shape)
+        if not std_px <= config.max_std_px:
+            return NotLocated(
+                f"{len(pairs)} inliers leave the corners of the frame uncertain by {std_px:.1f} px, "
+                f"more than max_std_px = {config.max_std_px:g}",
+                evidence,
+            )
+        if reason := implausibility(homography, moving.shape):
+            return NotLocated(f"{reason}, from {len(pairs)} inliers", evidence)
+        return Located(homography, fit.information, fit.residual_px, evidence)
+
+    def _consensus(self, moving: NDArray[np.float32], fixed: NDArray[np.float32]) -> NDArray[np.float64] | None:
+        """Return the homography that most matches agree on (MAGSAC++), None if there is none."""
+        settings = cv2.UsacParams()
+        settings.threshold = self._config.threshold_px
+        settings.confidence = 0.999
+        settings.maxIterations = 5000
+        settings.sampler = cv2.SAMPLING_UNIFORM
+        settings.score = cv2.SCORE_METHOD_MAGSAC
+        settings.loMethod = cv2.LOCAL_OPTIM_SIGMA
+        settings.randomGeneratorState = self._seed
+        homography, _ = cv2.findHomography(moving, fixed, settings)
+        # OpenCV returns nothing, or an empty matrix, when it finds no model.
+        return normalised(homography) if np.shape(homography) == (3, 3) else None
+
+    def _too_few(self, what: str, evidence: dict[str, float]) -> str:
+        return (
+            f"{evidence[what]:.0f} {what}, fewer than min_inliers = {self._config.min_inliers} "
+            f"({evidence['keypoints_moving']:.0f} and {evidence['keypoints_fixed']:.0f} keypoints)"
+        )

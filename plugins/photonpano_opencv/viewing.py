@@ -1,0 +1,40 @@
+"""Exposures as 8-bit images for feature detectors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano import VirtualExposure
+
+_CLIPPED = 0.001
+"""Share of pixels at either end that may become black or white: single hot pixels must not flatten the rest."""
+
+
+def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return an exposure on the scale on which its noise is uniform, blurred against noise, stretched to 8 bits.
+
+    Uniform noise gives every keypoint the same chance; on a linear or sRGB scale the dark or the bright parts drown.
+
+    Returns:
+        The image, (H, W) uint8, and the mask of pixels that were seen, (H, W) uint8, 0 or 255.
+    """
+    known = exposure.weight > 0
+    # Each pixel weighs by how well it is known, so that nothing leaks in from where nothing was seen.
+    weight = np.where(known, exposure.weight, np.float32(0))
+    weighted = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0)) * weight
+    if blur_px > 0:
+        weighted = cv2.GaussianBlur(weighted, (0, 0), blur_px)
+        weight = cv2.GaussianBlur(weight, (0, 0), blur_px)
+    image = weighted / np.maximum(weight, 1e-6)
+    mask = np.where(known, np.uint8(255), np.uint8(0))
+    if not known.any():
+        return np.zeros_like(mask), mask
+    low, high = np.quantile(image[known], (_CLIPPED, 1 - _CLIPPED))
+    stretched = (image - low) * (255 / max(high - low, 1e-6))
+    return np.clip(np.rint(stretched), 0, 255).astype(np.uint8), mask
