@@ -1,42 +1,47 @@
 """photonpano: sharp panoramas from single-photon cameras.
 
 The names here are public: plugins and notebooks import them from `photonpano` and nowhere else, except for the pure
-functions of `photonpano.geometry`, `photonpano.photometry` and `photonpano.merging`.
+functions of `photonpano.geometry`, `photonpano.photometry` and `photonpano.merging`. Each is imported when it is first
+used, so that the help of the command line needs no numpy.
 """
 
-from photonpano.contributions import (
-    Config,
-    InterpolatorContribution,
-    LocatorContribution,
-    MergerContribution,
-    Requirement,
-    ResamplerContribution,
-    SourceContext,
-    SourceContribution,
-    SpecPath,
-    StageContext,
-)
-from photonpano.errors import (
-    CanvasTooLargeError,
-    InputError,
-    LocationError,
-    OutputError,
-    PhotonpanoError,
-    PluginError,
-    SpecError,
-)
-from photonpano.hookspecs import hookimpl
-from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source, Trajectory
-from photonpano.values import (
-    FrameSpan,
-    Group,
-    Located,
-    NotLocated,
-    Panorama,
-    Response,
-    StreamInfo,
-    VirtualExposure,
-)
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from photonpano.contributions import (
+        Config,
+        InterpolatorContribution,
+        LocatorContribution,
+        MergerContribution,
+        Requirement,
+        ResamplerContribution,
+        SourceContext,
+        SourceContribution,
+        SpecPath,
+        StageContext,
+    )
+    from photonpano.errors import (
+        CanvasTooLargeError,
+        InputError,
+        LocationError,
+        OutputError,
+        PhotonpanoError,
+        PluginError,
+        SpecError,
+    )
+    from photonpano.hookspecs import hookimpl
+    from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source, Trajectory
+    from photonpano.values import (
+        FrameSpan,
+        Group,
+        Located,
+        NotLocated,
+        Panorama,
+        Response,
+        StreamInfo,
+        VirtualExposure,
+    )
 
 __version__ = "0.1.0"
 
@@ -74,3 +79,16 @@ __all__ = [
     "VirtualExposure",
     "hookimpl",
 ]
+
+_MODULES = ("errors", "values", "protocols", "contributions", "hookspecs")
+"""Where the public names are defined."""
+
+if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
+
+    def __getattr__(name: str) -> object:
+        if name in __all__:
+            for home in _MODULES:
+                module = import_module(f"photonpano.{home}")
+                if hasattr(module, name):
+                    return getattr(module, name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,67 @@
+"""All commands in one program. Commands import what they need when they run, so that help is quick."""
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+import photonpano
+from photonpano.cli.check import check
+from photonpano.cli.evaluate import evaluate
+from photonpano.cli.explain import explain
+from photonpano.cli.outcome import reported
+from photonpano.cli.plugins import plugins
+from photonpano.cli.run import run
+from photonpano.cli.schema import schema
+from photonpano.cli.simulate import simulate
+
+
+class _Commands(TyperGroup):
+    """The commands; whatever goes wrong in one becomes a message and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that the arguments name."""
+        with reported(debug=ctx.params["debug"]):
+            return super().invoke(ctx)
+
+
+app = typer.Typer(
+    name="photonpano",
+    cls=_Commands,
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+for command in (run, check, explain, simulate, evaluate, schema):
+    app.command()(command)
+app.add_typer(plugins, name="plugins")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"photonpano {photonpano.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def photonpano_options(
+    version: Annotated[  # its callback does the work
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[  # read before the command runs
+        bool, typer.Option("--debug", envvar="PHOTONPANO_DEBUG", help="Show the Python traceback of errors.")
+    ] = False,
+) -> None:
+    """Turn the frames of a single-photon camera into a panorama.
+
+    A spec, a YAML file, names the capture and the method. 'check' it, then 'run' it.
+
+    Exit codes: 0 done, 1 it failed, 2 the spec or the command line is wrong.
+    """
+
+
+def main() -> None:
+    """Run the program with the arguments of the process."""
+    app()

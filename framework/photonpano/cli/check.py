@@ -1,0 +1,24 @@
+"""photonpano check."""
+
+import typer
+
+from photonpano.cli.arguments import Overrides, Spec
+
+
+def check(spec: Spec, overrides: Overrides = None) -> None:
+    """Find everything that is wrong with a spec, without running it.
+
+    Prints each problem with its file, line and column, and ends with exit code 2 if there are any. Opens the capture, so
+    that the stages are checked against its size, and reads none of its frames.
+
+    Example: photonpano check scan.yaml
+    """
+    from photonpano.api import open_source
+    from photonpano.cli.wording import capture_words
+    from photonpano.spec import load_spec
+
+    plan = load_spec(spec, overrides or ())
+    with open_source(plan) as source:
+        count = len(plan.levels)
+        levels = f"{count} level{'' if count == 1 else 's'}"
+        typer.echo(f"{spec}: ok, {levels} on {plan.source.contribution.name}: {capture_words(source.info)}")

@@ -1,0 +1,74 @@
+"""photonpano evaluate."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from photonpano.evaluation import Evaluation, ImageScore
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", show_default=False)],
+    truth: Annotated[
+        Path, typer.Option(metavar="TRUTH.npz", help="The truth that 'simulate' wrote beside the capture.", show_default=False)
+    ],
+    oracle: Annotated[
+        bool,
+        typer.Option("--oracle/--no-oracle", help="Also render along the true motion, which needs the capture and some time."),
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+) -> None:
+    """Score a run against the known truth.
+
+    Corner errors are in pixels of a frame, after the best alignment of the two planes, over the located frames. PSNR and SSIM
+    compare the panorama with the true scene where it was seen. The oracle is the panorama along the true motion.
+
+    Example: photonpano evaluate runs/scan --truth cube.truth.npz
+    """
+    import json
+
+    from photonpano.api import evaluate as evaluate_run
+    from photonpano.cli.progress import progress_for_stderr
+    from photonpano.cli.wording import columns
+
+    evaluation = evaluate_run(run, truth, oracle, progress_for_stderr())
+    typer.echo(json.dumps(_data(evaluation), indent=2) if as_json else columns(_rows(evaluation)))
+
+
+def _rows(evaluation: "Evaluation") -> list[list[str]]:
+    motion = evaluation.trajectory
+    rows = [
+        ["corner error, mean", f"{motion.mean_px:.3f} px"],
+        ["corner error, median", f"{motion.median_px:.3f} px"],
+        ["corner error, 95 %", f"{motion.p95_px:.3f} px"],
+        ["corner error, worst frame", f"{motion.max_px:.3f} px"],
+        ["frames located", f"{100 * motion.located_share:.1f} %"],
+    ]
+    for name, score in (("panorama", evaluation.panorama), ("oracle", evaluation.oracle)):
+        if score is not None:
+            rows += [[f"PSNR, {name}", f"{score.psnr_db:.2f} dB"], [f"SSIM, {name}", f"{score.ssim:.4f}"]]
+    if evaluation.below_oracle_db is not None:
+        rows.append(["PSNR below the oracle", f"{evaluation.below_oracle_db:.2f} dB"])
+    return rows
+
+
+def _data(evaluation: "Evaluation") -> dict[str, Any]:
+    motion = evaluation.trajectory
+    return {
+        "corner_error_px": {
+            "mean": motion.mean_px,
+            "median": motion.median_px,
+            "p95": motion.p95_px,
+            "max": motion.max_px,
+        },
+        "located_share": motion.located_share,
+        "panorama": _scores(evaluation.panorama),
+        "oracle": _scores(evaluation.oracle),
+        "below_oracle_db": evaluation.below_oracle_db,
+    }
+
+
+def _scores(score: "ImageScore | None") -> dict[str, float] | None:
+    return None if score is None else {"psnr_db": score.psnr_db, "ssim": score.ssim, "compared_share": score.compared_share}

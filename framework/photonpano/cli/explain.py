@@ -1,0 +1,102 @@
+"""photonpano explain."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from photonpano.cli.arguments import Overrides, Spec
+
+if TYPE_CHECKING:
+    from photonpano.registry import Catalog
+    from photonpano.spec import Plan
+
+
+def explain(spec: Spec, overrides: Overrides = None) -> None:
+    """Print a spec as it will run, with all defaults.
+
+    The output is a spec itself. Its comments say which plugin gives each stage, what is a default, and how many groups and
+    pairs each level will have.
+
+    Example: photonpano explain scan.yaml > resolved.yaml
+    """
+    from photonpano.api import open_source
+    from photonpano.cli.wording import capture_words
+    from photonpano.pipeline.components import build_levels
+    from photonpano.pipeline.pairs import pairs_of
+    from photonpano.registry import discover
+    from photonpano.spec import load_spec
+
+    catalog = discover()
+    plan = load_spec(spec, overrides or (), catalog=catalog)
+    predictions = []
+    with open_source(plan) as source:
+        capture = capture_words(source.info)
+        for level in build_levels(plan, source):
+            groups = level.resampler.groups(source.info.n_frames, level.number)
+            sizes = sorted({len(group.span) for group in groups})
+            frames = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
+            pairs = len(pairs_of(groups, plan.graph.skips))
+            predictions.append(f"level {level.number}: {len(groups)} groups of {frames} frames, {pairs} pairs")
+    typer.echo(f"# {spec} as it will run, on {capture}")
+    typer.echo("\n".join(_Writer(plan, catalog, predictions).lines()))
+
+
+class _Writer:
+    """Writes a resolved spec as YAML with comments."""
+
+    def __init__(self, plan: "Plan", catalog: "Catalog", levels: Sequence[str]) -> None:
+        self._plan = plan
+        self._catalog = catalog
+        self._levels = levels
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines of the whole spec."""
+        for section, value in self._plan.document.items():
+            if section == "levels":
+                yield "levels:"
+                for index, (level, comment) in enumerate(zip(value, self._levels, strict=True)):
+                    yield f"  # {comment}"
+                    first, *others = self._mapping(level, f"levels.{index}", "")
+                    yield f"  - {first}"
+                    yield from (f"    {line}" for line in others)
+            else:
+                yield from self._mapping({section: value}, "", "")
+
+    def _mapping(self, mapping: Mapping[str, Any], where: str, indent: str) -> Iterator[str]:
+        from photonpano.registry.description import flow
+        from photonpano.spec.tree import joined
+
+        for key, value in mapping.items():
+            path = joined(where, key)
+            if isinstance(value, dict) and value:
+                yield f"{indent}{key}:"
+                yield from self._mapping(value, path, f"{indent}  ")
+            else:
+                remarks = [self._origin(path, value), self._written(path)]
+                comment = ", ".join(filter(None, remarks))
+                yield f"{indent}{key}: {flow(value)}" + (f"  # {comment}" if comment else "")
+
+    def _origin(self, path: str, value: Any) -> str:
+        """Say which plugin gives a component."""
+        from photonpano.registry import KINDS
+
+        *_, section, key = ["", *path.split(".")]
+        kinds = [kind.name for kind in KINDS.values() if kind.section == section]
+        if key != "use" or not kinds:
+            return ""
+        entry = self._catalog.find(kinds[0], value)
+        return f"{entry.plugin} {entry.version}"
+
+    def _written(self, path: str) -> str:
+        """Say where a value comes from, unless it stands in the file as it is."""
+        places = self._plan.places
+        place = places.get(path)
+        if place is None and path.startswith("levels."):
+            _, index, stage, *rest = path.split(".")
+            # A level that does not choose another component goes on from the keys of the stage.
+            if rest and f"levels.{index}.{stage}.use" not in places:
+                place = places.get(".".join([stage, *rest]))
+        if place is not None and place.override is not None:
+            return "--set"
+        return "default" if place is None or place.line is None else ""

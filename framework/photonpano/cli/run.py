@@ -1,0 +1,35 @@
+"""photonpano run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from photonpano.cli.arguments import Overrides, Spec
+
+
+def run(
+    spec: Spec,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="The run folder, in place of the spec's.", show_default=False),
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Make the panorama of a spec.
+
+    Writes the run folder: panorama.png to look at, panorama.tiff with the linear flux, coverage.tiff, trajectory.npz,
+    run.json with everything that was used and found, and report.html.
+
+    Example: photonpano run scan.yaml --output runs/first --set render.scale=2
+    """
+    from photonpano.api import run as run_plan
+    from photonpano.cli.outcome import warn
+    from photonpano.cli.progress import progress_for_stderr
+    from photonpano.spec import load_spec
+
+    result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())
+    for warning in result.record["warnings"]:
+        warn(warning)
+    typer.echo(f"panorama  {result.directory / 'panorama.png'}")
+    typer.echo(f"report    {result.directory / 'report.html'}")
