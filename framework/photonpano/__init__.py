@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from photonpano.api import RunResult, evaluate, open_source, run
     from photonpano.contributions import (
         Config,
         InterpolatorContribution,
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     )
     from photonpano.hookspecs import hookimpl
     from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source, Trajectory
+    from photonpano.registry import Catalog, discover
+    from photonpano.spec import Plan, load_spec, parse_spec
     from photonpano.values import (
         FrameSpan,
         Group,
@@ -47,6 +50,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "CanvasTooLargeError",
+    "Catalog",
     "Config",
     "FrameSpan",
     "Group",
@@ -63,11 +67,13 @@ __all__ = [
     "OutputError",
     "Panorama",
     "PhotonpanoError",
+    "Plan",
     "PluginError",
     "Requirement",
     "Resampler",
     "ResamplerContribution",
     "Response",
+    "RunResult",
     "Source",
     "SourceContext",
     "SourceContribution",
@@ -77,10 +83,16 @@ __all__ = [
     "StreamInfo",
     "Trajectory",
     "VirtualExposure",
+    "discover",
+    "evaluate",
     "hookimpl",
+    "load_spec",
+    "open_source",
+    "parse_spec",
+    "run",
 ]
 
-_MODULES = ("errors", "values", "protocols", "contributions", "hookspecs")
+_MODULES = ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "spec")
 """Where the public names are defined."""
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
