@@ -42,7 +42,6 @@ class Bars:
 
 
 def _bar(console: Console, unit: str) -> RichProgress:
-    from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
     from rich.text import Text
@@ -58,7 +57,6 @@ def _bar(console: Console, unit: str) -> RichProgress:
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn(escape(unit)),
         Rate(),
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         console=console,

@@ -1,0 +1,55 @@
+# Needs Python 3.11 or newer, with venv and pip. Everything else goes into a virtual environment of its own.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/installed
+STEP := @printf '\n== %s\n'
+
+.PHONY: help install test demo bench clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo 'make demo     simulate a small capture, make its panorama, and score it'
+	@echo 'make test     run all checks and tests'
+	@echo 'make bench    run the benchmarks, which takes long'
+	@echo 'make install  make the virtual environment $(VENV)'
+	@echo 'make clean    remove the virtual environment, the demo and caches'
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(STEP) 'installing into $(VENV)'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: photonpano needs Python 3.11 or newer; try: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+test: $(INSTALLED)
+	$(STEP) 'ruff check'
+	@$(BIN)/ruff check .
+	$(STEP) 'ruff format'
+	@$(BIN)/ruff format --check .
+	$(STEP) 'mypy'
+	@$(BIN)/mypy
+	$(STEP) 'import-linter'
+	@$(BIN)/lint-imports
+	$(STEP) 'pytest'
+	@$(BIN)/pytest
+
+demo: $(INSTALLED)
+	@mkdir -p demo
+	$(STEP) 'simulating a capture'
+	@$(BIN)/photonpano simulate examples/pipelines/demo-capture.yaml --output demo/capture.npy
+	$(STEP) 'making its panorama (a minute or two)'
+	@$(BIN)/photonpano run examples/pipelines/demo.yaml
+	$(STEP) 'comparing it with the truth'
+	@$(BIN)/photonpano evaluate demo/run --truth demo/capture.truth.npz
+	$(STEP) 'to look at: demo/run/panorama.png and demo/run/report.html'
+
+bench: $(INSTALLED)
+	$(STEP) 'benchmarks'
+	@$(BIN)/pytest tests/benchmarks -s
+
+clean:
+	rm -rf $(VENV) demo dist .*_cache .benchmarks .hypothesis
+	find framework plugins tests -name __pycache__ -prune -exec rm -rf {} +
