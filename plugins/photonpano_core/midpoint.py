@@ -23,7 +23,8 @@ class MidpointResampler:
 
         The k groups are spread evenly, so that the first starts at frame 0 and the last ends with the capture; frames that do
         not fill a group are left out between groups at level 1, never at one end. References are the centres, but for the
-        end groups, whose references are the first and the last frame.
+        end groups, whose references are the first and the last frame. No instant comes twice: where groups start at every
+        frame, there is nothing between them.
 
         Raises:
             InputError: the capture has fewer frames than a group.
@@ -33,12 +34,12 @@ class MidpointResampler:
             raise InputError(problem)
         count = n_frames // size
         density = 2 ** (level - 1) if self._config.densify else 1
-        starts = np.rint(np.linspace(0, n_frames - size, (count - 1) * density + 1)).astype(int)
+        starts = np.unique(np.rint(np.linspace(0, n_frames - size, (count - 1) * density + 1)).astype(int))
         if count == 1:
             starts = np.array([(n_frames - size) // 2])
         spans = [FrameSpan(int(start), int(start) + size) for start in starts]
         groups = [Group(span, span.centre) for span in spans]
-        if level > 1 and self._config.endpoints:
+        if level > 1 and self._config.endpoints and size > 1:
             first, last = FrameSpan(0, size), FrameSpan(n_frames - size, n_frames)
             groups = [Group(first, 0.0), *groups, Group(last, float(n_frames - 1))]
         return tuple(groups)

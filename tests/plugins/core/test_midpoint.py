@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano import FrameSpan, Group, InputError, StreamInfo
+from photonpano_core.configs import MidpointConfig
+from photonpano_core.hooks import photonpano_resamplers
+from photonpano_core.midpoint import MidpointResampler
+
+
+def groups(n_frames: int, level: int, group_size: int = 100, **config: bool) -> tuple[Group, ...]:
+    return MidpointResampler(MidpointConfig(group_size=group_size, **config)).groups(n_frames, level)
+
+
+def spans(*starts: int, size: int = 100) -> list[FrameSpan]:
+    return [FrameSpan(start, start + size) for start in starts]
+
+
+def test_the_first_level_fills_the_capture_side_by_side() -> None:
+    found = groups(400, 1)
+    assert [group.span for group in found] == spans(0, 100, 200, 300)
+    assert [group.reference for group in found] == [49.5, 149.5, 249.5, 349.5]
+
+
+def test_the_second_level_adds_a_group_between_every_two_and_one_at_each_end() -> None:
+    found = groups(400, 2)
+    assert [group.span for group in found] == spans(0, 0, 50, 100, 150, 200, 250, 300, 300)
+    assert [group.reference for group in found] == [0, 49.5, 99.5, 149.5, 199.5, 249.5, 299.5, 349.5, 399]
+
+
+def test_frames_that_fill_no_group_are_left_out_between_groups() -> None:
+    assert [group.span for group in groups(460, 1)] == spans(0, 120, 240, 360)
+
+
+def test_a_single_group_lies_in_the_middle() -> None:
+    assert [group.span for group in groups(160, 1)] == spans(30)
+    assert [group.reference for group in groups(160, 2)] == [0, 79.5, 159]
+
+
+@pytest.mark.parametrize(("level", "count"), [(1, 10), (2, 19), (3, 37), (4, 73)])
+def test_levels_get_denser_as_in_the_paper(level: int, count: int) -> None:
+    ends = 2 if level > 1 else 0
+    assert len(groups(1000, level)) == count + ends
+    assert len(groups(1000, level, endpoints=False)) == count
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_the_ablation_keeps_the_number_of_groups(level: int) -> None:
+    assert groups(1000, level, densify=False, endpoints=False) == groups(1000, 1)
+
+
+@given(group_size=st.integers(1, 300), more=st.integers(0, 1500), level=st.integers(1, 4))
+def test_any_capture_is_covered_evenly(group_size: int, more: int, level: int) -> None:
+    n_frames = group_size + more
+    found = groups(n_frames, level, group_size)
+    assert all(len(group.span) == group_size and group.span.stop <= n_frames for group in found)
+    references = [group.reference for group in found]
+    assert all(earlier < later for earlier, later in pairwise(references))
+    if level > 1:
+        assert (references[0], references[-1]) == (0, n_frames - 1)
+        assert (found[0].span.start, found[-1].span.stop) == (0, n_frames)
+    centred = groups(n_frames, level, group_size, endpoints=False)
+    assert all(group.reference == group.span.centre for group in centred)
+    count = n_frames // group_size
+    distance = (n_frames - group_size) / max(1, (count - 1) * 2 ** (level - 1))
+    if distance >= 1:
+        assert len(centred) == (count - 1) * 2 ** (level - 1) + 1
+        assert all(abs(later.reference - earlier.reference - distance) <= 1 for earlier, later in pairwise(centred))
+    if count > 1:
+        assert (centred[0].span.start, centred[-1].span.stop) == (0, n_frames)
+
+
+@given(group_size=st.integers(1, 300), count=st.integers(1, 20), rest=st.integers(0, 299))
+def test_the_first_level_has_as_many_groups_as_fit_and_they_share_no_frame(group_size: int, count: int, rest: int) -> None:
+    found = groups(group_size * count + rest % group_size, 1, group_size)
+    assert len(found) == count
+    assert all(earlier.span.stop <= later.span.start for earlier, later in pairwise(found))
+
+
+TOO_SHORT = (
+    "the capture has 99 frames, fewer than one group of 100; set group_size to 24 or less, so that at least four groups fit"
+)
+
+
+def test_a_capture_shorter_than_a_group_is_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        groups(99, 1)
+    assert str(caught.value) == TOO_SHORT
+
+
+def test_it_is_refused_before_the_run() -> None:
+    (contribution,) = photonpano_resamplers()
+    assert contribution.check(MidpointConfig(group_size=100), StreamInfo(99, 8, 8, None)) == [TOO_SHORT]
+    assert contribution.check(MidpointConfig(group_size=100), StreamInfo(100, 8, 8, None)) == []
