@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group
+from photonpano.geometry import translation
+from photonpano.merging import accumulate, chunks_of
+from photonpano_core.configs import PhotonMleConfig
+from photonpano_core.photon_mle import PhotonMleMerger
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from photonpano import Source
+
+N = 60
+GROUP = Group(FrameSpan(0, N), 29.5)
+SPEED_PX = 0.25
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    """(40, 80) of stripes, 8 px wide."""
+    return np.tile(np.where(np.arange(80) // 8 % 2, 0.9, 0.2), (40, 1))
+
+
+@pytest.fixture(scope="module")
+def still(memory_source: type, scene: np.ndarray) -> Source:
+    return memory_source(np.random.default_rng(0).random((N, 40, 48)) < scene[:, :48])
+
+
+@pytest.fixture(scope="module")
+def panning(memory_source: type, scene: np.ndarray) -> Source:
+    """Frame t shows the scene from SPEED_PX * t on, rounded to whole pixels."""
+    rng = np.random.default_rng(0)
+    starts = np.floor(SPEED_PX * np.arange(N)).astype(int)
+    return memory_source(np.array([rng.random((40, 48)) < scene[:, start : start + 48] for start in starts]))
+
+
+def merger(**config: object) -> PhotonMleMerger:
+    return PhotonMleMerger(PhotonMleConfig.model_validate(config))
+
+
+def test_the_first_level_sums_frames_where_they_lie(still: Source) -> None:
+    exposure = merger().merge(still, GROUP, None, 1.0)
+    expected = still.response.flux((still.counts(GROUP.span) / N).astype(np.float32), N)
+    np.testing.assert_allclose(exposure.flux, expected, rtol=1e-6)
+    np.testing.assert_array_equal(exposure.weight, np.full((40, 48), N))
+    assert (exposure.group, exposure.scale, exposure.response) == (GROUP, 1.0, still.response)
+
+
+def test_only_the_frames_of_the_group_count(still: Source) -> None:
+    exposure = merger().merge(still, Group(FrameSpan(10, 30), 15), None, 1.0)
+    np.testing.assert_array_equal(exposure.weight, np.full((40, 48), 20))
+
+
+def test_known_motion_makes_edges_sharp(panning: Source, scene: np.ndarray, pan: Callable) -> None:
+    """At frame 29.5 the scene begins at 7 px: frames see whole pixels, so the true start is floor(29.5 / 4)."""
+    motion = pan(SPEED_PX)
+    compensated = merger(tolerance_px=0.25).merge(panning, GROUP, motion, 1.0)
+    naive = merger(compensate=False).merge(panning, GROUP, motion, 1.0)
+    true = -np.log1p(-scene[:, 7 : 7 + 48])
+    inside = (slice(None), slice(8, 40))
+    errors = [np.sqrt(np.mean((exposure.flux - true)[inside] ** 2)) for exposure in (compensated, naive)]
+    assert errors[0] < 0.4
+    assert errors[1] > 2 * errors[0]
+
+
+def test_warps_are_relative_to_the_reference_instant_of_the_group(panning: Source, pan: Callable) -> None:
+    """A camera that stands far away on the plane, or a plane that is turned, gives the same exposure."""
+    motion = pan(SPEED_PX)
+    there = type(motion)(lambda frame: translation(5000, -300) @ motion.at([frame])[0])
+    np.testing.assert_allclose(
+        merger().merge(panning, GROUP, there, 1.0).flux, merger().merge(panning, GROUP, motion, 1.0).flux, atol=1e-3
+    )
+
+
+def test_an_end_group_is_seen_from_its_end(panning: Source, pan: Callable) -> None:
+    exposure = merger().merge(panning, Group(FrameSpan(0, N), 0.0), pan(SPEED_PX), 1.0)
+    # Later frames see further right, so that the left border of the first one is seen by it and few others.
+    assert exposure.weight[20, 0] < N / 4
+    assert exposure.weight[20, 40] == pytest.approx(N)
+
+
+@pytest.mark.parametrize(("scale", "shape"), [(0.5, (20, 24)), (2.0, (80, 96)), (0.3, (12, 14))])
+def test_the_scale_is_pixels_of_the_exposure_per_pixel_of_the_frame(
+    panning: Source, pan: Callable, scale: float, shape: tuple[int, int]
+) -> None:
+    exposure = merger().merge(panning, GROUP, pan(SPEED_PX), scale)
+    assert (exposure.flux.shape, exposure.scale) == (shape, scale)
+    assert exposure.flux.dtype == exposure.weight.dtype == np.float32
+    full = merger().merge(panning, GROUP, pan(SPEED_PX), 1.0)
+    means = [np.nanmean(exposure.response.mean_count(image.flux)) for image in (exposure, full)]
+    assert means[0] == pytest.approx(means[1], rel=0.03)
+
+
+def test_it_sums_chunks_as_the_tolerance_says(panning: Source, pan: Callable) -> None:
+    motion = pan(SPEED_PX)
+    to_reference = translation(-SPEED_PX * GROUP.reference, 0)
+    for tolerance_px in (0.25, 4.0):
+        chunks = chunks_of(GROUP.span, motion, (40, 48), tolerance_px)
+        expected, _ = accumulate(panning, chunks, to_reference, (40, 48)).estimate(panning.response)
+        exposure = merger(tolerance_px=tolerance_px).merge(panning, GROUP, motion, 1.0)
+        np.testing.assert_allclose(exposure.flux, expected, atol=1e-3)

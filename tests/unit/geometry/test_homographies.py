@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano.geometry import (
+    apply,
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    jacobian,
+    normalised,
+    parameters,
+    rescaled,
+    rescaling,
+    translation,
+)
+
+small = st.floats(-0.2, 0.2)
+shift = st.floats(-500, 500)
+perspective = st.floats(-1e-4, 1e-4)
+homographies = st.builds(lambda *p: from_parameters(p), small, small, small, small, shift, shift, perspective, perspective)
+points = st.lists(st.tuples(st.floats(-10, 600), st.floats(-10, 300)), min_size=1, max_size=5).map(np.array)
+
+
+def test_a_homography_divides_by_the_depth() -> None:
+    tilted = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.001, 0.0, 1.0]])
+    np.testing.assert_allclose(apply(tilted, [[100, 50], [0, 0]]), [[105 / 1.1, 50 / 1.1], [5, 0]])
+
+
+def test_x_is_the_column_and_y_the_row() -> None:
+    image = np.zeros((5, 7), np.float32)
+    image[1, 2] = 1
+    moved = cv2.warpPerspective(image, translation(3, 1), (7, 5))
+    x, y = apply(translation(3, 1), [[2, 1]])[0]
+    assert (x, y) == (5, 2)
+    assert moved[int(y), int(x)] == 1
+
+
+def test_a_point_on_the_horizon_goes_to_infinity_without_a_warning() -> None:
+    horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
+    assert np.isinf(apply(horizon, [[100, 50]])).all()
+
+
+def test_stacks_map_one_set_of_points_or_one_each() -> None:
+    stack = np.stack([translation(1, 0), translation(0, 2)])
+    np.testing.assert_array_equal(apply(stack, [[5, 5]]), [[[6, 5]], [[5, 7]]])
+    np.testing.assert_array_equal(apply(stack, [[[5, 5]], [[0, 0]]]), [[[6, 5]], [[0, 2]]])
+
+
+@given(homographies, points)
+def test_the_inverse_undoes(homography: np.ndarray, where: np.ndarray) -> None:
+    np.testing.assert_allclose(apply(inverse(homography), apply(homography, where)), where, atol=1e-6)
+    assert inverse(homography)[2, 2] == 1
+
+
+@given(homographies, homographies, points)
+def test_products_apply_the_right_factor_first(first: np.ndarray, second: np.ndarray, where: np.ndarray) -> None:
+    together = normalised(second @ first)
+    np.testing.assert_allclose(apply(together, where), apply(second, apply(first, where)), atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)])
+def test_what_has_no_h33_of_one_is_refused(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="a homography must be finite and have h33 other than 0"):
+        normalised(bad)
+
+
+def test_rescaling_keeps_pixel_edges_in_place() -> None:
+    """The edges of the image lie at -0.5; the first pixel of a half-size image covers the first two."""
+    np.testing.assert_allclose(apply(rescaling(0.5), [[-0.5, -0.5], [0.5, 0.5]]), [[-0.5, -0.5], [0, 0]])
+    np.testing.assert_allclose(apply(rescaling(2), [[0, 0], [7.5, 3.5]]), [[0.5, 0.5], [15.5, 7.5]])
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0, 3.0])
+def test_rescaling_agrees_with_opencv(scale: float) -> None:
+    ramp = np.tile(np.arange(24, dtype=np.float32), (12, 1))
+    resized = cv2.resize(ramp, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+    inside = resized[5, int(scale) : -int(scale) or None]
+    columns = np.arange(len(resized[5]))[int(scale) : -int(scale) or None]
+    back = apply(inverse(rescaling(scale)), np.stack([columns, np.full(len(columns), 5)], axis=1))[:, 0]
+    np.testing.assert_allclose(inside, back, atol=1e-5)
+
+
+@given(homographies, points, st.sampled_from([0.25, 0.5, 2.0, 3.0]))
+def test_a_rescaled_motion_is_the_same_motion(homography: np.ndarray, where: np.ndarray, scale: float) -> None:
+    to_scaled = rescaling(scale)
+    expected = apply(to_scaled, apply(homography, where))
+    np.testing.assert_allclose(apply(rescaled(homography, scale), apply(to_scaled, where)), expected, atol=1e-6)
+
+
+def test_rescaling_doubles_a_translation() -> None:
+    np.testing.assert_allclose(rescaled(translation(3, -1), 2), translation(6, -2), atol=1e-12)
+
+
+def test_the_parameters_stand_as_in_the_paper() -> None:
+    p = np.arange(1, 9) / 10
+    expected = [[1 + p[0], p[2], p[4]], [p[1], 1 + p[3], p[5]], [p[6], p[7], 1]]
+    np.testing.assert_allclose(from_parameters(p), expected)
+    np.testing.assert_array_equal(from_parameters(np.zeros((2, 8))), np.stack([np.eye(3)] * 2))
+
+
+@given(st.lists(homographies, min_size=1, max_size=4).map(np.stack))
+def test_parameters_round_trip(stack: np.ndarray) -> None:
+    assert parameters(stack).shape == (len(stack), 8)
+    np.testing.assert_allclose(from_parameters(parameters(stack)), stack, rtol=0, atol=1e-12)
+
+
+@given(homographies, points)
+def test_the_jacobian_agrees_with_finite_differences(homography: np.ndarray, where: np.ndarray) -> None:
+    p = parameters(homography)
+    steps = np.diag([1e-6] * 4 + [1e-4] * 2 + [1e-9] * 2)
+    differences = [
+        (apply(from_parameters(p + step), where) - apply(from_parameters(p - step), where)) / (2 * step.max()) for step in steps
+    ]
+    derivatives = jacobian(homography, where)
+    assert derivatives.shape == (len(where), 2, 8)
+    # The derivatives by p7 and p8 grow with the square of the coordinates.
+    np.testing.assert_allclose(derivatives, np.stack(differences, axis=-1), rtol=1e-4, atol=1e-2)
+
+
+def test_corners_are_pixel_centres_clockwise() -> None:
+    np.testing.assert_array_equal(corners((3, 5)), [[0, 0], [4, 0], [4, 2], [0, 2]])
+
+
+def test_corner_displacements_are_distances() -> None:
+    stack = np.stack([np.eye(3), translation(3, 4)])
+    np.testing.assert_allclose(corner_displacements(stack, np.eye(3), (3, 5)), [[0] * 4, [5] * 4])

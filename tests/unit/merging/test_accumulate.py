@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan
+from photonpano.geometry import from_parameters, rescaling, translation
+from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of
+from photonpano.photometry import BinaryResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (30, 40)
+FLUX = 0.7
+
+
+def frames_of(flux: np.ndarray | float, n: int, seed: int = 0) -> np.ndarray:
+    """Bernoulli frames of a still scene."""
+    return np.random.default_rng(seed).random((n, *SHAPE)) < -np.expm1(-np.asarray(flux))
+
+
+def still(n: int, homography: np.ndarray | None = None) -> list[Chunk]:
+    return [Chunk(FrameSpan(0, n), np.eye(3) if homography is None else homography)]
+
+
+def test_a_still_capture_gives_its_counts(memory_source: type) -> None:
+    source = memory_source(frames_of(FLUX, 50))
+    photons = accumulate(source, still(50), np.eye(3), SHAPE)
+    np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
+    np.testing.assert_array_equal(photons.weight, np.full(SHAPE, 50))
+
+
+def test_chunks_of_a_still_capture_add_up(memory_source: type) -> None:
+    source = memory_source(frames_of(FLUX, 50))
+    halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
+    told: list[int] = []
+    photons = accumulate(source, halves, np.eye(3), SHAPE, told.append)
+    np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
+    assert told == [20, 30]
+
+
+def test_a_whole_pixel_shift_moves_counts_and_weight_without_loss(memory_source: type) -> None:
+    source = memory_source(frames_of(FLUX, 50))
+    photons = accumulate(source, still(50, translation(3, -2)), translation(10, 10), (60, 70))
+    there = (slice(8, 38), slice(13, 53))
+    np.testing.assert_allclose(photons.counts[there], source.counts(FrameSpan(0, 50)), rtol=1e-6)
+    assert photons.weight.sum() == pytest.approx(50 * 30 * 40)
+    assert np.count_nonzero(photons.weight) == 30 * 40
+
+
+def test_a_frame_off_the_grid_leaves_nothing(memory_source: type) -> None:
+    photons = accumulate(memory_source(frames_of(FLUX, 5)), still(5, translation(500, 0)), np.eye(3), SHAPE)
+    assert not photons.counts.any()
+    assert not photons.weight.any()
+
+
+def test_a_frame_half_off_the_grid_keeps_its_half(memory_source: type) -> None:
+    source = memory_source(frames_of(FLUX, 5))
+    photons = accumulate(source, still(5, translation(-15, 0)), np.eye(3), SHAPE)
+    np.testing.assert_allclose(photons.counts[:, :25], source.counts(FrameSpan(0, 5))[:, 15:], rtol=1e-6)
+    assert not photons.weight[:, 25:].any()
+
+
+def test_counts_and_weight_are_spread_alike(memory_source: type) -> None:
+    """Half a pixel on, every pixel is the mean of two; at the border half a frame is missing."""
+    source = memory_source(frames_of(FLUX, 50))
+    photons = accumulate(source, still(50, translation(0.5, 0)), np.eye(3), SHAPE)
+    counts = source.counts(FrameSpan(0, 50)).astype(float)
+    np.testing.assert_allclose(photons.counts[:, 1:], (counts[:, :-1] + counts[:, 1:]) / 2, rtol=1e-5)
+    np.testing.assert_allclose(photons.counts[:, 0], counts[:, 0] / 2, rtol=1e-5)
+    np.testing.assert_allclose(photons.weight[:, :2], [[25, 50]] * 30, rtol=1e-5)
+
+
+def test_chunks_come_within_their_tolerance_of_warping_every_frame(memory_source: type, known_motion: type) -> None:
+    """Frames of a scene that is smooth: misplaced by at most d px, a count errs by d times its slope."""
+    n, tolerance_px = 80, 0.5
+    motion = known_motion(lambda frame: from_parameters(np.array([1e-4, 5e-4, -5e-4, 0, 0.11, 0.05, 1e-6, 0]) * frame))
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    bright = 0.5 + 0.4 * np.sin(x / 4) * np.cos(y / 5)
+    frames = frames_of(-np.log1p(-bright), n)
+    source = memory_source(frames)
+    chunks = chunks_of(FrameSpan(0, n), motion, SHAPE, tolerance_px)
+    assert 10 < len(chunks) < n / 2
+    grid = (50, 60)
+    onto = translation(5, 5)
+    quick = accumulate(source, chunks, onto, grid)
+    counts, weight = np.zeros(grid), np.zeros(grid)
+    for frame, homography in zip(frames, motion.at(range(n)), strict=True):
+        for total, image in ((counts, frame), (weight, np.ones(SHAPE))):
+            total += cv2.warpPerspective(image.astype(np.float32), onto @ homography, grid[::-1])
+    inside = weight > n - 0.5
+    assert inside.sum() > 400
+    # Smooth the photon noise away, which moves with the chunks: what is left is the misplacement.
+    misplaced = cv2.GaussianBlur(np.where(inside, quick.counts - counts, 0), (0, 0), 2) / n
+    slope = 0.4 / 4
+    assert np.abs(misplaced).max() < slope * tolerance_px / 2
+    np.testing.assert_allclose(quick.weight[inside], n, atol=1)
+    assert abs(quick.weight.sum() / weight.sum() - 1) < 0.01
+
+
+def test_the_flux_of_bernoulli_frames_is_unbiased(memory_source: type, pan: Callable) -> None:
+    """The mean over P pixels of n frames errs by sqrt((exp(f) - 1) / (n P)), wherever the camera looks."""
+    n = 200
+    source = memory_source(frames_of(FLUX, n))
+    chunks = chunks_of(FrameSpan(0, n), pan(0.013), SHAPE, 0.25)
+    flux, weight = accumulate(source, chunks, np.eye(3), SHAPE).estimate(source.response)
+    known = flux[weight > n - 1]
+    bias = np.expm1(FLUX) / (2 * n)
+    std = np.sqrt(np.expm1(FLUX) / (n * known.size))
+    assert abs(known.mean() - FLUX - bias) < 4 * std
+    assert abs(known.mean() - FLUX) < 0.01
+
+
+def test_the_noise_of_a_still_flux_is_that_of_its_photons(memory_source: type) -> None:
+    n = 200
+    source = memory_source(frames_of(FLUX, n))
+    flux, _ = accumulate(source, still(n), np.eye(3), SHAPE).estimate(source.response)
+    # 1,200 pixels tell a standard deviation to 2 %.
+    assert flux.std() == pytest.approx(np.sqrt(np.expm1(FLUX) / n), rel=0.08)
+
+
+@pytest.fixture
+def masked(memory_source: type) -> object:
+    """A capture with one pixel that is always lit, and is masked."""
+    frames = frames_of(FLUX, 200)
+    frames[:, 10, 20] = True
+    valid = np.ones(SHAPE, bool)
+    valid[10, 20] = False
+    return memory_source(frames, valid)
+
+
+def test_a_masked_pixel_of_a_still_camera_is_unknown(masked) -> None:
+    flux, weight = accumulate(masked, still(200), np.eye(3), SHAPE).estimate(masked.response)
+    assert weight[10, 20] == 0
+    assert np.isnan(flux[10, 20])
+    assert np.isnan(flux).sum() == 1
+
+
+def test_motion_fills_a_masked_pixel_without_its_light(masked, pan: Callable) -> None:
+    chunks = chunks_of(FrameSpan(0, 200), pan(0.02), SHAPE, 0.25)
+    flux, weight = accumulate(masked, chunks, np.eye(3), SHAPE).estimate(masked.response)
+    seen = weight[10, 20:25]
+    assert np.all((seen > 50) & (seen < 190))
+    # Lit in every frame it would be ln(400); it is as the others, within five times the noise.
+    np.testing.assert_allclose(flux[10, 20:25], FLUX, atol=5 * np.sqrt(np.expm1(FLUX) / 50))
+
+
+@pytest.mark.parametrize("factor", [2, 3, 5])
+def test_shrinking_keeps_the_photons(memory_source: type, factor: int) -> None:
+    """Of 30x40 px, 3 and 5 do not divide all sides: what is missing of the last pixels is unseen, not dark."""
+    source = memory_source(frames_of(FLUX, 50))
+    grid = (-(-SHAPE[0] // factor), -(-SHAPE[1] // factor))
+    photons = accumulate(source, still(50), rescaling(1 / factor), grid)
+    assert photons.counts.sum() * factor**2 == pytest.approx(int(source.counts(FrameSpan(0, 50)).sum()), rel=1e-6)
+    assert photons.weight.sum() * factor**2 == pytest.approx(50 * SHAPE[0] * SHAPE[1], rel=1e-6)
+    flux, _ = photons.estimate(source.response)
+    assert np.nanmean(flux) == pytest.approx(FLUX, abs=0.02)
+
+
+def test_a_pixel_of_a_halved_image_is_the_mean_of_four(memory_source: type) -> None:
+    source = memory_source(frames_of(FLUX, 50))
+    photons = accumulate(source, still(50), rescaling(0.5), (15, 20))
+    blocks = source.counts(FrameSpan(0, 50)).reshape(15, 2, 20, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(photons.counts, blocks, rtol=1e-6)
+
+
+def test_the_weight_is_the_number_of_frames(memory_source: type, pan: Callable) -> None:
+    """A pan of one pixel a frame over 40 px: column c of the plane is seen in min(c, 39) + 1 of the first 60 frames."""
+    source = memory_source(frames_of(FLUX, 60))
+    chunks = chunks_of(FrameSpan(0, 60), pan(1), SHAPE, 0.25)
+    photons = accumulate(source, chunks, np.eye(3), (30, 60))
+    np.testing.assert_allclose(photons.weight, np.tile(np.minimum(np.arange(60), 39) + 1, (30, 1)), rtol=1e-5)
+
+
+def test_less_than_one_frame_is_no_estimate() -> None:
+    counts, weight = np.float32([[0.5, 0.5, 3]]), np.float32([[0.99, 1, 4]])
+    flux, known = PhotonSum(counts, weight).estimate(BinaryResponse())
+    np.testing.assert_array_equal(known, [[0, 1, 4]])
+    np.testing.assert_allclose(flux, [[np.nan, np.log(2), np.log(4)]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("shift_px", [0.01, 0.1, 1 / 64])
+def test_warps_are_exact_below_a_thirty_second_of_a_pixel(memory_source: type, shift_px: float) -> None:
+    """OpenCV 4 rounds bilinear coordinates to 1/32 px: there, 0.01 px would do nothing at all."""
+    ramp = np.arange(100)[:, None, None] < np.arange(SHAPE[1])  # column x is lit in x of 100 frames
+    source = memory_source(np.broadcast_to(ramp, (100, *SHAPE)))
+    photons = accumulate(source, still(100, translation(shift_px, 0)), np.eye(3), SHAPE)
+    inside = (slice(1, -1), slice(1, -1))
+    np.testing.assert_allclose(photons.counts[inside], np.arange(SHAPE[1])[None, 1:-1].repeat(28, 0) - shift_px, atol=2e-4)

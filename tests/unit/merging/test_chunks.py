@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano import FrameSpan
+from photonpano.geometry import corner_displacements, from_parameters, inverse, translation
+from photonpano.merging import chunks_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (30, 40)
+
+
+def test_a_still_camera_needs_one_chunk(pan: Callable) -> None:
+    (chunk,) = chunks_of(FrameSpan(5, 105), pan(0), SHAPE, 0.25)
+    assert chunk.span == FrameSpan(5, 105)
+    np.testing.assert_array_equal(chunk.homography, np.eye(3))
+
+
+def test_a_pan_is_cut_where_it_has_moved_by_the_tolerance(pan: Callable) -> None:
+    chunks = chunks_of(FrameSpan(10, 20), pan(0.125), SHAPE, 0.5)
+    assert [chunk.span for chunk in chunks] == [FrameSpan(10, 14), FrameSpan(14, 18), FrameSpan(18, 20)]
+    # Each is warped as the camera stood at its centre.
+    np.testing.assert_allclose(chunks[0].homography, translation(0.125 * 11.5, 0))
+
+
+def test_a_fast_camera_gets_a_chunk_for_each_frame(pan: Callable) -> None:
+    assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 7), pan(3), SHAPE, 0.25)] == [1] * 7
+
+
+@pytest.mark.parametrize("zoom", [0.5, 2.0])
+def test_the_tolerance_is_in_pixels_of_the_frame_not_of_the_reference_plane(known_motion: type, zoom: float) -> None:
+    """A camera whose pixels look small on the plane moves as many of its own."""
+    motion = known_motion(lambda frame: np.diag([zoom, zoom, 1.0]) @ translation(0.125 * frame, 0))
+    assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 8), motion, SHAPE, 0.5)] == [4, 4]
+
+
+wobbles = st.tuples(*[st.floats(-2e-3, 2e-3)] * 4, *[st.floats(-1, 1)] * 2, *[st.floats(-1e-6, 1e-6)] * 2)
+
+
+@given(
+    start=st.integers(0, 1000),
+    length=st.integers(1, 60),
+    wobble=wobbles,
+    drift=wobbles,
+    tolerance_px=st.floats(0.05, 8),
+)
+def test_chunks_cover_every_frame_once_and_keep_to_the_tolerance(
+    known_motion: type, start: int, length: int, wobble: tuple, drift: tuple, tolerance_px: float
+) -> None:
+    def at(frame: float) -> np.ndarray:
+        return from_parameters(np.sin(frame / 7) * np.array(wobble) + 0.1 * frame / 60 * np.array(drift))
+
+    motion = known_motion(at)
+    span = FrameSpan(start, start + length)
+    chunks = chunks_of(span, motion, SHAPE, tolerance_px)
+    assert [chunks[0].span.start, *(chunk.span.stop for chunk in chunks)] == [
+        *(chunk.span.start for chunk in chunks),
+        span.stop,
+    ]
+    for chunk in chunks:
+        np.testing.assert_array_equal(chunk.homography, at(chunk.span.centre))
+        moved = inverse(chunk.homography) @ motion.at(range(chunk.span.start, chunk.span.stop))
+        assert corner_displacements(moved, np.eye(3), SHAPE).max() <= tolerance_px * 1.01 + 0.01 * (len(chunk.span) > 1)

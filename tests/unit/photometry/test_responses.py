@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano.photometry import BinaryResponse
+
+RESPONSE = BinaryResponse()
+
+
+def f32(*values: float) -> np.ndarray:
+    return np.array(values, dtype=np.float32)
+
+
+def test_known_values() -> None:
+    np.testing.assert_allclose(RESPONSE.mean_count(f32(0, np.log(2), 3)), [0, 0.5, 1 - np.exp(-3)], rtol=1e-6)
+    np.testing.assert_allclose(RESPONSE.flux(f32(0, 0.5, 0.75), 100), [0, np.log(2), np.log(4)], rtol=1e-6)
+
+
+@given(st.floats(0, 6, width=32))
+def test_the_estimate_undoes_the_detection(flux: float) -> None:
+    estimate = RESPONSE.flux(RESPONSE.mean_count(f32(flux)), 1e6)
+    assert estimate.dtype == np.float32
+    np.testing.assert_allclose(estimate, flux, rtol=1e-4, atol=1e-6)
+
+
+@given(st.integers(1, 100_000))
+def test_a_pixel_that_is_always_lit_gets_the_flux_of_half_a_dark_frame(frames: int) -> None:
+    np.testing.assert_allclose(RESPONSE.flux(f32(1), frames), np.log(2 * frames), rtol=2e-3)
+    # It stays the brightest: a pixel with one dark frame is dimmer.
+    assert RESPONSE.flux(f32(1 - 1 / frames), frames) < RESPONSE.flux(f32(1), frames)
+
+
+def test_rounding_beyond_one_and_unknown_pixels_do_no_harm() -> None:
+    flux = RESPONSE.flux(f32(1.0000001, np.nan, -1e-9), f32(10, 10, 10))
+    np.testing.assert_allclose(flux, [np.log(20), np.nan, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [100, 400])
+def test_noise_is_uniform_on_the_stabilised_scale(frames: int) -> None:
+    """Standard deviations of 20,000 draws are known to 0.5 %; what is left is the approximation itself."""
+    flux = f32(0.2, 0.5, 1.0, 2.0)[:, None]
+    rng = np.random.default_rng(0)
+    counts = rng.binomial(frames, -np.expm1(-flux.astype(float)), (4, 20_000))
+    stabilised = RESPONSE.stabilised(RESPONSE.flux((counts / frames).astype(np.float32), frames))
+    np.testing.assert_allclose(stabilised.std(axis=1), float(RESPONSE.stabilised_std(frames)), rtol=0.03)
+
+
+def test_the_stabilised_scale_runs_from_zero_to_a_right_angle() -> None:
+    np.testing.assert_allclose(RESPONSE.stabilised(f32(0, np.log(2), 100)), [0, np.pi / 4, np.pi / 2], atol=1e-6)

@@ -1,0 +1,32 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano.photometry import linear_to_srgb, srgb_to_linear, tone_mapped
+
+
+def f32(*values: float) -> np.ndarray:
+    return np.array(values, dtype=np.float32)
+
+
+def test_known_values() -> None:
+    """Of the standard: middle grey of 8 bits, and where the straight part meets the power."""
+    np.testing.assert_allclose(srgb_to_linear(f32(0, 0.04045, 118 / 255, 1)), [0, 0.0031308, 0.18116, 1], rtol=1e-4)
+    np.testing.assert_allclose(linear_to_srgb(f32(0, 0.0031308, 0.5, 1)), [0, 0.04045, 0.73536, 1], rtol=1e-4)
+
+
+@given(st.floats(0, 1, width=32))
+def test_the_curves_undo_each_other(value: float) -> None:
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(f32(value))), value, atol=1e-5)
+
+
+def test_what_is_out_of_range_is_clipped_and_what_is_unknown_stays_so() -> None:
+    np.testing.assert_allclose(linear_to_srgb(f32(-1, 2, np.nan)), f32(0, 1, np.nan), rtol=1e-6)
+
+
+def test_a_picture_has_white_where_it_is_told_and_black_where_nothing_is_known() -> None:
+    picture = tone_mapped(f32(0, 0.4, 0.2, 5, np.nan), white=0.4)
+    assert picture.dtype == np.uint8
+    np.testing.assert_array_equal(picture, [0, 255, 188, 255, 0])

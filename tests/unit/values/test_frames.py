@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from photonpano import FrameSpan, Group, InputError, StreamInfo
+
+
+def test_a_span_counts_its_frames_and_knows_its_middle() -> None:
+    span = FrameSpan(10, 14)
+    assert (len(span), span.centre, str(span)) == (4, 11.5, "frames 10 to 13")
+    assert FrameSpan(7, 8).centre == 7
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, 3), (3, 3), (4, 3)])
+def test_a_span_is_never_empty(start: int, stop: int) -> None:
+    with pytest.raises(ValueError, match=rf"0 <= start < stop, got \[{start}, {stop}\)"):
+        FrameSpan(start, stop)
+
+
+def test_a_group_is_seen_from_one_of_its_instants() -> None:
+    span = FrameSpan(10, 14)
+    assert {Group(span, reference).reference for reference in (10, 11.5, 13)} == {10, 11.5, 13}
+    for outside in (9.5, 13.5, float("nan")):
+        with pytest.raises(ValueError, match="lies outside frames 10 to 13"):
+            Group(span, outside)
+
+
+def test_a_stream_refuses_frames_it_does_not_hold() -> None:
+    stream = StreamInfo(100, 4, 6, None)
+    assert (stream.frame_shape, stream.span) == ((4, 6), FrameSpan(0, 100))
+    stream.require(FrameSpan(90, 100))
+    with pytest.raises(InputError) as caught:
+        stream.require(FrameSpan(90, 101))
+    assert str(caught.value) == "frames 90 to 100 were asked for, but the capture has 100 frames (0 to 99)"
+
+
+@pytest.mark.parametrize("value", [FrameSpan(0, 1), Group(FrameSpan(0, 1), 0), StreamInfo(1, 1, 1, None)])
+def test_values_are_frozen(value: object) -> None:
+    field = dataclasses.fields(value)[0].name  # type: ignore[arg-type]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(value, field, None)
