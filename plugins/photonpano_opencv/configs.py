@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 from pydantic import Field
 
 from photonpano import Config
@@ -12,10 +14,15 @@ class OpencvSiftConfig(Config):
 
     max_keypoints: int = Field(2000, ge=16, le=100_000, description="the strongest keypoints of an exposure that are kept")
     contrast_threshold: float = Field(
-        0.02, ge=0, le=1, description="keypoints with less contrast are dropped; OpenCV's own default is 0.04"
+        0.02,
+        ge=0,
+        le=1,
+        description="keypoints with less contrast after a blur of 1 px are dropped; OpenCV's own default is 0.04",
     )
-    blur_px: float = Field(
-        1.5, ge=0, le=16, description="standard deviation of the Gaussian that quiets photon noise before detection, in px"
+    blur_px: Annotated[float, Field(ge=0, le=16)] | Literal["auto"] = Field(
+        "auto",
+        description="standard deviation of the Gaussian that quiets photon noise before detection, in px; "
+        "auto takes 1, and up to 2.5 in the dark",
     )
     ratio: float = Field(0.8, gt=0, le=1, description="a match must be so many times nearer than the second best (Lowe 2004)")
     search_px: float = Field(

@@ -12,7 +12,7 @@ from photonpano import Located, NotLocated
 from photonpano.geometry import apply, implausibility, normalised
 from photonpano_opencv.fitting import fit_homography
 from photonpano_opencv.matching import match_everywhere, match_nearby, unit_descriptors
-from photonpano_opencv.viewing import stabilised_8_bit
+from photonpano_opencv.viewing import blur_against_noise, stabilised_8_bit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,9 +53,11 @@ class SiftLocator:
     def describe(self, exposure: VirtualExposure) -> SiftFeatures:
         """Detect keypoints on the variance-stabilised image, where it was seen."""
         config = self._config
-        image, mask = stabilised_8_bit(exposure, config.blur_px)
+        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        image, mask = stabilised_8_bit(exposure, blur_px)
+        threshold = config.contrast_threshold / max(1.0, blur_px)
         # A detector for each call: OpenCV does not promise that one may be shared by threads.
-        sift = cv2.SIFT.create(config.max_keypoints, 3, config.contrast_threshold, enable_precise_upscale=True)
+        sift = cv2.SIFT.create(config.max_keypoints, 3, threshold, enable_precise_upscale=True)
         keypoints, descriptors = sift.detectAndCompute(image, mask)
         # OpenCV keeps all keypoints that are as strong as the weakest, so there may be more than asked for.
         keypoints = keypoints[: config.max_keypoints]

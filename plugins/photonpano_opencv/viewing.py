@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from photonpano.photometry import signal_to_noise
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -14,6 +16,15 @@ if TYPE_CHECKING:
 
 _CLIPPED = 0.001
 """Share of pixels at either end that may become black or white: single hot pixels must not flatten the rest."""
+
+
+def blur_against_noise(exposure: VirtualExposure) -> float:
+    """Choose the standard deviation of the Gaussian, in px: 1 in the light, up to 2.5 where noise exceeds the scene.
+
+    In the light more blur costs accuracy (1.5 px instead of 1 px took a trajectory at flux 0.5 from
+    0.07 to 0.17 px), in the dark less blur does (at flux 0.02 most keypoints are noise then).
+    """
+    return float(np.clip(2 / max(signal_to_noise(exposure), 1e-6), 1.0, 2.5))
 
 
 def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
 
 from photonpano.errors import LocationError
+from photonpano.photometry import signal_to_noise
 from photonpano.values import FrameSpan, NotLocated
 
 if TYPE_CHECKING:
@@ -16,10 +16,9 @@ if TYPE_CHECKING:
 
     from photonpano.values import BoolArray, Edge, Group, VirtualExposure
 
-_BLUR_PX = 2.0
 TOLERATED_RUN = 2
 """So many exposures in a row may be lost: the motion is interpolated across them."""
-_NOISY = 1.5
+_NOISY = 0.25
 """Below this ratio of signal to noise, darkness is to blame; above it, blur or a scene without texture."""
 _SHOWN = 6
 
@@ -29,7 +28,7 @@ class Contrast:
     """How much there is to see in an exposure.
 
     Attributes:
-        signal_to_noise: standard deviation of the scene over that of the photon noise, both at the scale of a few pixels.
+        signal_to_noise: see `photonpano.photometry.signal_to_noise`.
         blank: why there is nothing to see at all; None if there is something.
     """
 
@@ -48,13 +47,7 @@ def contrast_of(exposure: VirtualExposure) -> Contrast:
     darkest = exposure.response.mean_count(flux.min(keepdims=True))
     if 1 - darkest[0] <= 0.5 / exposure.weight[known].max():
         return Contrast(0.0, "every pixel is lit in every frame, so that its flux is unknown; use a darker aperture")
-    weight = known.astype(np.float32)
-    stabilised = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0))
-    smooth_weight = cv2.GaussianBlur(weight, (0, 0), _BLUR_PX)
-    smooth = cv2.GaussianBlur(stabilised, (0, 0), _BLUR_PX) / np.maximum(smooth_weight, 1e-6)
-    noise = float(np.median(exposure.response.stabilised_std(exposure.weight[known]))) / (2 * np.sqrt(np.pi) * _BLUR_PX)
-    variance = float(smooth[known].var()) - noise**2
-    return Contrast(float(np.sqrt(max(variance, 0.0))) / noise)
+    return Contrast(signal_to_noise(exposure))
 
 
 def require_tied(
@@ -99,7 +92,7 @@ def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Co
         return []
     ratio = float(np.median([contrast.signal_to_noise for contrast in lost if not contrast.blank]))
     size = int(np.median([len(group.span) for group in groups]))
-    seen = f"In these exposures of {size} frames the scene stands out {ratio:.1f} times above the photon noise"
+    seen = f"In these exposures of {size} frames the scene varies {ratio:.2g} times as much as a pixel's photon noise"
     if ratio < _NOISY:
         return [f"{seen}: they are too dark. Try larger groups, such as resample.with.group_size={2 * size}."]
     return [

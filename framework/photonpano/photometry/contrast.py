@@ -1,0 +1,37 @@
+"""How far a scene stands out from photon noise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from photonpano.values import VirtualExposure
+
+_BLOCK = 4
+"""Averages of so many pixels squared tell scene and noise apart: noise falls with their number, the scene hardly does."""
+
+
+def signal_to_noise(exposure: VirtualExposure) -> float:
+    """Return the standard deviation of the scene over that of the noise of a pixel, on the scale where noise is uniform.
+
+    Around 1 and below, single pixels are noise; registration then needs larger structures. 0 if nothing stands out.
+    """
+    known = exposure.weight > 0
+    if not known.any():
+        return 0.0
+    values = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0))
+    sums, counts = _block_sums(values), _block_sums(known.astype(np.float32))
+    full = counts == _BLOCK**2
+    if np.count_nonzero(full) < 2:
+        return 0.0
+    noise = float(np.median(exposure.response.stabilised_std(exposure.weight[known])))
+    variance = float(np.var(sums[full] / _BLOCK**2)) - noise**2 / _BLOCK**2
+    return float(np.sqrt(max(variance, 0.0))) / noise
+
+
+def _block_sums(image: np.ndarray) -> np.ndarray:
+    rows, columns = image.shape[0] // _BLOCK, image.shape[1] // _BLOCK
+    blocks = image[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
+    return np.asarray(blocks.sum(axis=(1, 3)))
