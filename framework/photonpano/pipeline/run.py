@@ -95,7 +95,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
         "status": "done",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "spec": plan.document,
-        "spec_file": None,
+        "spec_file": None if plan.file is None else str(plan.file),
         "seed": plan.run.seed,
         "source": source_record(stream),
         "plugins": plugin_records(plan),

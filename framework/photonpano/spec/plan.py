@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from photonpano.contributions import (
         Config,
@@ -63,6 +64,7 @@ class Plan:
         run: seed, threads, memory.
         document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
         places: where each value of the spec was written, by its path, for messages that come up later.
+        file: the spec file, None for a spec that was built in Python.
     """
 
     source: Choice[SourceContribution[Any]]
@@ -73,3 +75,4 @@ class Plan:
     run: RunSettings
     document: Mapping[str, Any]
     places: Mapping[str, Place] = field(default_factory=dict)
+    file: Path | None = None

@@ -101,7 +101,9 @@ class _Resolver:
         settings: dict[str, Any] = {name: self.validated(model, sections[name]) for name, model in SETTINGS.items()}
         if source is None or self.problems:
             return None
-        plan = Plan(source, tuple(filter(None, levels)), **settings, document={}, places=self.root.places())
+        plan = Plan(
+            source, tuple(filter(None, levels)), **settings, document={}, places=self.root.places(), file=self.root.head.file
+        )
         return replace(plan, document=self.document(plan, stages))
 
     def version(self, value: Value | None) -> None:
