@@ -45,7 +45,8 @@ def contrast_of(exposure: VirtualExposure) -> Contrast:
     if flux.max() <= 0:
         return Contrast(0.0, "no pixel saw a photon; is the shutter closed, or the file the right one?")
     darkest = exposure.response.mean_count(flux.min(keepdims=True))
-    if 1 - darkest[0] <= 0.5 / exposure.weight[known].max():
+    # Half a frame is taken to be dark in a pixel that is always lit; one whole dark frame is the next there can be.
+    if 1 - darkest[0] < 0.75 / exposure.weight[known].max():
         return Contrast(0.0, "every pixel is lit in every frame, so that its flux is unknown; use a darker aperture")
     return Contrast(signal_to_noise(exposure))
 
