@@ -26,7 +26,7 @@ class OpencvSiftConfig(Config):
     )
     ratio: float = Field(0.8, gt=0, le=1, description="a match must be so many times nearer than the second best (Lowe 2004)")
     search_px: float = Field(
-        20.0, gt=0, description="from the second level on, matches are looked for so far from where the motion known puts them"
+        12.0, gt=0, description="from the second level on, matches are looked for so far from where the motion known puts them"
     )
     threshold_px: float = Field(2.0, gt=0, le=50, description="a match that fits better than this can be an inlier, in px")
     min_inliers: int = Field(12, ge=5, description="a pair with fewer inliers is not located")

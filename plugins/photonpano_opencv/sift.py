@@ -80,11 +80,13 @@ class SiftLocator:
         config = self._config
         evidence = {"keypoints_moving": float(len(moving.points)), "keypoints_fixed": float(len(fixed.points))}
         descriptors = unit_descriptors(moving.descriptors), unit_descriptors(fixed.descriptors)
-        if initial is None:
-            pairs = match_everywhere(*descriptors, config.ratio)
-        else:
+        pairs = np.zeros((0, 2), dtype=np.intp)
+        if initial is not None:
             predicted = apply(initial, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, config.search_px, config.ratio)
+        if len(pairs) < config.min_inliers:
+            # No motion is known yet, or it is further off than the search reaches.
+            pairs = match_everywhere(*descriptors, config.ratio)
         evidence["matches"] = float(len(pairs))
         if len(pairs) < config.min_inliers:
             return NotLocated(self._too_few("matches", evidence), evidence)
