@@ -131,8 +131,10 @@ def _writing(directory: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        # A short write of an array comes without the system's words.
+        reason = error.strerror or "a file was cut short"
         raise OutputError(
-            f"{directory}: the results could not be written ({error.strerror or error}); what was there before is unchanged. "
+            f"{directory}: the results could not be written ({reason}); what was there before is unchanged. "
             "Make room, or choose another folder with --output"
         ) from error
 

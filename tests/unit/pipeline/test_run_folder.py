@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import json
+import resource
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from photonpano import OutputError, Panorama
+from photonpano.geometry import translation
+from photonpano.pipeline.run_folder import run_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from photonpano.pipeline.run_folder import RunFolder
+
+FLUX = np.random.default_rng(0).random((60, 90), np.float32)
+FLUX[:, :5] = np.nan
+PANORAMA = Panorama(FLUX, np.where(np.isnan(FLUX), np.float32(0), np.float32(7)), translation(3, 4))
+PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
+FILES = {"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
+
+
+def write_panorama(folder: RunFolder) -> None:
+    folder.write_panorama(PANORAMA, PICTURE)
+
+
+def write_trajectory(folder: RunFolder) -> None:
+    homographies = np.random.default_rng(0).random((500, 3, 3))
+    folder.write_trajectory(homographies, np.ones(500, bool), PANORAMA.canvas, (48, 64), 250)
+
+
+def write_record(folder: RunFolder) -> None:
+    folder.write_record({"warnings": ["a line"] * 2000})
+
+
+def write_report(folder: RunFolder) -> None:
+    folder.write_report("<html>µ</html>" * 2000)
+
+
+WRITERS = (write_panorama, write_trajectory, write_record, write_report)
+
+
+def write_all(folder: RunFolder) -> None:
+    for write in WRITERS:
+        write(folder)
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """A run folder of an earlier run, and a note of its owner."""
+    for name in [*FILES, "notes.txt"]:
+        (tmp_path / "runs").mkdir(exist_ok=True)
+        (tmp_path / "runs" / name).write_text(f"old {name}")
+    return tmp_path / "runs"
+
+
+def require_old(directory: Path) -> None:
+    assert {file.name for file in directory.iterdir()} == {*FILES, "notes.txt"}
+    assert all(file.read_text() == f"old {file.name}" for file in directory.iterdir())
+
+
+def test_the_files_hold_what_was_written(tmp_path: Path) -> None:
+    with run_folder(tmp_path / "runs" / "scan") as folder:
+        write_all(folder)
+    directory = tmp_path / "runs" / "scan"
+    assert {file.name for file in directory.iterdir()} == FILES
+    np.testing.assert_array_equal(tifffile.imread(directory / "panorama.tiff"), FLUX)
+    np.testing.assert_array_equal(tifffile.imread(directory / "coverage.tiff"), PANORAMA.weight)
+    np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), PICTURE)
+    with np.load(directory / "trajectory.npz") as archive:
+        assert set(archive.files) == {"homographies", "canvas", "frame_shape", "reference", "located"}
+        assert tuple(archive["frame_shape"]) == (48, 64)
+    assert json.loads((directory / "run.json").read_text()) == {"warnings": ["a line"] * 2000}
+    assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")
+
+
+def test_nothing_has_a_final_name_before_the_end(old: Path) -> None:
+    with run_folder(old) as folder:
+        write_all(folder)
+        assert all(file.read_text() == f"old {file.name}" for file in old.iterdir() if file.is_file())
+    assert (old / "notes.txt").read_text() == "old notes.txt"
+    assert json.loads((old / "run.json").read_text())["warnings"]
+    assert {file.name for file in old.iterdir()} == {*FILES, "notes.txt"}
+
+
+def write_and_fail(directory: Path, error: BaseException) -> None:
+    with run_folder(directory) as folder:
+        write_all(folder)
+        raise error
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_exception_leaves_what_was_there(old: Path, error: type[BaseException]) -> None:
+    with pytest.raises(error):
+        write_and_fail(old, error())
+    require_old(old)
+
+
+def test_an_exception_leaves_no_folder_that_was_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="half-way"):
+        write_and_fail(tmp_path / "scan", ValueError("half-way"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@contextmanager
+def files_of_at_most(n_bytes: int) -> Iterator[None]:
+    """Let the system cut short what is written, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_a_full_disk_leaves_what_was_there(old: Path, write: Callable[[RunFolder], None]) -> None:
+    with pytest.raises(OutputError) as caught, run_folder(old) as folder, files_of_at_most(4096):
+        write(folder)
+    reason = "a file was cut short" if write is write_panorama else "File too large"
+    assert str(caught.value) == (
+        f"{old}: the results could not be written ({reason}); what was there before is unchanged. "
+        "Make room, or choose another folder with --output"
+    )
+    require_old(old)
+
+
+def test_a_file_in_the_way_is_told_before_the_work(tmp_path: Path) -> None:
+    """As root, permissions stop nobody; a file does."""
+    way = tmp_path / "runs"
+    way.write_text("a file")
+    for directory, reason in ((way, "File exists"), (way / "scan", "Not a directory")):
+        with pytest.raises(OutputError) as caught, run_folder(directory):
+            raise AssertionError("the block must not run")
+        assert str(caught.value) == (
+            f"{directory}: the run folder cannot be written to ({reason}); choose another one with --output"
+        )
+    assert way.read_text() == "a file"
