@@ -23,6 +23,8 @@ from photonpano.registry.wording import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from pydantic import BaseModel
+
     from photonpano.contributions import AnyContribution
     from photonpano.registry.wording import Schema
 
@@ -84,10 +86,16 @@ def describe(contribution: AnyContribution) -> Description:
         contribution.kind,
         contribution.name,
         contribution.summary,
-        tuple(_rows(root, root)),
+        config_rows(contribution.config),
         "\n".join(snippet) + "\n",
         tuple(dict.fromkeys(requirement.install for requirement in contribution.requires)),
     )
+
+
+def config_rows(config: type[BaseModel]) -> tuple[ConfigRow, ...]:
+    """Describe every key of a config, those of the mappings in it as well."""
+    root = config_schema(config)
+    return tuple(_rows(root, root))
 
 
 def _rows(schema: Schema, root: Schema, prefix: str = "", depth: int = 0) -> list[ConfigRow]:

@@ -59,5 +59,5 @@ class RunSettings(Config):
     memory: ByteSize = Field(
         ByteSize(2 * 1024**3),
         ge=64 * 1024**2,
-        description="a panorama that needs more than this is refused, such as 2 GiB",
+        description="a panorama that would take more memory than this is refused",
     )
