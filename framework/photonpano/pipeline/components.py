@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -11,6 +12,8 @@ from photonpano.errors import PhotonpanoError, PluginError
 from photonpano.pipeline.threads import thread_count
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from photonpano.contributions import Contribution
     from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
     from photonpano.spec.plan import Choice, Plan
@@ -26,6 +29,7 @@ class Level:
     Attributes:
         number: from 1.
         scale: pixels of the level's exposures per pixel of a frame.
+        origins: who provides the component of each kind, such as "merger 'photon-mle' of photonpano 0.1.0".
     """
 
     number: int
@@ -34,6 +38,22 @@ class Level:
     merger: Merger
     locator: Locator
     interpolator: Interpolator
+    origins: Mapping[str, str]
+
+    @contextmanager
+    def blaming(self, kind: str) -> Iterator[None]:
+        """Name the component of a kind, such as "merger", in what it raises by mistake.
+
+        Raises:
+            PluginError: the block raised something that was not made for users.
+        """
+        try:
+            yield
+        except PhotonpanoError:
+            raise
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise PluginError(f"{self.origins[kind]} failed at level {self.number}: {reason}") from error
 
 
 def build_source(plan: Plan) -> Source:
@@ -67,6 +87,10 @@ def build_levels(plan: Plan, source: Source) -> tuple[Level, ...]:
             component(level.merge),
             component(level.locate),
             component(level.interpolate),
+            {
+                choice.contribution.kind: _origin(choice)
+                for choice in (level.resample, level.merge, level.locate, level.interpolate)
+            },
         )
         for number, level in enumerate(plan.levels, start=1)
     )
@@ -74,7 +98,7 @@ def build_levels(plan: Plan, source: Source) -> tuple[Level, ...]:
 
 def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: ContextT) -> ComponentT:
     contribution = choice.contribution
-    who = f"{contribution.kind} {contribution.name!r} of {choice.plugin} {choice.version}"
+    who = _origin(choice)
     for requirement in contribution.requires:
         if importlib.util.find_spec(requirement.module) is None:
             raise PluginError(f'{who} needs {requirement.module}: run pip install "{requirement.install}"')
@@ -84,3 +108,7 @@ def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: Con
         raise
     except Exception as error:
         raise PluginError(f"{who} could not be built: {type(error).__name__}: {error}") from error
+
+
+def _origin(choice: Choice[Contribution[Any, Any, Any]]) -> str:
+    return f"{choice.contribution.kind} {choice.contribution.name!r} of {choice.plugin} {choice.version}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.errors import PluginError
-from photonpano.geometry import implausibility, inverse, normalised, rescaled
+from photonpano.geometry import implausibility, inverse, rescaled
 from photonpano.pipeline.diagnosis import Contrast, contrast_of, require_tied
 from photonpano.pipeline.graph import largest_component, solve
 from photonpano.pipeline.pairs import pairs_of, shared_share
@@ -85,6 +85,7 @@ def locate(
 
     Raises:
         LocationError: exposures cannot be tied to each other, and the settings do not allow to go on without them.
+        PluginError: the locator failed in its own way, or returned what is no motion.
     """
     groups = exposures.groups
     registrar = _Registrar(level, exposures, known, clock)
@@ -144,38 +145,34 @@ class _Registrar:
         exposure = self._exposures[index]
         with self._clock("locate"):
             contrast = contrast_of(exposure)
-            return (None if contrast.blank else self._level.locator.describe(exposure)), contrast
+            with self._level.blaming("locator"):
+                return (None if contrast.blank else self._level.locator.describe(exposure)), contrast
 
     def _register(self, moving: int, fixed: int) -> Edge:
         with self._clock("locate"):
             for index in (moving, fixed):
                 if blank := self.contrasts[index].blank:
                     return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
-            scale = self._level.scale
             initial = self._initial(moving, fixed)
-            motion = self._level.locator.register(
-                self._features[moving], self._features[fixed], None if initial is None else rescaled(initial, scale)
-            )
-            if isinstance(motion, Located):
+            with self._level.blaming("locator"):
+                motion = self._level.locator.register(self._features[moving], self._features[fixed], initial)
+            if not isinstance(motion, NotLocated):
                 motion = self._checked(motion, moving, fixed)
             return Edge(moving, fixed, motion)
 
     def _initial(self, moving: int, fixed: int) -> Homography | None:
+        """Return the motion known so far, in px of exposures."""
         if self._known is None:
             return None
         instants = [self._exposures.groups[index].reference for index in (moving, fixed)]
         to_plane = self._known.at(instants)
-        return normalised(inverse(to_plane[1]) @ to_plane[0])
+        return rescaled(inverse(to_plane[1]) @ to_plane[0], self._level.scale)
 
     def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
         """Convert a motion to px of frames, and refuse what no camera does."""
-        matrix = np.asarray(motion.homography)
-        if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)) or matrix[2, 2] == 0:
-            raise PluginError(
-                f"the locator {type(self._level.locator).__module__} returned {matrix.tolist()} for a located pair; "
-                "a homography is a finite (3, 3) matrix with h33 = 1, and a failure is NotLocated"
-            )
-        homography = rescaled(matrix, 1 / self._level.scale)
+        if broken := broken_promise(motion):
+            raise PluginError(f"{self._level.origins['locator']} broke its contract at level {self._level.number}: {broken}")
+        homography = rescaled(motion.homography, 1 / self._level.scale)
         if reason := implausibility(homography, self._exposures.frame_shape):
             return NotLocated(reason, motion.evidence)
         groups = self._exposures.groups
@@ -187,6 +184,28 @@ class _Registrar:
             information = information * np.outer(units, units) * new
         residual_px = None if motion.residual_px is None else motion.residual_px / self._level.scale
         return replace(motion, homography=homography, information=information, residual_px=residual_px)
+
+
+def broken_promise(motion: object) -> str | None:
+    """Tell what is wrong with what a locator calls a located pair; None if nothing is."""
+    if not isinstance(motion, Located):
+        return f"expected Located or NotLocated, got {type(motion).__name__}"
+    matrix, information = np.asarray(motion.homography), motion.information
+    if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)) or matrix[2, 2] == 0:
+        return f"a homography is a finite (3, 3) matrix with h33 = 1, got {matrix.tolist()}; a failure is NotLocated"
+    if information is not None and not _is_positive_definite(np.asarray(information)):
+        return "information is an inverse covariance: an (8, 8) matrix, finite and positive definite; None if there is none"
+    return None
+
+
+def _is_positive_definite(matrix: FloatArray) -> bool:
+    if matrix.shape != (8, 8) or not np.all(np.isfinite(matrix)):
+        return False
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _in_order(pool: ThreadPoolExecutor, work: Callable[[int], Any], items: Iterable[int], ahead: int) -> Iterator[Any]:

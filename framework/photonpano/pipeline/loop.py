@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from photonpano.errors import PluginError
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.pipeline.locate import locate
 from photonpano.pipeline.merge import VirtualExposures
@@ -60,16 +62,18 @@ def estimate_motion(
 
     Raises:
         LocationError: too few exposures could be located.
+        PluginError: a component failed in its own way, or broke its contract.
     """
     results: list[LevelResult] = []
     known: Trajectory | None = None
     for level in levels:
         clock = Stopwatch(threads)
-        with clock("resample"):
+        with clock("resample"), level.blaming("resampler"):
             groups = level.resampler.groups(source.info.n_frames, level.number)
+        _require_order(groups, level)
         exposures = VirtualExposures(level, source, groups, known, clock)
         located = locate(level, exposures, known, graph, threads, clock, progress)
-        with clock("interpolate"):
+        with clock("interpolate"), level.blaming("interpolator"):
             free = level.interpolator.fit(located.instants, located.homographies, None)
             trajectory = ReferencedTrajectory(free, reference)
             change_px = None if known is None else _change_px(known, trajectory, source)
@@ -77,6 +81,15 @@ def estimate_motion(
         progress.note(_summary(results[-1]))
         known = trajectory
     return results
+
+
+def _require_order(groups: Sequence[Group], level: Level) -> None:
+    instants = [group.reference for group in groups]
+    if not groups or any(later <= earlier for earlier, later in pairwise(instants)):
+        raise PluginError(
+            f"{level.origins['resampler']} returned groups at the instants {instants} at level {level.number}; "
+            "expected at least one, in order, each instant once"
+        )
 
 
 def _change_px(before: Trajectory, after: Trajectory, source: Source) -> float:

@@ -33,5 +33,5 @@ class VirtualExposures:
         return len(self.groups)
 
     def __getitem__(self, index: int) -> VirtualExposure:
-        with self._clock("merge"):
+        with self._clock("merge"), self._level.blaming("merger"):
             return self._level.merger.merge(self._source, self.groups[index], self._known, self._level.scale)

@@ -34,9 +34,14 @@ def plan_canvas(trajectory: Trajectory, stream: StreamInfo, scale: float, memory
 
     Raises:
         CanvasTooLargeError: it would take more; the message says how much.
-        LocationError: frames reach the horizon of the reference plane.
+        LocationError: frames reach the horizon of the reference plane, or none is located.
     """
     frames = np.flatnonzero(trajectory.located(np.arange(stream.n_frames)))
+    if not len(frames):
+        raise LocationError(
+            "no frame lies between two located exposures, so that no motion is known to merge frames along; "
+            "use smaller groups or more levels"
+        )
     homographies = trajectory.at(frames)
     try:
         canvas = canvas_of(homographies, stream.frame_shape, scale)
