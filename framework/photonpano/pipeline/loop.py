@@ -70,7 +70,7 @@ def estimate_motion(
         clock = Stopwatch(threads)
         with clock("resample"), level.blaming("resampler"):
             groups = level.resampler.groups(source.info.n_frames, level.number)
-        _require_order(groups, level)
+        _require_sound(groups, level, source.info.n_frames)
         exposures = VirtualExposures(level, source, groups, known, clock)
         located = locate(level, exposures, known, graph, threads, clock, progress)
         with clock("interpolate"), level.blaming("interpolator"):
@@ -83,13 +83,13 @@ def estimate_motion(
     return results
 
 
-def _require_order(groups: Sequence[Group], level: Level) -> None:
+def _require_sound(groups: Sequence[Group], level: Level, n_frames: int) -> None:
     instants = [group.reference for group in groups]
+    who = f"{level.origins['resampler']} broke its contract at level {level.number}"
     if not groups or any(later <= earlier for earlier, later in pairwise(instants)):
-        raise PluginError(
-            f"{level.origins['resampler']} returned groups at the instants {instants} at level {level.number}; "
-            "expected at least one, in order, each instant once"
-        )
+        raise PluginError(f"{who}: expected at least one group, in order, each instant once; got the instants {instants}")
+    if beyond := [str(group) for group in groups if group.span.stop > n_frames]:
+        raise PluginError(f"{who}: the capture has {n_frames} frames (0 to {n_frames - 1}), got a group of {beyond[0]}")
 
 
 def _change_px(before: Trajectory, after: Trajectory, source: Source) -> float:

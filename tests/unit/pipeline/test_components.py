@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from photonpano import (
+    Config,
+    InputError,
+    InterpolatorContribution,
+    LocatorContribution,
+    MergerContribution,
+    PluginError,
+    Requirement,
+    ResamplerContribution,
+    Response,
+    SourceContext,
+    SourceContribution,
+    StageContext,
+    StreamInfo,
+)
+from photonpano.pipeline.components import build_levels, build_source
+from photonpano.registry import Catalog
+from photonpano.registry.catalog import make_entry
+from photonpano.spec import Plan, parse_spec
+
+
+class Keys(Config):
+    size: int = 1
+
+
+class Built:
+    """Remembers what it was built from; stands in for any component."""
+
+    def __init__(self, config: Keys, context: Any) -> None:
+        self.config, self.context = config, context
+        self.info, self.response = StreamInfo(100, 8, 16, None), object()
+
+
+KINDS: list[Any] = [
+    SourceContribution,
+    ResamplerContribution,
+    MergerContribution,
+    LocatorContribution,
+    InterpolatorContribution,
+]
+SECTIONS = ("source", "resample", "merge", "locate", "interpolate")
+
+
+def plan(levels: Any = 1, **changes: Any) -> Plan:
+    """Resolve a spec of toys of the distribution `toys`; a change gives other fields to the toy of a kind."""
+    rows = []
+    for kind in KINDS:
+        fields = {"name": "toy", "summary": "A toy", "config": Keys, "build": Built} | changes.get(kind.kind, {})
+        rows.append(make_entry(kind(**fields), "toys", "1.0", "toys = toys.hooks"))
+    spec = {"version": 1, **{section: {"use": "toy"} for section in SECTIONS}, "levels": levels}
+    return parse_spec(spec | {"run": {"seed": 7, "threads": 3}}, catalog=Catalog(tuple(rows)))
+
+
+def test_components_are_told_what_they_may_know() -> None:
+    made = plan()
+    source = build_source(made)
+    assert source.context == SourceContext(seed=7, threads=3)
+    (level,) = build_levels(made, source)
+    assert level.locator.context == StageContext(source.info, source.response, seed=7, threads=3)
+    assert level.origins == {
+        "resampler": "resampler 'toy' of toys 1.0",
+        "merger": "merger 'toy' of toys 1.0",
+        "locator": "locator 'toy' of toys 1.0",
+        "interpolator": "interpolator 'toy' of toys 1.0",
+    }
+
+
+def test_levels_that_choose_alike_share_a_component() -> None:
+    made = plan(levels=[{"scale": 0.5}, {"locate": {"with": {"size": 2}}}, {}])
+    first, second, third = build_levels(made, build_source(made))
+    assert first.locator is third.locator is not second.locator
+    assert first.merger is second.merger is third.merger
+    assert [level.number for level in (first, second, third)] == [1, 2, 3]
+    assert [level.scale for level in (first, second, third)] == [0.5, 1, 1]
+    assert second.locator.config == Keys(size=2)
+
+
+def broken(*_: Any) -> Any:
+    raise RuntimeError("no such device")
+
+
+@pytest.mark.parametrize("kind", [kind.kind for kind in KINDS])
+def test_a_component_that_cannot_be_built_is_named(kind: str) -> None:
+    made = plan(**{kind: {"build": broken}})
+    with pytest.raises(PluginError) as caught:
+        build_levels(made, build_source(made))
+    assert str(caught.value) == f"{kind} 'toy' of toys 1.0 could not be built: RuntimeError: no such device"
+
+
+def test_an_error_for_users_passes_as_it_is() -> None:
+    def missing(*_: Any) -> Any:
+        raise InputError("there is no file cube.npy")
+
+    with pytest.raises(InputError, match=r"^there is no file cube\.npy$"):
+        build_source(plan(source={"build": missing}))
+
+
+def test_a_library_that_went_missing_is_named_with_its_install_line() -> None:
+    """A spec that was checked elsewhere, or a library that was uninstalled since."""
+    made = plan()
+    contribution = made.source.contribution
+    object.__setattr__(contribution, "requires", (Requirement("no_such_library", "photonpano[camera]"),))
+    with pytest.raises(PluginError) as caught:
+        build_source(made)
+    assert str(caught.value) == "source 'toy' of toys 1.0 needs no_such_library: run pip install \"photonpano[camera]\""
+
+
+def test_the_response_reaches_every_stage() -> None:
+    made = plan()
+    source = build_source(made)
+    (level,) = build_levels(made, source)
+    responses: set[Response] = {getattr(level, kind.kind).context.response for kind in KINDS[1:]}
+    assert responses == {source.response}

@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group, InputError, PluginError
+from photonpano.geometry import translation
+from photonpano.pipeline.loop import estimate_motion
+from photonpano.pipeline.progress import Quiet
+from photonpano.spec.settings import GraphSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from photonpano.pipeline.components import Level
+
+N_FRAMES = 120
+
+
+@pytest.fixture(scope="module")
+def source(memory_source: type) -> Any:
+    return memory_source(np.zeros((N_FRAMES, 40, 60)))
+
+
+@pytest.fixture
+def run(source: Any) -> Callable[..., list]:
+    def run(*levels: Level, reference: int = 60) -> list:
+        return estimate_motion(source, levels, GraphSettings(), reference, 2, Quiet())
+
+    return run
+
+
+@pytest.mark.parametrize("reference", [0, 60, 119])
+def test_the_reference_frame_is_the_identity_at_every_level(
+    run: Callable, make_level: Callable, pan: Callable, reference: int
+) -> None:
+    results = run(make_level(pan(0.3)), make_level(pan(0.3), number=2), reference=reference)
+    for result in results:
+        np.testing.assert_allclose(result.trajectory.at([reference]), [np.eye(3)], atol=1e-12)
+        inside = np.arange(5, 115)
+        if 5 <= reference < 115:
+            np.testing.assert_allclose(result.trajectory.at(inside)[:, 0, 2], 0.3 * (inside - reference), atol=1e-9)
+
+
+def test_a_level_is_merged_along_the_motion_of_the_one_before(run: Callable, make_level: Callable, pan: Callable) -> None:
+    merged_along: list[Any] = []
+    level = make_level(pan(0.3))
+    merge = level.merger.merge
+
+    class Watched:
+        def merge(self, source: Any, group: Group, trajectory: Any, scale: float) -> Any:
+            merged_along.append(trajectory)
+            return merge(source, group, trajectory, scale)
+
+    levels = [make_level(pan(0.3), number=number, merger=Watched()) for number in (1, 2)]
+    results = run(*levels)
+    assert [len(result.groups) for result in results] == [12, 23]
+    assert merged_along == [None] * 12 + [results[0].trajectory] * 23
+
+
+def test_it_tells_how_far_a_level_moved_the_frames(run: Callable, make_level: Callable, pan: Callable) -> None:
+    """From a pan of 0.3 to one of 0.4 px a frame: seen from frame 60, by 0.1 * |t - 60| px, where it is located."""
+    first, second = run(make_level(pan(0.3)), make_level(pan(0.4), number=2))
+    assert first.change_px is None
+    frames = np.clip(np.arange(N_FRAMES), 4.5, 114.5)
+    assert second.change_px == pytest.approx(0.1 * np.abs(frames - 60).mean(), rel=0.01)
+    assert set(second.seconds) == {"resample", "merge", "locate", "interpolate"}
+
+
+def test_it_notes_a_line_for_each_level(source: Any, make_level: Callable, pan: Callable) -> None:
+    class Notes(Quiet):
+        def __init__(self) -> None:
+            self.lines: list[str] = []
+
+        def note(self, message: str) -> None:
+            self.lines.append(message)
+
+    notes = Notes()
+    levels = [make_level(pan(0.3)), make_level(pan(0.3), number=2)]
+    estimate_motion(source, levels, GraphSettings(), 60, 2, notes)
+    assert notes.lines == [
+        "level 1: 12 of 12 exposures located",
+        "level 2: 23 of 23 exposures located, the motion changed by 0.00 px",
+    ]
+
+
+def raising(error: BaseException) -> Callable[..., Any]:
+    def fail(*_: Any) -> Any:
+        raise error
+
+    return fail
+
+
+CALLS = [
+    ("resampler", "groups"),
+    ("merger", "merge"),
+    ("locator", "describe"),
+    ("locator", "register"),
+    ("interpolator", "fit"),
+]
+
+
+@pytest.mark.parametrize(("kind", "method"), CALLS)
+def test_a_component_that_fails_is_named(run: Callable, make_level: Callable, pan: Callable, kind: str, method: str) -> None:
+    second = make_level(pan(0.3), number=2)
+    setattr(getattr(second, kind), method, raising(ZeroDivisionError("by nothing")))
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.3)), second)
+    assert str(caught.value) == f"{kind} 'toy' of toys 1.0 failed at level 2: ZeroDivisionError: by nothing"
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize(("kind", "method"), CALLS)
+@pytest.mark.parametrize("error", [InputError("said for users"), KeyboardInterrupt()], ids=repr)
+def test_what_is_meant_for_users_passes(
+    run: Callable, make_level: Callable, pan: Callable, kind: str, method: str, error: BaseException
+) -> None:
+    level = make_level(pan(0.3))
+    setattr(getattr(level, kind), method, raising(error))
+    with pytest.raises(type(error)) as caught:
+        run(level)
+    assert caught.value is error
+
+
+def spans(*starts: int) -> Iterator[Group]:
+    for start in starts:
+        yield Group(FrameSpan(start, start + 10), start)
+
+
+@pytest.mark.parametrize(
+    ("groups", "instants"), [((), "[]"), (tuple(spans(0, 50, 20)), "[0, 50, 20]"), (tuple(spans(0, 0)), "[0, 0]")]
+)
+def test_groups_without_order_are_refused(
+    run: Callable, make_level: Callable, pan: Callable, groups: tuple[Group, ...], instants: str
+) -> None:
+    class Chaos:
+        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+            return groups
+
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.3), resampler=Chaos()))
+    assert str(caught.value) == (
+        "resampler 'toy' of toys 1.0 broke its contract at level 1: "
+        f"expected at least one group, in order, each instant once; got the instants {instants}"
+    )
+
+
+def test_groups_beyond_the_capture_are_refused(run: Callable, make_level: Callable, pan: Callable) -> None:
+    class Greedy:
+        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+            return tuple(spans(0, n_frames - 5))
+
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.3), resampler=Greedy()))
+    assert str(caught.value) == (
+        "resampler 'toy' of toys 1.0 broke its contract at level 1: "
+        "the capture has 120 frames (0 to 119), got a group of frames 115 to 124"
+    )
+
+
+def test_one_group_is_one_located_instant(run: Callable, make_level: Callable, pan: Callable) -> None:
+    class Whole:
+        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+            return (Group(FrameSpan(0, n_frames), 59.5),)
+
+    (result,) = run(make_level(pan(0.3), resampler=Whole()))
+    assert (result.located.n_located, result.located.edges) == (1, ())
+    np.testing.assert_array_equal(result.trajectory.at([0, 119]), [np.eye(3)] * 2)
+
+
+def test_the_gauge_is_a_map_of_the_plane(run: Callable, make_level: Callable, known_motion: type) -> None:
+    """A camera that zooms by 1.1 at frame 60: seen from there, frame 110 is (x - x60) / 1.1 away."""
+    motion = known_motion(lambda frame: translation(0.3 * frame, 0) @ np.diag([1.1, 1.1, 1.0]))
+    (result,) = run(make_level(motion))
+    np.testing.assert_allclose(result.trajectory.at([110])[0], translation(0.3 * 50 / 1.1, 0), atol=1e-9)
