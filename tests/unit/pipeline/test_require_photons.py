@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photonpano import InputError
+from photonpano.pipeline.run import require_photons
+
+DARK = (
+    "no pixel is lit in any of {} frames looked at all over the capture; "
+    "check that the file is the right one, and that the lens was open"
+)
+LIT = (
+    "every pixel is lit in all of {} frames looked at all over the capture, so that no flux can be told; "
+    "check the layout of the file, or expose less"
+)
+
+
+@pytest.mark.parametrize(("n_frames", "looked_at"), [(1, 1), (10, 10), (1000, 256)])
+@pytest.mark.parametrize(("value", "text"), [(0, DARK), (1, LIT)])
+def test_all_dark_and_all_lit_captures_are_refused(
+    memory_source: type, n_frames: int, looked_at: int, value: int, text: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        require_photons(memory_source(np.full((n_frames, 4, 8), value)))
+    assert str(caught.value) == text.format(looked_at)
+
+
+@pytest.mark.parametrize("value", [0, 1])
+def test_one_pixel_of_the_last_frame_is_enough(memory_source: type, value: int) -> None:
+    frames = np.full((1000, 4, 8), value)
+    frames[-1, 2, 3] = 1 - value
+    require_photons(memory_source(frames))
+
+
+@pytest.mark.parametrize("value", [0, 1])
+def test_masked_pixels_do_not_count(memory_source: type, value: int) -> None:
+    frames, valid = np.full((100, 4, 8), value), np.ones((4, 8), bool)
+    frames[:, 2, 3], valid[2, 3] = 1 - value, False
+    with pytest.raises(InputError):
+        require_photons(memory_source(frames, valid))

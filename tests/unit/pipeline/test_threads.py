@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import cv2
+import pytest
+from threadpoolctl import threadpool_info
+
+from photonpano.pipeline.stopwatch import Stopwatch
+from photonpano.pipeline.threads import one_thread_inside, thread_count
+from photonpano.spec.settings import RunSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def test_auto_is_a_thread_for_each_core_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 2, 5}, raising=False)
+    assert thread_count(RunSettings()) == 3
+    assert thread_count(RunSettings(threads=7)) == 7
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    yield
+    cv2.setNumThreads(before)
+
+
+def threads_of_libraries() -> list[int]:
+    return [cv2.getNumThreads(), *(library["num_threads"] for library in threadpool_info())]
+
+
+def look_inside_and_fail() -> None:
+    with one_thread_inside():
+        assert set(threads_of_libraries()) == {1}
+        raise ValueError("half-way")
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_libraries_keep_to_one_thread_inside_and_get_theirs_back() -> None:
+    before = threads_of_libraries()
+    with pytest.raises(ValueError, match="half-way"):
+        look_inside_and_fail()
+    assert threads_of_libraries() == before
+
+
+def test_a_stopwatch_adds_up_by_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter([0.0, 1.5, 10.0, 10.25, 20.0, 22.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
+    clock = Stopwatch(2)
+    for stage in ("merge", "merge", "locate"):
+        with clock(stage):
+            pass
+    assert clock.seconds == {"merge": 1.75, "locate": 2.0}
+
+
+def test_what_runs_in_a_pool_counts_for_its_share() -> None:
+    """Two threads that are busy for the same 0.1 s take 0.1 s together."""
+    clock, together = Stopwatch(2), threading.Barrier(2)
+
+    def work() -> None:
+        with clock("merge"):
+            together.wait()
+            time.sleep(0.1)
+            together.wait()
+
+    with ThreadPoolExecutor(2) as pool:
+        for future in [pool.submit(work), pool.submit(work)]:
+            future.result()
+    assert 0.1 <= clock.seconds["merge"] < 0.19
+
+
+def test_the_time_of_a_failure_counts() -> None:
+    clock = Stopwatch(1)
+    with pytest.raises(ValueError, match="half-way"), clock("merge"):
+        raise ValueError("half-way")
+    assert set(clock.seconds) == {"merge"}

@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry import from_parameters, inverse, normalised, translation
+from photonpano.pipeline.trajectory import ReferencedTrajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def test_it_is_seen_from_the_reference_frame(pan: Callable) -> None:
+    trajectory = ReferencedTrajectory(pan(0.5, first=10, last=90), 40)
+    np.testing.assert_allclose(trajectory.at([40, 50, 20.5]), [np.eye(3), translation(5, 0), translation(-9.75, 0)])
+    np.testing.assert_array_equal(trajectory.located([9, 10, 90, 91]), [False, True, True, False])
+
+
+def test_pairwise_motions_do_not_depend_on_the_reference(known_motion: type) -> None:
+    speeds = np.array([1e-4, -2e-4, 3e-4, 0, 0.3, -0.1, 1e-6, 2e-6])
+    free = known_motion(lambda frame: from_parameters(speeds * frame))
+    pairs = []
+    for reference in (0, 25, 100):
+        first, second = ReferencedTrajectory(free, reference).at([20, 70])
+        pairs.append(normalised(inverse(first) @ second))
+        np.testing.assert_allclose(ReferencedTrajectory(free, reference).at([reference]), [np.eye(3)], atol=1e-12)
+    np.testing.assert_allclose(pairs[1:], [pairs[0]] * 2, atol=1e-9)
