@@ -11,7 +11,7 @@ import numpy as np
 from photonpano.errors import PluginError
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.pipeline.locate import locate
-from photonpano.pipeline.merge import VirtualExposures
+from photonpano.pipeline.merge import merge
 from photonpano.pipeline.stopwatch import Stopwatch
 from photonpano.pipeline.trajectory import ReferencedTrajectory
 
@@ -68,28 +68,39 @@ def estimate_motion(
     known: Trajectory | None = None
     for level in levels:
         clock = Stopwatch(threads)
-        with clock("resample"), level.blaming("resampler"):
-            groups = level.resampler.groups(source.info.n_frames, level.number)
-        _require_sound(groups, level, source.info.n_frames)
-        exposures = VirtualExposures(level, source, groups, known, clock)
+        groups = resample(level, source.info.n_frames, clock)
+        exposures = merge(level, source, groups, known, clock)
         located = locate(level, exposures, known, graph, threads, clock, progress)
-        with clock("interpolate"), level.blaming("interpolator"):
-            free = level.interpolator.fit(located.instants, located.homographies, None)
-            trajectory = ReferencedTrajectory(free, reference)
-            change_px = None if known is None else _change_px(known, trajectory, source)
+        trajectory = interpolate(level, located, reference, clock)
+        change_px = None if known is None else _change_px(known, trajectory, source)
         results.append(LevelResult(level, groups, located, trajectory, change_px, clock.seconds))
         progress.note(_summary(results[-1]))
         known = trajectory
     return results
 
 
-def _require_sound(groups: Sequence[Group], level: Level, n_frames: int) -> None:
+def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]:
+    """Choose the groups of a level (paper, section 4, "Re-sample").
+
+    Raises:
+        PluginError: they are not in order, or lie outside the capture.
+    """
+    with clock("resample"), level.blaming("resampler"):
+        groups = level.resampler.groups(n_frames, level.number)
     instants = [group.reference for group in groups]
     who = f"{level.origins['resampler']} broke its contract at level {level.number}"
     if not groups or any(later <= earlier for earlier, later in pairwise(instants)):
         raise PluginError(f"{who}: expected at least one group, in order, each instant once; got the instants {instants}")
     if beyond := [str(group) for group in groups if group.span.stop > n_frames]:
         raise PluginError(f"{who}: the capture has {n_frames} frames (0 to {n_frames - 1}), got a group of {beyond[0]}")
+    return groups
+
+
+def interpolate(level: Level, located: LocatedLevel, reference: int, clock: Stopwatch) -> Trajectory:
+    """Turn the located instants into a homography for every frame (paper, section 4, "Interpolate")."""
+    with clock("interpolate"), level.blaming("interpolator"):
+        free = level.interpolator.fit(located.instants, located.homographies, None)
+        return ReferencedTrajectory(free, reference)
 
 
 def _change_px(before: Trajectory, after: Trajectory, source: Source) -> float:

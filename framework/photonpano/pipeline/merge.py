@@ -13,6 +13,21 @@ if TYPE_CHECKING:
     from photonpano.values import Group, VirtualExposure
 
 
+def merge(
+    level: Level, source: Source, groups: Sequence[Group], known: Trajectory | None, clock: Stopwatch
+) -> VirtualExposures:
+    """Merge the groups of a level along the motion known so far (paper, section 4, "Merge"), each when it is asked for.
+
+    Args:
+        level: the components of the level.
+        source: the capture.
+        groups: what is merged.
+        known: the motion known so far; None at the first level.
+        clock: is told the time that merging takes.
+    """
+    return VirtualExposures(level, source, groups, known, clock)
+
+
 class VirtualExposures:
     """The virtual exposures of a level: `exposures[i]` merges group i along the motion known so far.
 
