@@ -44,7 +44,7 @@ demo: $(INSTALLED)
 	@$(BIN)/photonpano run examples/pipelines/demo.yaml
 	$(STEP) 'comparing it with the truth'
 	@$(BIN)/photonpano evaluate demo/run --truth demo/capture.truth.npz
-	$(STEP) 'to look at: demo/run/panorama.png and demo/run/report.html'
+	$(STEP) 'done; look at $(CURDIR)/demo/run/panorama.png and report.html beside it'
 
 bench: $(INSTALLED)
 	$(STEP) 'benchmarks'

@@ -31,5 +31,6 @@ def run(
     result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())
     for warning in result.record["warnings"]:
         warn(warning)
-    typer.echo(f"panorama  {result.directory / 'panorama.png'}")
-    typer.echo(f"report    {result.directory / 'report.html'}")
+    directory = result.directory.resolve()
+    typer.echo(f"panorama  {directory / 'panorama.png'}")
+    typer.echo(f"report    {directory / 'report.html'}")

@@ -1,0 +1,244 @@
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from photonpano import Config, LocatorContribution, Requirement
+from photonpano.registry import BrokenPlugin, Catalog
+from photonpano.registry.catalog import make_entry
+from photonpano.spec import load_spec, parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+def test_simulate_writes_a_capture_and_says_how_to_use_it(finished: Path) -> None:
+    assert (finished / "simulate.err").read_text() == ""
+    size = (finished / "cube.truth.npz").stat().st_size
+    assert (finished / "simulate.out").read_text() == (
+        "cube.npy        384.1 kB  200 binary frames of 96x160 at 96,800 Hz\n"
+        f"cube.truth.npz  {size / 1000:.1f} kB  the truth: motion and scene\n"
+        "\n"
+        "In a spec that lies here:\n"
+        "\n"
+        "source: {use: packed-npy, with: {path: cube.npy, frame_rate_hz: 96800}}\n"
+        "\n"
+        "To score a run of it: photonpano evaluate RUN --truth cube.truth.npz\n"
+    )
+
+
+def test_what_simulate_says_is_a_spec(finished: Path) -> None:
+    line = next(line for line in (finished / "simulate.out").read_text().splitlines() if line.startswith("source:"))
+    plan = parse_spec(f"version: 1\n{line}\n", directory=finished)
+    assert plan.source.contribution.name == "packed-npy"
+
+
+def test_simulate_names_the_width_where_bytes_do_not_tell(folder: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("simulate", "capture.yaml", "-o", "odd.npy", "--set", "source.with.frame_shape=[20, 43]")
+    assert "source: {use: packed-npy, with: {path: odd.npy, frame_rate_hz: 96800, width: 43}}" in result.stdout
+    assert np.load(folder / "odd.npy").shape == (200, 20, 6)
+
+
+def test_simulate_warns_of_pixels_that_the_file_cannot_mark(folder: Path, invoke: Callable[..., Any]) -> None:
+    sensor = "source.with.sensor={hot_fraction: 0.01, mask_hot_pixels: true}"
+    result = invoke("simulate", "capture.yaml", "-o", "hot.npy", "--set", sensor, "--set", "source.with.n_frames=5")
+    assert result.exit_code == 0
+    with np.load(folder / "hot.truth.npz") as truth:
+        hot = int(truth["hot_pixels"].sum())
+    assert hot > 0
+    assert result.stderr == (
+        f"warning: {hot} pixels are not to be used, which hot.npy does not say; name them in a file as bad_pixels\n"
+    )
+
+
+def test_run_ends_with_where_to_look_and_is_quiet_in_pipes(finished: Path) -> None:
+    assert (finished / "run.out").read_text() == (
+        f"panorama  {finished}/run/panorama.png\nreport    {finished}/run/report.html\n"
+    )
+    warnings = json.loads((finished / "run" / "run.json").read_text())["warnings"]
+    assert (finished / "run.err").read_text() == "".join(f"warning: {warning}\n" for warning in warnings)
+
+
+def test_evaluate(finished: Path, invoke: Callable[..., Any]) -> None:
+    arguments = ["evaluate", finished / "run", "--truth", finished / "cube.truth.npz"]
+    table = invoke(*arguments)
+    assert table.exit_code == 0, table.stderr
+    rows = dict(line.split("  ", 1) for line in table.stdout.splitlines())
+    scores = json.loads(invoke(*arguments, "--json").stdout)
+    assert {key.strip(): value.strip() for key, value in rows.items()} == {
+        "corner error, mean": f"{scores['corner_error_px']['mean']:.3f} px",
+        "corner error, median": f"{scores['corner_error_px']['median']:.3f} px",
+        "corner error, 95 %": f"{scores['corner_error_px']['p95']:.3f} px",
+        "corner error, worst frame": f"{scores['corner_error_px']['max']:.3f} px",
+        "frames located": f"{100 * scores['located_share']:.1f} %",
+        "PSNR, panorama": f"{scores['panorama']['psnr_db']:.2f} dB",
+        "SSIM, panorama": f"{scores['panorama']['ssim']:.4f}",
+        "PSNR, oracle": f"{scores['oracle']['psnr_db']:.2f} dB",
+        "SSIM, oracle": f"{scores['oracle']['ssim']:.4f}",
+        "PSNR below the oracle": f"{scores['below_oracle_db']:.2f} dB",
+    }
+    assert scores["corner_error_px"]["mean"] < 1
+
+
+def test_evaluate_without_the_oracle(finished: Path, invoke: Callable[..., Any]) -> None:
+    arguments = ["evaluate", finished / "run", "--truth", finished / "cube.truth.npz", "--no-oracle"]
+    assert "oracle" not in invoke(*arguments).stdout
+    assert json.loads(invoke(*arguments, "--json").stdout)["oracle"] is None
+
+
+def test_check_says_ok(folder: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("check", "capture.yaml", "--set", "source.with.n_frames=4000")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == "capture.yaml: ok, 1 level on simulator: 4,000 binary frames of 96x160 at 96,800 Hz\n"
+
+
+def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) -> None:
+    levels = "levels=[{scale: 0.5, locate: {with: {ratio: 0.7}}}, {}]"
+    arguments = ["capture.yaml", "--set", levels, "--set", "run.seed=3"]
+    result = invoke("explain", *arguments)
+    assert result.exit_code == 0, result.stderr
+    expected = load_spec("capture.yaml", [levels, "run.seed=3"]).document
+    assert YAML(typ="safe").load(result.stdout) == expected
+    assert parse_spec(result.stdout).document == expected
+
+
+def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
+    spec = (
+        (folder / "capture.yaml").read_text().replace("levels: 1", "locate: {with: {ratio: 0.7}}\nlevels: [{locate: {}}, {}]")
+    )
+    (folder / "capture.yaml").write_text(spec)
+    lines = [line.strip() for line in invoke("explain", "capture.yaml", "--set", "run.seed=3").stdout.splitlines()]
+    assert lines[0] == "# capture.yaml as it will run, on 200 binary frames of 96x160 at 96,800 Hz"
+    assert "use: simulator  # photonpano 0.1.0" in lines
+    assert "use: opencv-sift  # photonpano 0.1.0, default" in lines
+    assert "flux: 1" in lines
+    assert "group_size: 50" in lines
+    assert "endpoints: true  # default" in lines
+    assert "ratio: 0.7" in lines
+    assert "seed: 3  # --set" in lines
+    assert f"directory: {folder}/runs/capture  # default" in lines
+    assert "# level 1: 4 groups of 50 frames, 5 pairs" in lines
+    assert "# level 2: 9 groups of 50 frames, 20 pairs" in lines
+
+
+def test_schema(folder: Path, invoke: Callable[..., Any]) -> None:
+    printed = json.loads(invoke("schema").stdout)
+    assert {"version", "source", "levels"} <= set(printed["properties"])
+    assert invoke("schema", "--output", "schema.json").stdout == "schema.json\n"
+    assert json.loads((folder / "schema.json").read_text()) == printed
+
+
+class Nothing(Config):
+    pass
+
+
+def locator(name: str, *requires: Requirement) -> LocatorContribution[Nothing]:
+    return LocatorContribution(name=name, summary="A toy", config=Nothing, build=lambda *_: None, requires=requires)
+
+
+@pytest.fixture
+def odd_catalog(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [make_entry(locator("twice"), plugin, "2.0", f"{plugin} = {plugin}.hooks") for plugin in ("alpha", "beta")]
+    rows.append(make_entry(locator("far", Requirement("no_such_library", "gamma[far]")), "gamma", "1.0", "g = gamma.hooks"))
+    broken = BrokenPlugin("delta", "0.3", "d = delta.hooks", "ImportError: no module named [delta]")
+    monkeypatch.setattr("photonpano.registry.discover", lambda: Catalog(tuple(rows), (broken,)))
+
+
+def test_plugins_list(invoke: Callable[..., Any]) -> None:
+    result = invoke("plugins", "list", "--kind", "source")
+    assert (result.exit_code, result.stderr) == (0, "")
+    head, *rows = result.stdout.splitlines()
+    assert head.split() == ["KIND", "NAME", "PLUGIN", "SUMMARY"]
+    assert [row.split()[:4] for row in rows] == [
+        ["source", "packed-npy", "photonpano", "0.1.0"],
+        ["source", "simulator", "photonpano", "0.1.0"],
+    ]
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_list_shows_what_cannot_be_used(invoke: Callable[..., Any]) -> None:
+    result = invoke("plugins", "list")
+    assert result.stdout == (
+        "KIND     NAME   PLUGIN     SUMMARY\n"
+        "locator  twice  alpha 2.0  [name taken twice] A toy\n"
+        "locator  twice  beta 2.0   [name taken twice] A toy\n"
+        "locator  far    gamma 1.0  [not installed: gamma[far]] A toy\n"
+    )
+    assert result.stderr == "1 plugin is broken, see: photonpano plugins list --broken\n"
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_list_broken(invoke: Callable[..., Any]) -> None:
+    result = invoke("plugins", "list", "--broken")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == "delta 0.3 (d = delta.hooks): ImportError: no module named [delta]\n"
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_list_json(invoke: Callable[..., Any]) -> None:
+    data = json.loads(invoke("plugins", "list", "--kind", "locator", "--json").stdout)
+    assert [(row["name"], row["plugin"]) for row in data["components"]] == [
+        ("twice", "alpha"),
+        ("twice", "beta"),
+        ("far", "gamma"),
+    ]
+    assert data["components"][2]["unavailable"] == (
+        "the locator 'far' needs no_such_library, which is not installed: pip install \"gamma[far]\""
+    )
+    assert data["broken"] == [
+        {
+            "plugin": "delta",
+            "version": "0.3",
+            "entry_point": "d = delta.hooks",
+            "error": "ImportError: no module named [delta]",
+        }
+    ]
+
+
+def test_no_plugin_is_broken(invoke: Callable[..., Any]) -> None:
+    assert invoke("plugins", "list", "--broken").stdout == "no plugin is broken\n"
+
+
+def test_plugins_show(finished: Path, invoke: Callable[..., Any]) -> None:
+    text = invoke("plugins", "show", "packed-npy").stdout
+    head, facts, table, snippet = text.split("\n\n")
+    assert head.startswith("packed-npy: ")
+    assert facts == "kind    source\nplugin  photonpano 0.1.0 (core = photonpano_core.hooks)"
+    assert [line.split()[0] for line in table.splitlines()] == ["KEY", "path", "frame_rate_hz", "width", "bad_pixels"]
+    assert "required" in table
+    plan = parse_spec("version: 1\n" + snippet.replace('"<a path>"', "cube.npy"), directory=finished)
+    assert plan.source.contribution.name == "packed-npy"
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_show_says_how_to_install(invoke: Callable[..., Any]) -> None:
+    assert invoke("plugins", "show", "far").stdout == (
+        "far: A toy\n\n"
+        "kind    locator\n"
+        "plugin  gamma 1.0 (g = gamma.hooks)\n"
+        'needs   pip install "gamma[far]" (not installed)\n\n'
+        "locate:\n  use: far\n"
+    )
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_show_of_a_name_that_two_offer(invoke: Callable[..., Any]) -> None:
+    result = invoke("plugins", "show", "twice")
+    assert result.exit_code == 1
+    assert result.stderr == (
+        "error: the locator 'twice' is offered by alpha 2.0 (alpha = alpha.hooks) and beta 2.0 (beta = beta.hooks); "
+        "uninstall all but one\n"
+    )
+
+
+def test_plugins_show_of_an_unknown_name(invoke: Callable[..., Any]) -> None:
+    result = invoke("plugins", "show", "opencv-shift")
+    assert result.exit_code == 2
+    assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'?" in result.stderr
+    wrong_kind = invoke("plugins", "show", "opencv-sift", "--kind", "source")
+    assert "there is no source 'opencv-sift'; known: packed-npy and simulator" in wrong_kind.stderr

@@ -1,0 +1,155 @@
+"""What users read when they made a mistake, word for word."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano.cli.outcome import reported
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SOURCE = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\n"
+
+
+def spec(folder: Path, text: str) -> str:
+    (folder / "spec.yaml").write_text(text)
+    return "spec.yaml"
+
+
+@pytest.mark.parametrize("command", ["check", "run", "explain"])
+def test_all_problems_of_a_spec_each_on_a_line(folder: Path, invoke: Callable[..., Any], command: str) -> None:
+    text = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\nresample: {group_size: 50}\nrender: {scale: big}\n"
+    result = invoke(command, spec(folder, text), "--set", "run.seed=-1")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        f"spec.yaml:2:1: source: there is no file {folder}/cube.npy; check the path\n"
+        "spec.yaml:3:12: resample.group_size: unknown key; it belongs under `with`\n"
+        "spec.yaml:4:17: render.scale: expected a number from 0.05 to 16, got 'big'\n"
+        "run.seed: expected an integer of at least 0, got -1 (in the override run.seed=-1)\n"
+        "error: the spec has 4 problems\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            SOURCE + "locate: {use: opencv-shift}\n",
+            "spec.yaml:3:15: locate.use: there is no locator 'opencv-shift'; did you mean 'opencv-sift'?\n",
+        ),
+        (SOURCE + "level: 3\n", "spec.yaml:3:1: level: unknown key; did you mean 'levels'?\n"),
+    ],
+    ids=["component", "key"],
+)
+def test_one_problem(folder: Path, invoke: Callable[..., Any], text: str, message: str) -> None:
+    np.save(folder / "cube.npy", np.zeros((2, 4, 1), np.uint8))
+    result = invoke("check", spec(folder, text))
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == message + "error: the spec has 1 problem\n"
+
+
+def test_a_spec_that_is_not_there(folder: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("run", folder / "nowhere.yaml")
+    assert (result.exit_code, result.stderr) == (
+        2,
+        f"{folder}/nowhere.yaml: there is no such file\nerror: the spec has 1 problem\n",
+    )
+
+
+@pytest.mark.parametrize("command", ["check", "run", "explain"])
+def test_a_capture_that_is_too_short_for_the_spec(folder: Path, invoke: Callable[..., Any], command: str) -> None:
+    np.save(folder / "cube.npy", np.zeros((20, 4, 1), np.uint8))
+    result = invoke(command, spec(folder, SOURCE + "resample: {use: midpoint, with: {group_size: 30}}\n"))
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "spec.yaml:3:1: resample: the capture has 20 frames, fewer than one group of 30; "
+        "set group_size to 5 or less, so that at least four groups fit\nerror: the spec has 1 problem\n"
+    )
+    assert not (folder / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["simulate", "capture.yaml", "--output", "cube.bin"],
+            "error: cannot write cube.bin: a packed capture is a .npy file; name it cube.bin.npy\n",
+        ),
+        (
+            ["simulate", "capture.yaml", "--output", "no/cube.npy"],
+            "error: cannot write no/cube.npy: there is no folder no; create it or choose another\n",
+        ),
+        (
+            ["schema", "--output", "no/schema.json"],
+            "error: cannot write no/schema.json: there is no folder no; create it or choose another\n",
+        ),
+        (
+            ["run", "capture.yaml", "--output", "capture.yaml/run"],
+            "error: {folder}/capture.yaml/run: the run folder cannot be written to (Not a directory); "
+            "choose another one with --output\n",
+        ),
+        (
+            ["evaluate", "nowhere", "--truth", "truth.npz", "--no-oracle"],
+            "error: nowhere is not a folder; give the run folder that `photonpano run` wrote\n",
+        ),
+    ],
+    ids=["suffix", "folder", "schema", "run folder", "evaluate"],
+)
+def test_what_fails_exits_1(folder: Path, invoke: Callable[..., Any], arguments: list[str], message: str) -> None:
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr == message.replace("{folder}", str(folder))
+    assert [path.name for path in folder.iterdir()] == ["capture.yaml"]
+
+
+def test_square_brackets_are_not_taken_for_markup(folder: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("check", folder / "[bold]no[bold].yaml")
+    assert "[bold]no[bold].yaml: there is no such file" in result.stderr
+
+
+@pytest.mark.parametrize(("options", "environment"), [(["--debug"], {}), ([], {"PHOTONPANO_DEBUG": "1"})])
+def test_debug_shows_the_traceback(
+    folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, options: list[str], environment: dict[str, str]
+) -> None:
+    assert "Traceback" not in invoke("run", "nowhere.yaml").stderr
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    result = invoke(*options, "run", "nowhere.yaml")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Traceback (most recent call last):")
+    assert result.stderr.endswith("error: the spec has 1 problem\n")
+
+
+def test_defects_keep_their_traceback() -> None:
+    with pytest.raises(ZeroDivisionError), reported():
+        _ = 1 / 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise there")
+def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: list[str]) -> None:
+    command = [*program, "simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=100000"]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        while not list(folder.glob(".cube*")) and process.poll() is None:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert err == "\ninterrupted; nothing half-written is left under a final name\n"
+    assert [path.name for path in folder.iterdir()] == ["capture.yaml"]
+
+
+def test_a_reader_that_goes_away_is_no_error(folder: Path, program: list[str]) -> None:
+    with subprocess.Popen([*program, "schema"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""

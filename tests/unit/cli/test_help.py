@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import typer
+
+import photonpano
+from photonpano.cli.app import app
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+HEAVY = {"numpy", "pydantic", "cv2", "scipy", "skimage", "matplotlib", "rich", "photonpano_core", "photonpano_opencv"}
+
+
+def commands(group: Any, name: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for key, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*name, key))
+        else:
+            yield (*name, key), command
+
+
+COMMANDS = dict(commands(typer.main.get_command(app)))
+
+
+def test_help_imports_nothing_heavy(program: list[str]) -> None:
+    script = f"import sys, atexit; atexit.register(lambda: print(*sys.modules, file=sys.stderr)); {program[-1]}"
+    done = subprocess.run([sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True)
+    assert "Make the panorama of a spec." in done.stdout
+    loaded = {module.partition(".")[0] for module in done.stderr.split()}
+    assert "typer" in loaded
+    assert not loaded & HEAVY
+
+
+def test_there_are_these_commands() -> None:
+    assert {" ".join(name) for name in COMMANDS} == {
+        "run",
+        "check",
+        "explain",
+        "simulate",
+        "evaluate",
+        "schema",
+        "plugins list",
+        "plugins show",
+    }
+
+
+@pytest.mark.parametrize("name", COMMANDS, ids=" ".join)
+def test_help_explains_every_option_and_has_an_example_that_works(name: tuple[str, ...], invoke: Callable[..., Any]) -> None:
+    command = COMMANDS[name]
+    assert [parameter.name for parameter in command.params if not parameter.help] == []
+    text = invoke(*name, "--help").stdout
+    assert all(len(line) <= 80 for line in text.splitlines())
+    examples = [line.split("Example: ")[1] for line in command.help.splitlines() if "Example: " in line]
+    assert len(examples) == 1
+    program, *arguments = shlex.split(examples[0].partition(" > ")[0])
+    assert (program, *arguments[: len(name)]) == ("photonpano", *name)
+    with command.make_context(name[-1], arguments[len(name) :]):
+        pass
+
+
+def test_short_help_is_not_cut(invoke: Callable[..., Any]) -> None:
+    assert "..." not in invoke("--help").stdout.replace("[ARGS]...", "")
+    assert "..." not in invoke("plugins", "--help").stdout.replace("[ARGS]...", "")
+
+
+def test_version(invoke: Callable[..., Any]) -> None:
+    assert invoke("--version").stdout == f"photonpano {photonpano.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run"], "Missing argument 'SPEC'"),
+        (["run", "a.yaml", "--ouput", "b"], "No such option: --ouput"),
+        (["rum", "a.yaml"], "No such command 'rum'"),
+        (["simulate", "a.yaml"], "Missing option '--output' / '-o'"),
+    ],
+)
+def test_a_wrong_command_line_exits_2(arguments: list[str], message: str, invoke: Callable[..., Any]) -> None:
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert message in result.stderr
