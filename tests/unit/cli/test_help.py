@@ -25,6 +25,11 @@ def commands(group: Any, name: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
             yield (*name, key), command
 
 
+@pytest.fixture(autouse=True)
+def narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+
+
 COMMANDS = dict(commands(typer.main.get_command(app)))
 
 

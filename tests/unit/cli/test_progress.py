@@ -2,14 +2,30 @@ from __future__ import annotations
 
 import io
 
+import pytest
 from rich.console import Console
 
 from photonpano.cli.progress import Bars, progress_for_stderr
 from photonpano.pipeline.progress import Quiet
 
 
-def test_quiet_where_nobody_watches() -> None:
-    assert isinstance(progress_for_stderr(), Quiet)
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stderr", "terminal", "expected"),
+    [(io.StringIO(), "xterm", Quiet), (Terminal(), "xterm", Bars), (Terminal(), "dumb", Quiet)],
+    ids=["pipe", "terminal", "dumb terminal"],
+)
+def test_bars_are_for_those_who_watch(
+    monkeypatch: pytest.MonkeyPatch, stderr: io.StringIO, terminal: str, expected: type
+) -> None:
+    monkeypatch.setattr("sys.stderr", stderr)
+    monkeypatch.setenv("TERM", terminal)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert isinstance(progress_for_stderr(), expected)
 
 
 def test_a_bar_shows_stage_count_and_rate() -> None:
