@@ -12,6 +12,7 @@ import numpy as np
 from photonpano.geometry import apply, corners
 from photonpano.report.pictures import shrunk
 from photonpano.report.spans import true_spans
+from photonpano.report.wording import duration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -149,7 +150,7 @@ def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) 
             axes.barh(["panorama"], panorama["seconds"], height=0.62, color=SERIES[4], label="render")
             totals.append(panorama["seconds"])
         for name, total in zip(names, totals, strict=True):
-            axes.annotate(f"{total:.2g}", (total, name), xytext=(5, 0), textcoords="offset points", va="center", color=MUTED)
+            axes.annotate(duration(total), (total, name), xytext=(5, 0), textcoords="offset points", va="center", color=MUTED)
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.spines["left"].set_visible(False)
