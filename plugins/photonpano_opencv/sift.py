@@ -43,6 +43,30 @@ class SiftFeatures:
     shape: tuple[int, int]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Pairs of keypoints, and what they agree on.
+
+    Attributes:
+        pairs: (K, 2) indices of moving and fixed keypoints.
+        homography: (3, 3) the motion that most of them agree on; None if there is none beyond chance.
+        agreeing: how many of them agree.
+    """
+
+    pairs: NDArray[np.intp]
+    homography: NDArray[np.float64] | None
+    agreeing: int
+
+
+def least_agreeing(matches: int) -> float:
+    """Return how many matches must agree to tell a motion from chance (Brown and Lowe 2007, section 3.2).
+
+    Near where a motion is predicted, keypoints of pure noise match as well: 10 to 16 % of them agree on something, while 60 %
+    and more do of a scene at 0.01 photons per pixel and frame.
+    """
+    return 8.0 + 0.3 * matches
+
+
 class SiftLocator:
     """Detects once, matches with the ratio test, finds a consensus, fits all inliers, and checks what came out."""
 
@@ -80,19 +104,25 @@ class SiftLocator:
         config = self._config
         evidence = {"keypoints_moving": float(len(moving.points)), "keypoints_fixed": float(len(fixed.points))}
         descriptors = unit_descriptors(moving.descriptors), unit_descriptors(fixed.descriptors)
-        pairs = np.zeros((0, 2), dtype=np.intp)
+        matches = Matches(np.zeros((0, 2), dtype=np.intp), None, 0)
         if initial is not None:
             predicted = apply(initial, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, config.search_px, config.ratio)
-        if len(pairs) < config.min_inliers:
+            matches = self._consensus(moving.points, fixed.points, pairs)
+        if matches.homography is None:
             # No motion is known yet, or it is further off than the search reaches.
-            pairs = match_everywhere(*descriptors, config.ratio)
+            matches = self._consensus(moving.points, fixed.points, match_everywhere(*descriptors, config.ratio))
+        pairs, homography = matches.pairs, matches.homography
         evidence["matches"] = float(len(pairs))
         if len(pairs) < config.min_inliers:
             return NotLocated(self._too_few("matches", evidence), evidence)
-        homography = self._consensus(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]])
+        evidence["agreeing"] = float(matches.agreeing)
         if homography is None:
-            return NotLocated(f"{len(pairs)} matches do not agree on any motion", evidence)
+            return NotLocated(
+                f"{matches.agreeing} of {len(pairs)} matches agree on a motion, which may be chance "
+                f"(more than {least_agreeing(len(pairs)):.0f} must)",
+                evidence,
+            )
         for radius in GUIDED_RADII:
             if reason := implausibility(homography, moving.shape):
                 return NotLocated(f"{reason}, from {len(pairs)} matches", evidence)
@@ -114,8 +144,11 @@ class SiftLocator:
             return NotLocated(f"{reason}, from {len(pairs)} inliers", evidence)
         return Located(homography, fit.information, fit.residual_px, evidence)
 
-    def _consensus(self, moving: NDArray[np.float32], fixed: NDArray[np.float32]) -> NDArray[np.float64] | None:
-        """Return the homography that most matches agree on (MAGSAC++), None if there is none."""
+    def _consensus(self, moving: NDArray[np.float32], fixed: NDArray[np.float32], pairs: NDArray[np.intp]) -> Matches:
+        """Find the homography that most pairs agree on (MAGSAC++), unless chance alone could make them agree."""
+        if len(pairs) < self._config.min_inliers:
+            return Matches(pairs, None, 0)
+        here, there = moving[pairs[:, 0]], fixed[pairs[:, 1]]
         settings = cv2.UsacParams()
         settings.threshold = self._config.threshold_px
         settings.confidence = 0.999
@@ -124,9 +157,14 @@ class SiftLocator:
         settings.score = cv2.SCORE_METHOD_MAGSAC
         settings.loMethod = cv2.LOCAL_OPTIM_SIGMA
         settings.randomGeneratorState = self._seed
-        homography, _ = cv2.findHomography(moving, fixed, settings)
+        found, _ = cv2.findHomography(here, there, settings)
         # OpenCV returns nothing, or an empty matrix, when it finds no model.
-        return normalised(homography) if np.shape(homography) == (3, 3) else None
+        if np.shape(found) != (3, 3):
+            return Matches(pairs, None, 0)
+        homography = np.asarray(found, dtype=np.float64)
+        distances = np.linalg.norm(apply(homography, here) - there, axis=1)
+        agreeing = int(np.count_nonzero(distances < self._config.threshold_px))
+        return Matches(pairs, normalised(homography) if agreeing > least_agreeing(len(pairs)) else None, agreeing)
 
     def _too_few(self, what: str, evidence: dict[str, float]) -> str:
         return (
