@@ -32,7 +32,7 @@ test: $(INSTALLED)
 	$(STEP) 'mypy'
 	@$(BIN)/mypy
 	$(STEP) 'import-linter'
-	@$(BIN)/lint-imports
+	@$(BIN)/lint-imports --no-logo
 	$(STEP) 'pytest'
 	@$(BIN)/pytest
 

@@ -1,0 +1,71 @@
+"""What several files of the repository say of the same thing agrees."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import photonpano
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+TOOLS = PROJECT["tool"]
+PLUGINS = {path.parent.name for path in ROOT.glob("plugins/*/__init__.py")}
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+CONTRACTS = {contract["name"]: contract for contract in TOOLS["importlinter"]["contracts"]}
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {canonicalize_name(name): version for name, version in pairs}
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    assert PROJECT["project"]["version"] == photonpano.__version__
+
+
+def test_every_dependency_is_pinned_to_a_version_that_it_allows() -> None:
+    project = PROJECT["project"]
+    optional = [line for group in project["optional-dependencies"].values() for line in group]
+    pinned = pins()
+    for line in [*project["dependencies"], *optional, *PROJECT["build-system"]["requires"]]:
+        requirement = Requirement(line)
+        assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)]), line
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        {path.removeprefix("plugins/") for path in TOOLS["hatch"]["build"]["targets"]["wheel"]["packages"]}
+        - {"framework/photonpano"},
+        set(TOOLS["mypy"]["packages"]) - {"photonpano"},
+        set(TOOLS["importlinter"]["root_packages"]) - {"photonpano"},
+        set(CONTRACTS["the framework never imports a plugin"]["forbidden_modules"]),
+        set(CONTRACTS["plugins do not know each other"]["modules"]),
+        {module.partition(".")[0] for module in PROJECT["project"]["entry-points"]["photonpano"].values()},
+    ],
+    ids=["wheel", "mypy", "import-linter", "forbidden to the framework", "independent", "entry points"],
+)
+def test_every_plugin_is_shipped_and_checked(listed: set[str]) -> None:
+    assert listed == PLUGINS
+
+
+def test_make_help_names_every_target() -> None:
+    phony = re.search(r"^\.PHONY: (.*)$", MAKEFILE, re.MULTILINE)
+    assert phony is not None
+    named = set(re.findall(r"@echo 'make (\w+) ", MAKEFILE))
+    assert named | {"help"} == set(phony[1].split())
+
+
+def test_continuous_integration_can_be_started() -> None:
+    script = ROOT / ".ci" / "run"
+    assert script.stat().st_mode & 0o111
+    subprocess.run(["bash", "-n", script], check=True)
+    assert "make test" in script.read_text(encoding="utf-8")
