@@ -103,10 +103,10 @@ def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-
 
         class NaiveSum:
             def merge(self, source, group, trajectory, scale):
-                counts = source.counts(group.span)
-                weight = np.where(source.valid, len(group.span), 0).astype(np.float32)
-                with np.errstate(invalid="ignore"):
-                    flux = source.response.flux((counts / weight).astype(np.float32), weight)
+                frames = len(group.span)
+                flux = source.response.flux((source.counts(group.span) / frames).astype(np.float32), frames)
+                weight = np.full(flux.shape, frames, np.float32)
+                flux[~source.valid], weight[~source.valid] = np.nan, 0
                 return VirtualExposure(flux, weight, group, 1.0, source.response)
 
 

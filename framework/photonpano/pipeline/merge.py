@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from photonpano.errors import PluginError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -48,5 +50,12 @@ class VirtualExposures:
         return len(self.groups)
 
     def __getitem__(self, index: int) -> VirtualExposure:
-        with self._clock("merge"), self._level.blaming("merger"):
-            return self._level.merger.merge(self._source, self.groups[index], self._known, self._level.scale)
+        level = self._level
+        with self._clock("merge"), level.blaming("merger"):
+            exposure = level.merger.merge(self._source, self.groups[index], self._known, level.scale)
+        if exposure.scale != level.scale:
+            raise PluginError(
+                f"{level.origins['merger']} broke its contract at level {level.number}: "
+                f"expected an exposure of scale {level.scale:g}, got {exposure.scale:g}"
+            )
+        return exposure

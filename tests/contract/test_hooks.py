@@ -1,0 +1,93 @@
+"""The examples of the hooks are what a plugin author copies: they run, register, and can be run in a pipeline."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import types
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group, PluginError, api, hookspecs
+from photonpano.registry import discover
+from photonpano.registry.plugins import contributions_of
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}
+KINDS = {
+    "photonpano_sources": ("source", "my-camera"),
+    "photonpano_resamplers": ("resampler", "halves"),
+    "photonpano_mergers": ("merger", "naive-sum"),
+    "photonpano_locators": ("locator", "never-found"),
+    "photonpano_interpolators": ("interpolator", "nearest"),
+}
+
+
+def example_of(hook: str) -> types.ModuleType:
+    """Make a plugin of the example in the docstring of a hook."""
+    docstring = inspect.cleandoc(inspect.getdoc(HOOKS[hook]) or "")
+    (code,) = re.findall(r"```python\n(.*?)```", docstring, re.DOTALL)
+    module = types.ModuleType(f"example_of_{hook}")
+    exec(compile(inspect.cleandoc(code), module.__name__, "exec"), vars(module))
+    return module
+
+
+def test_there_is_one_hook_for_each_kind() -> None:
+    assert set(HOOKS) == set(KINDS)
+
+
+@pytest.mark.parametrize("hook", KINDS)
+def test_a_hook_takes_nothing_and_shows_a_complete_example(hook: str) -> None:
+    assert not inspect.signature(HOOKS[hook]).parameters
+    (contribution,) = contributions_of(example_of(hook))
+    assert (contribution.kind, contribution.name) == KINDS[hook]
+
+
+@pytest.mark.parametrize("section", ["merge", "interpolate"])
+def test_examples_of_stages_do_their_work(section: str, small_spec: dict[str, Any], tmp_path: Path) -> None:
+    """The other two give two groups, and none located: see below."""
+    hook, name = {"merge": ("photonpano_mergers", "naive-sum"), "interpolate": ("photonpano_interpolators", "nearest")}[section]
+    catalog = discover().including(example_of(hook))
+    plan = parse_spec(small_spec | {section: {"use": name}, "levels": 1}, output=tmp_path / "run", catalog=catalog)
+    record = api.run(plan).record
+    assert {"stage": section, "use": name, "plugin": f"example_of_{hook}", "version": "unreleased"} in record["plugins"]
+    assert record["levels"][0]["located"] == 6
+
+
+def test_the_example_of_a_merger_knows_nothing_of_masked_pixels(memory_source: type) -> None:
+    frames, valid = np.ones((10, 4, 6)), np.ones((4, 6), bool)
+    valid[1, 2] = False
+    (contribution,) = contributions_of(example_of("photonpano_mergers"))
+    merger = contribution.build(contribution.config(), None)
+    exposure = merger.merge(memory_source(frames, valid), Group(FrameSpan(0, 10), 4.5), None, 1.0)
+    np.testing.assert_array_equal(np.isnan(exposure.flux), ~valid)
+    np.testing.assert_array_equal(exposure.weight, np.where(valid, 10, 0))
+
+
+def test_an_example_that_takes_no_scale_is_refused_where_there_is_one(small_spec: dict[str, Any], tmp_path: Path) -> None:
+    catalog = discover().including(example_of("photonpano_mergers"))
+    spec = small_spec | {"merge": {"use": "naive-sum"}, "levels": [{"scale": 0.5}]}
+    with pytest.raises(PluginError) as caught:
+        api.run(parse_spec(spec, output=tmp_path / "run", catalog=catalog))
+    assert str(caught.value) == (
+        "merger 'naive-sum' of example_of_photonpano_mergers unreleased broke its contract at level 1: "
+        "expected an exposure of scale 0.5, got 1"
+    )
+
+
+def test_the_example_of_a_resampler_gives_two_groups() -> None:
+    (contribution,) = contributions_of(example_of("photonpano_resamplers"))
+    groups = contribution.build(contribution.config(), None).groups(100, 1)
+    assert [str(group) for group in groups] == ["frames 0 to 49", "frames 50 to 99"]
+
+
+def test_the_example_of_a_locator_finds_nothing_and_says_so() -> None:
+    (contribution,) = contributions_of(example_of("photonpano_locators"))
+    locator = contribution.build(contribution.config(), None)
+    assert locator.register(locator.describe(None), locator.describe(None), None).reason == "this example looks at nothing"
