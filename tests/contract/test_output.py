@@ -1,0 +1,157 @@
+"""What other programs may rely on in a run folder."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from photonpano.geometry import apply, corners
+from photonpano.photometry import tone_mapped
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+    from photonpano.api import RunResult
+
+N_FRAMES, SHAPE = 300, (128, 160)
+
+
+@pytest.fixture(scope="module")
+def folder(small_run: RunResult) -> Path:
+    return small_run.directory
+
+
+@pytest.fixture(scope="module")
+def record(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def trajectory(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "trajectory.npz", allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def test_the_folder_holds_these_files_and_no_others(folder: Path) -> None:
+    assert {file.name for file in folder.iterdir()} == {
+        "panorama.tiff",
+        "panorama.png",
+        "coverage.tiff",
+        "trajectory.npz",
+        "run.json",
+        "report.html",
+    }
+
+
+def test_the_panorama_is_linear_flux_and_unknown_where_nothing_was_seen(folder: Path) -> None:
+    flux, coverage = tifffile.imread(folder / "panorama.tiff"), tifffile.imread(folder / "coverage.tiff")
+    assert flux.dtype == coverage.dtype == np.float32
+    assert flux.shape == coverage.shape
+    np.testing.assert_array_equal(np.isnan(flux), coverage == 0)
+    assert 0.3 < np.nanmean(flux) < 0.8
+    assert np.nanmin(flux) >= 0
+    assert coverage.max() <= N_FRAMES + 0.01
+    assert set(np.unique(coverage[(coverage > 0) & (coverage < 1)])) == set()
+
+
+def test_the_picture_is_the_panorama_in_srgb(folder: Path, record: dict[str, Any]) -> None:
+    picture = cv2.imread(str(folder / "panorama.png"), cv2.IMREAD_UNCHANGED)
+    flux = tifffile.imread(folder / "panorama.tiff")
+    white = record["panorama"]["white_flux"]
+    assert white == pytest.approx(np.nanquantile(flux, 0.995))
+    np.testing.assert_array_equal(picture, tone_mapped(flux, white))
+
+
+def test_the_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str, np.ndarray]) -> None:
+    homographies = trajectory["homographies"]
+    assert {name: array.shape for name, array in trajectory.items()} == {
+        "homographies": (N_FRAMES, 3, 3),
+        "canvas": (3, 3),
+        "frame_shape": (2,),
+        "reference": (),
+        "located": (N_FRAMES,),
+    }
+    assert homographies.dtype == trajectory["canvas"].dtype == np.float64
+    assert trajectory["located"].dtype == np.bool_
+    assert np.issubdtype(trajectory["reference"].dtype, np.integer)
+    assert tuple(trajectory["frame_shape"]) == SHAPE
+    reference = int(trajectory["reference"])
+    assert reference == N_FRAMES // 2
+    np.testing.assert_allclose(homographies[reference], np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(homographies[:, 2, 2], 1)
+
+
+def test_the_canvas_maps_the_reference_frame_to_the_panorama(folder: Path, trajectory: dict[str, np.ndarray]) -> None:
+    """Every located frame lies on the panorama, and its middle was seen."""
+    coverage = tifffile.imread(folder / "coverage.tiff")
+    to_panorama = trajectory["canvas"] @ trajectory["homographies"][trajectory["located"]]
+    placed = apply(to_panorama, corners(SHAPE))
+    assert placed.min() > -0.5
+    assert (placed.max(axis=(0, 1)) < np.array(coverage.shape[::-1]) - 0.5).all()
+    middles = np.rint(apply(to_panorama, [[(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]])[:, 0]).astype(int)
+    assert coverage[middles[:, 1], middles[:, 0]].min() > 100
+
+
+def test_the_coverage_counts_the_located_frames(folder: Path, trajectory: dict[str, np.ndarray]) -> None:
+    """The maps hardly change areas here: the sum is frames times pixels of a frame."""
+    coverage = tifffile.imread(folder / "coverage.tiff")
+    assert coverage.sum() == pytest.approx(trajectory["located"].sum() * SHAPE[0] * SHAPE[1], rel=0.02)
+
+
+def test_the_record_tells_how_it_was_made(record: dict[str, Any], small_spec: dict[str, Any], folder: Path) -> None:
+    assert record["status"] == "done"
+    assert record["seed"] == 0
+    assert record["source"] == {
+        "n_frames": N_FRAMES,
+        "height": SHAPE[0],
+        "width": SHAPE[1],
+        "frame_rate_hz": 96800,
+        "kind": "binary",
+    }
+    assert [(plugin["stage"], plugin["use"]) for plugin in record["plugins"]] == [
+        ("source", "packed-npy"),
+        ("resample", "midpoint"),
+        ("merge", "photon-mle"),
+        ("locate", "opencv-sift"),
+        ("interpolate", "lucas-kanade"),
+    ]
+    assert all(plugin["plugin"] == "photonpano" and plugin["version"] for plugin in record["plugins"])
+    assert {"python", "numpy", "opencv-python-headless", "scipy"} <= set(record["libraries"])
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", record["created"])
+    assert record["peak_memory_bytes"] is None or 50e6 < record["peak_memory_bytes"] < 4e9
+    assert record["seconds"] > 0
+
+
+def test_the_recorded_spec_is_a_spec_of_the_same_run(record: dict[str, Any], small_spec: dict[str, Any], folder: Path) -> None:
+    again = parse_spec(record["spec"])
+    assert again.document == parse_spec(small_spec, output=folder).document
+    assert again.source.config.path.is_absolute()
+
+
+def test_the_record_tells_of_every_level(record: dict[str, Any]) -> None:
+    levels = record["levels"]
+    assert [level["level"] for level in levels] == [1, 2, 3]
+    assert [level["groups"] for level in levels] == [6, 13, 23]
+    assert levels[0]["change_px"] is None
+    assert levels[1]["change_px"] > levels[2]["change_px"] > 0
+    for level in levels:
+        assert level["located"] == level["groups"]
+        assert level["pairs"] >= level["groups"] - 1
+        assert set(level["seconds"]) == {"resample", "merge", "locate", "interpolate"}
+        for failure in level["failures"]:
+            assert set(failure) == {"moving", "fixed", "reason", "evidence"}
+
+
+def test_the_report_needs_nothing_else(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r"""(?:src|href)=["'](?!data:|#)[^"']*""", page) == []
+    assert "<script" not in page
+    assert "data:image/png;base64," in page
