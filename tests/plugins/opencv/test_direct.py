@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano_opencv.configs import DirectConfig
+from photonpano_opencv.direct import DirectLocator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (160, 240)
+STILL = np.eye(3)
+LOCATOR = DirectLocator(DirectConfig())
+ROTATED = from_parameters([np.cos(0.03) - 1, np.sin(0.03), -np.sin(0.03), np.cos(0.03) - 1, 6.0, -3.0, 0, 0])
+PROJECTIVE = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
+
+
+def register(moving: object, fixed: object, initial: np.ndarray | None = None) -> Located | NotLocated:
+    return LOCATOR.register(LOCATOR.describe(moving), LOCATOR.describe(fixed), initial)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("true", "initial"),
+    [
+        (translation(0.3, -0.2), STILL),
+        (translation(20.25, 7.5), None),
+        (translation(-31.0, 0.0), None),
+        (ROTATED, None),
+        (PROJECTIVE, translation(8, 5)),
+    ],
+    ids=["sub-pixel", "shift", "backwards", "rotation", "projective"],
+)
+def test_it_finds_known_motions_and_not_their_inverse(
+    seen_from: Callable, true: np.ndarray, initial: np.ndarray | None
+) -> None:
+    located = register(seen_from(true, seed=1), seen_from(STILL, seed=2), initial)
+    assert isinstance(located, Located), located
+    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.15
+
+
+def test_forwards_and_backwards_agree(seen_from: Callable) -> None:
+    moving, fixed = seen_from(translation(12.3, 4.1), seed=1), seen_from(STILL, seed=2)
+    forwards, backwards = register(moving, fixed), register(fixed, moving)
+    assert isinstance(forwards, Located)
+    assert isinstance(backwards, Located)
+    assert corner_displacements(forwards.homography, inverse(backwards.homography), SHAPE).max() < 0.05
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.1])
+def test_the_information_is_that_of_the_scatter(seen_from: Callable, brightness: float) -> None:
+    # Whole pixels: between them, the fixture samples its street bluntly, and the images differ by more than noise.
+    true, frame = translation(10, -3), corners(SHAPE)
+    errors, predicted = [], []
+    for seed in range(12):
+        moving = seen_from(true, seed=2 * seed, brightness=brightness)
+        located = register(moving, seen_from(STILL, seed=2 * seed + 1, brightness=brightness), true)
+        assert isinstance(located, Located), located
+        assert located.information is not None
+        assert located.evidence["noise_ratio"] == pytest.approx(1, abs=0.2)
+        to_corners = jacobian(located.homography, frame).reshape(8, 8)
+        predicted.append(np.trace(to_corners @ np.linalg.inv(located.information) @ to_corners.T))
+        errors.append(np.sum((apply(located.homography, frame) - apply(true, frame)) ** 2))
+    assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
+
+
+def test_the_same_input_gives_the_same_bytes_from_any_thread(seen_from: Callable) -> None:
+    moving, fixed = seen_from(translation(5, 2), seed=1), seen_from(STILL, seed=2)
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda _: register(moving, fixed), range(6)))
+    assert len({each.homography.tobytes() for each in found if isinstance(each, Located)}) == 1
+
+
+def test_unseen_pixels_do_not_pull(seen_from: Callable) -> None:
+    true = translation(6.5, 1.5)
+    moving = seen_from(true, seed=1)
+    half = np.zeros(SHAPE, bool)
+    half[:, :150] = True
+    masked = replace(moving, flux=np.where(half, moving.flux, np.nan), weight=np.where(half, moving.weight, 0))
+    located = register(masked, seen_from(STILL, seed=2), STILL)
+    assert isinstance(located, Located), located
+    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.3
+
+
+def test_a_flat_wall_is_not_located(photograph: Callable) -> None:
+    wall = np.full(SHAPE, 0.5, np.float32)
+    assert isinstance(register(photograph(wall, seed=1), photograph(wall, seed=2)), NotLocated)
+
+
+def test_another_place_is_not_located_and_says_why(seen_from: Callable) -> None:
+    failure = register(seen_from(translation(330, 200), seed=1), seen_from(STILL, seed=2), STILL)
+    assert isinstance(failure, NotLocated)
+    assert any(word in failure.reason for word in ("diverges", "correlate", "settled", "overlap"))
+
+
+def test_exposures_that_share_nothing_say_so(seen_from: Callable) -> None:
+    failure = register(seen_from(STILL, seed=1), seen_from(STILL, seed=2), translation(235, 0))
+    assert isinstance(failure, NotLocated)
+    assert "overlap" in failure.reason
