@@ -1,0 +1,162 @@
+"""Whole runs of a small capture: 300 frames of 128x160 px, a pan of 60 px with a trembling hand, groups of 50 frames."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import api
+from photonpano.evaluation import corner_errors
+from photonpano.geometry import rescaling, translation
+from photonpano.pipeline.capture import truth_path
+from photonpano.pipeline.progress import Quiet
+from photonpano.pipeline.run import execute
+from photonpano.pipeline.run_folder import run_folder
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from photonpano.api import RunResult
+    from photonpano.evaluation import Evaluation
+    from photonpano.pipeline.run import RunOutcome
+    from photonpano.spec import Plan
+
+SHAPE = (128, 160)
+INSIDE = slice(25, 275)
+"""The frames that every level locates: at the first, the ends lie beyond the middle of a group."""
+
+
+def outcome_of(plan: Plan) -> RunOutcome:
+    """Run a plan, and leave out the report, which takes longer than all the rest."""
+    with api.open_source(plan) as source:
+        return execute(plan, source, "tests", Quiet())
+
+
+@pytest.fixture(scope="module")
+def run(small_spec: dict[str, Any]) -> Callable[..., RunOutcome]:
+    """Run the small spec with overrides, or with other sections."""
+
+    def run(*overrides: str, **sections: Any) -> RunOutcome:
+        return outcome_of(parse_spec(small_spec | sections, overrides=overrides))
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def error_px(small_capture: Path) -> Callable[[np.ndarray], float]:
+    with np.load(truth_path(small_capture)) as archive:
+        true = archive["homographies"]
+
+    def error_px(homographies: np.ndarray) -> float:
+        return corner_errors(homographies[INSIDE], true[INSIDE], SHAPE).mean_px
+
+    return error_px
+
+
+@pytest.fixture(scope="module")
+def three_levels(small_run: RunResult) -> np.ndarray:
+    with np.load(small_run.directory / "trajectory.npz") as archive:
+        return archive["homographies"]
+
+
+@pytest.fixture(scope="module")
+def scored(small_run: RunResult, small_capture: Path) -> Evaluation:
+    return api.evaluate(small_run.directory, truth_path(small_capture))
+
+
+def test_three_levels_find_the_motion(scored: Evaluation, three_levels: np.ndarray, error_px: Callable) -> None:
+    """0.16 px when this was written; the ends, of which a single group tells, are off by more."""
+    assert error_px(three_levels) < 0.3
+    assert scored.trajectory.located_share == 1
+    assert scored.trajectory.mean_px < 1
+
+
+def test_the_panorama_comes_close_to_the_one_along_the_true_motion(scored: Evaluation) -> None:
+    """Within 2.1 dB when this was written."""
+    assert scored.oracle is not None
+    assert scored.oracle.psnr_db > 25
+    assert scored.oracle.psnr_db - scored.panorama.psnr_db < 3
+
+
+def test_each_level_improves_on_the_one_before(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
+    """1.2, 0.24 and 0.16 px when this was written."""
+    errors = [error_px(run(levels=1).homographies), error_px(run(levels=2).homographies), error_px(three_levels)]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[2] < 0.9 * errors[1]
+
+
+def test_a_constant_number_of_groups_is_clearly_worse(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
+    """0.5 px when this was written."""
+    ablation = run("resample.with.densify=false", "resample.with.endpoints=false")
+    assert error_px(ablation.homographies) > 1.8 * error_px(three_levels)
+
+
+def test_a_naive_average_is_clearly_worse(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
+    """1.9 px when this was written: more levels do not help."""
+    naive = run("merge.with.compensate=false", levels=2)
+    assert error_px(naive.homographies) > 4 * error_px(three_levels)
+
+
+def test_a_first_level_of_half_the_size_shows_the_way_to_the_second(run: Callable, error_px: Callable) -> None:
+    coarse, fine = run(levels=[{"scale": 0.5}]), run(levels=[{"scale": 0.5}, {}])
+    assert error_px(coarse.homographies) < 2.5
+    assert error_px(fine.homographies) < 0.4
+    assert [level["scale"] for level in fine.record["levels"]] == [0.5, 1.0]
+
+
+def test_the_panorama_has_the_scale_of_the_spec(run: Callable) -> None:
+    once, twice = run(levels=1).panorama, run("render.scale=2", levels=1).panorama
+    assert twice.flux.shape == (2 * once.flux.shape[0], 2 * once.flux.shape[1])
+    np.testing.assert_allclose(twice.canvas, rescaling(2) @ once.canvas, atol=1e-9)
+    assert np.nanmean(twice.flux) == pytest.approx(np.nanmean(once.flux), rel=0.02)
+    assert twice.weight.max() == pytest.approx(once.weight.max(), rel=0.02)
+
+
+@pytest.mark.parametrize(("reference", "frame"), [("first", 0), ("last", 299), (77, 77)])
+def test_the_panorama_lies_in_the_plane_of_the_frame_that_the_spec_names(
+    run: Callable, reference: str | int, frame: int
+) -> None:
+    outcome = run(f"render.reference={reference}", levels=1)
+    assert outcome.reference == frame
+    np.testing.assert_allclose(outcome.homographies[frame], np.eye(3), atol=1e-12)
+    # A canvas of scale 1 samples the pixels of the reference plane as they are.
+    canvas = outcome.panorama.canvas
+    np.testing.assert_array_equal(canvas, translation(round(canvas[0, 2]), round(canvas[1, 2])))
+
+
+def test_any_number_of_threads_gives_the_same_bytes(run: Callable, tmp_path: Path) -> None:
+    """Four groups, then nine: the order in which threads finish must not show."""
+    written = set()
+    for threads in (1, 2, 3):
+        outcome = run(f"run.threads={threads}", "resample.with.group_size=75", levels=2)
+        with run_folder(tmp_path) as folder:
+            folder.write_trajectory(outcome.homographies, outcome.located, outcome.panorama.canvas, SHAPE, outcome.reference)
+        written.add((tmp_path / "trajectory.npz").read_bytes())
+    assert len(written) == 1
+
+
+def test_a_recorded_spec_repeats_the_run(run: Callable) -> None:
+    first = run("run.seed=3", levels=1)
+    again = outcome_of(parse_spec(json.loads(json.dumps(first.record["spec"]))))
+    np.testing.assert_array_equal(again.homographies, first.homographies)
+    np.testing.assert_array_equal(again.panorama.flux, first.panorama.flux)
+
+
+def test_masked_hot_pixels_leave_no_trace(simulated: Callable) -> None:
+    """One in a hundred pixels is lit in every frame; masked, it shows what other frames saw there."""
+    sensor = {"hot_fraction": 0.01, "hot_rate": [5, 6]}
+    capture = simulated(path={"kind": "pan", "length_px": 40}, n_frames=120, sensor=sensor)
+    with np.load(truth_path(capture)) as archive:
+        np.save(capture.with_name("hot.npy"), archive["hot_pixels"])
+    source = {"use": "packed-npy", "with": {"path": str(capture), "bad_pixels": str(capture.with_name("hot.npy"))}}
+    spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 40}}, "levels": 1}
+    masked = outcome_of(parse_spec(spec)).panorama
+    lit = outcome_of(parse_spec(spec, overrides=["source.with.bad_pixels=null"])).panorama
+    assert abs(np.isnan(masked.flux).mean() - np.isnan(lit.flux).mean()) < 0.01
+    # A streak of light 40 px long behind each of 200 pixels raises the mean.
+    assert np.nanmean(lit.flux) > 1.01 * np.nanmean(masked.flux)
