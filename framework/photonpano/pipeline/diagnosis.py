@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 TOLERATED_RUN = 2
 """So many exposures in a row may be lost: the motion is interpolated across them."""
 _NOISY = 0.25
-"""Below this ratio of signal to noise, darkness is to blame; above it, blur or a scene without texture."""
+"""Below this ratio of signal to noise, darkness may be to blame; above it, blur may. Either may be for want of texture."""
 _SHOWN = 6
 
 
@@ -95,7 +95,10 @@ def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Co
     size = int(np.median([len(group.span) for group in groups]))
     seen = f"In these exposures of {size} frames the scene varies {ratio:.2g} times as much as a pixel's photon noise"
     if ratio < _NOISY:
-        return [f"{seen}: they are too dark. Try larger groups, such as resample.with.group_size={2 * size}."]
+        return [
+            f"{seen}: either they are too dark (try larger groups, such as resample.with.group_size={2 * size}), "
+            "or the scene has no texture there."
+        ]
     return [
         f"{seen}, so darkness is not the cause: either motion blurs them (try smaller groups, such as "
         f"resample.with.group_size={max(1, size // 2)}), or the scene has no texture there."

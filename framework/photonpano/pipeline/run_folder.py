@@ -96,13 +96,13 @@ def run_folder(directory: Path) -> Iterator[RunFolder]:
     """Gather the files of a run, and give them their final names when the block ends well.
 
     The folder is made, and proved to be writable, before the work starts. When the block raises, what was there before stays
-    as it was, and a folder that was not there is gone again.
+    as it was, and folders that were not there are gone again.
 
     Raises:
         OutputError: the folder cannot be made or written to, or the disk is full.
     """
-    existed = directory.exists()
     try:
+        missing = [folder for folder in (directory, *directory.parents) if not folder.exists()]
         directory.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=".part-", dir=directory))
     except OSError as error:
@@ -121,9 +121,10 @@ def run_folder(directory: Path) -> Iterator[RunFolder]:
         done = True
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-        if not done and not existed:
-            with suppress(OSError):
-                directory.rmdir()
+        if not done:
+            with suppress(OSError):  # somebody else has put something there
+                for folder in missing:
+                    folder.rmdir()
 
 
 @contextmanager

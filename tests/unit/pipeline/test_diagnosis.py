@@ -113,8 +113,8 @@ texture there.
 
 def test_darkness_is_told_from_blur() -> None:
     assert refusal((0, 1, 2, 7, 8, 9), DARK).splitlines()[-2:] == [
-        "In these exposures of 100 frames the scene varies 0.17 times as much as a pixel's photon noise: they are too dark. "
-        "Try larger groups, such as resample.with.group_size=200.",
+        "In these exposures of 100 frames the scene varies 0.17 times as much as a pixel's photon noise: either they are too "
+        "dark (try larger groups, such as resample.with.group_size=200), or the scene has no texture there.",
         "To go on with the largest part alone, set graph.disconnected to largest.",
     ]
 

@@ -16,7 +16,7 @@ LIT = (
 )
 
 
-@pytest.mark.parametrize(("n_frames", "looked_at"), [(1, 1), (10, 10), (1000, 256)])
+@pytest.mark.parametrize(("n_frames", "looked_at"), [(1, 1), (40, 40), (256, 256), (257, 256), (1000, 256)])
 @pytest.mark.parametrize(("value", "text"), [(0, DARK), (1, LIT)])
 def test_all_dark_and_all_lit_captures_are_refused(
     memory_source: type, n_frames: int, looked_at: int, value: int, text: str

@@ -105,8 +105,19 @@ def test_an_exception_leaves_what_was_there(old: Path, error: type[BaseException
 
 def test_an_exception_leaves_no_folder_that_was_not_there(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="half-way"):
-        write_and_fail(tmp_path / "scan", ValueError("half-way"))
+        write_and_fail(tmp_path / "runs" / "today" / "scan", ValueError("half-way"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_somebody_else_put_there_stays(tmp_path: Path) -> None:
+    def meet_another() -> None:
+        with run_folder(tmp_path / "runs" / "scan"):
+            (tmp_path / "runs" / "notes.txt").write_text("a note")
+            raise ValueError("half-way")
+
+    with pytest.raises(ValueError, match="half-way"):
+        meet_another()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "runs", tmp_path / "runs" / "notes.txt"]
 
 
 @contextmanager
