@@ -1,5 +1,6 @@
 """All commands in one program. Commands import what they need when they run, so that help is quick."""
 
+import signal
 from typing import Annotated, Any
 
 import typer
@@ -64,4 +65,6 @@ def photonpano_options(
 
 def main() -> None:
     """Run the program with the arguments of the process."""
+    # Batch systems end a job with SIGTERM; it cleans up as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     app()

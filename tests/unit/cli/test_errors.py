@@ -135,12 +135,13 @@ def test_defects_keep_their_traceback() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise there")
-def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: list[str]) -> None:
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: list[str], sent: signal.Signals) -> None:
     command = [*program, "simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=100000"]
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         while not list(folder.glob(".cube*")) and process.poll() is None:
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(sent)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
     assert err == "\ninterrupted; nothing half-written is left under a final name\n"
