@@ -1,0 +1,121 @@
+"""Captures of which parts, or the whole, cannot be located: what is tolerated, what is said, and what to try."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from photonpano import LocationError, api
+from photonpano.pipeline.progress import Quiet
+from photonpano.pipeline.run import execute
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from photonpano.pipeline.run import RunOutcome
+
+
+def run(capture: Path, *overrides: str) -> RunOutcome:
+    source = {"use": "packed-npy", "with": {"path": str(capture)}}
+    plan = parse_spec({"version": 1, "source": source, "levels": 1}, overrides=overrides)
+    with api.open_source(plan) as opened:
+        return execute(plan, opened, "tests", Quiet())
+
+
+def refusal(capture: Path, *overrides: str) -> list[str]:
+    """Return the lines of the error, with # for what the locator counts."""
+    with pytest.raises(LocationError) as caught:
+        run(capture, *overrides)
+    lines = str(caught.value).splitlines()
+    pairs = [re.sub(r"\d+(?= (matches|and|keypoints))", "#", line) for line in lines if line.startswith("  frames")]
+    return [lines[0], *pairs, *(re.sub(r"[\d.]+(?= times)", "#", line) for line in lines[1 + len(pairs) :])]
+
+
+def pair(moving: str, fixed: str) -> str:
+    return f"  frames {moving} onto frames {fixed}: # matches, fewer than min_inliers = 12 (# and # keypoints)"
+
+
+@pytest.fixture(scope="module")
+def with_a_wall(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, int], Path]:
+    """Let something without texture pass before the camera, from one frame to another."""
+
+    def with_a_wall(start: int, stop: int) -> Path:
+        frames = np.load(small_capture)
+        wall = np.random.default_rng(0).random((stop - start, 128, 160)) < 0.4
+        frames[start:stop] = np.packbits(wall, axis=-1)
+        path = tmp_path_factory.mktemp("wall") / "cube.npy"
+        np.save(path, frames)
+        return path
+
+    return with_a_wall
+
+
+def test_a_single_lost_exposure_is_tolerated_and_told(with_a_wall: Callable) -> None:
+    outcome = run(with_a_wall(100, 150), "resample.with.group_size=50")
+    (level,) = outcome.record["levels"]
+    assert (level["groups"], level["located"]) == (6, 5)
+    assert {tuple(failure["moving"]) for failure in level["failures"]} >= {(100, 150), (150, 200)}
+    assert all(failure["evidence"]["keypoints_moving"] > 0 for failure in level["failures"])
+    assert outcome.record["warnings"][0] == (
+        "level 1: 1 of 6 exposures are not located (frames 100 to 149); the motion is interpolated across them"
+    )
+    # Between two located exposures the motion is known.
+    assert outcome.located[100:150].all()
+
+
+def test_a_longer_part_without_texture_is_named(with_a_wall: Callable) -> None:
+    """Of the two parts that it separates the smaller one is lost with it."""
+    lines = refusal(with_a_wall(50, 150), "resample.with.group_size=25")
+    assert re.fullmatch(
+        r"level 1: \d+ of \d+ pairs of exposures could not be located, so that frames 0 to 149 cannot be tied to the rest",
+        lines[0],
+    )
+    assert lines[1:4] == [pair("50 to 74", "0 to 24"), pair("50 to 74", "25 to 49"), pair("75 to 99", "25 to 49")]
+    assert re.fullmatch(r"  \.\.\. and \d+ more", lines[7])
+    assert lines[8:] == [
+        "In these exposures of 25 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
+        "(try larger groups, such as resample.with.group_size=50), or the scene has no texture there.",
+        "To go on with the largest part alone, set graph.disconnected to largest.",
+    ]
+
+
+def test_the_largest_part_is_shown_if_the_spec_asks_for_it(with_a_wall: Callable) -> None:
+    outcome = run(with_a_wall(50, 150), "resample.with.group_size=25", "graph.disconnected=largest")
+    np.testing.assert_array_equal(np.flatnonzero(outcome.located), np.arange(162, 288))
+    assert outcome.record["warnings"] == [
+        "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others); the motion is interpolated across them",
+        "174 of 300 frames lie outside what was located and are left out",
+    ]
+    # Seen from a frame that was not located: where the held velocity puts it.
+    np.testing.assert_allclose(outcome.homographies[150], np.eye(3), atol=1e-12)
+
+
+def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
+    lines = refusal(simulated(flux=0.001), "resample.with.group_size=50")
+    assert lines[:3] == [
+        "level 1: none of the 12 pairs of exposures could be located",
+        pair("50 to 99", "0 to 49"),
+        pair("100 to 149", "0 to 49"),
+    ]
+    assert lines[-1] == (
+        "In these exposures of 50 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
+        "(try larger groups, such as resample.with.group_size=100), or the scene has no texture there."
+    )
+    fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 1})
+    assert refusal(fast, "resample.with.group_size=75") == [
+        "level 1: none of the 6 pairs of exposures could be located",
+        pair("75 to 149", "0 to 74"),
+        pair("150 to 224", "0 to 74"),
+        pair("150 to 224", "75 to 149"),
+        pair("225 to 299", "75 to 149"),
+        pair("225 to 299", "150 to 224"),
+        pair("225 to 299", "0 to 74"),
+        "In these exposures of 75 frames the scene varies # times as much as a pixel's photon noise, so darkness is not the "
+        "cause: either motion blurs them (try smaller groups, such as resample.with.group_size=37), or the scene has no "
+        "texture there.",
+    ]
