@@ -48,7 +48,7 @@ demo: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(STEP) 'benchmarks'
-	@$(BIN)/pytest tests/benchmarks -s
+	@$(BIN)/pytest tests/benchmarks -s --timeout 0
 
 clean:
 	rm -rf $(VENV) demo dist .*_cache .benchmarks .hypothesis
