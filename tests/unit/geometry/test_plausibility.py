@@ -30,7 +30,8 @@ def test_what_a_camera_does_is_plausible(homography: np.ndarray) -> None:
     assert implausibility(homography, SHAPE) is None
 
 
-TILTED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0025, 0.0, 1.0]])
+TURNED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0025, 0.0, 1.0]])
+TILTED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.005, 1.0]])
 
 REASONS = [
     (np.full((3, 3), np.nan), "the homography is not finite"),
@@ -44,6 +45,10 @@ REASONS = [
     (
         about_centre(rescaling(0.6)),
         "the homography changes the area of the image 0.36 times (at most 2 is plausible)",
+    ),
+    (
+        about_centre(TURNED),
+        "the homography makes opposite sides of the image differ 1.7 times (at most 1.5 is plausible)",
     ),
     (
         about_centre(TILTED),

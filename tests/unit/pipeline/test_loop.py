@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, PluginError
-from photonpano.geometry import translation
 from photonpano.pipeline.loop import estimate_motion
 from photonpano.pipeline.progress import Quiet
 from photonpano.spec.settings import GraphSettings
@@ -168,10 +167,3 @@ def test_one_group_is_one_located_instant(run: Callable, make_level: Callable, p
     (result,) = run(make_level(pan(0.3), resampler=Whole()))
     assert (result.located.n_located, result.located.edges) == (1, ())
     np.testing.assert_array_equal(result.trajectory.at([0, 119]), [np.eye(3)] * 2)
-
-
-def test_the_gauge_is_a_map_of_the_plane(run: Callable, make_level: Callable, known_motion: type) -> None:
-    """A camera that zooms by 1.1 at frame 60: seen from there, frame 110 is (x - x60) / 1.1 away."""
-    motion = known_motion(lambda frame: translation(0.3 * frame, 0) @ np.diag([1.1, 1.1, 1.0]))
-    (result,) = run(make_level(motion))
-    np.testing.assert_allclose(result.trajectory.at([110])[0], translation(0.3 * 50 / 1.1, 0), atol=1e-9)

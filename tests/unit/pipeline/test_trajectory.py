@@ -18,8 +18,9 @@ def test_it_is_seen_from_the_reference_frame(pan: Callable) -> None:
 
 
 def test_pairwise_motions_do_not_depend_on_the_reference(known_motion: type) -> None:
-    speeds = np.array([1e-4, -2e-4, 3e-4, 0, 0.3, -0.1, 1e-6, 2e-6])
-    free = known_motion(lambda frame: from_parameters(speeds * frame))
+    """A camera that zooms while it pans: these maps do not commute."""
+    zoom, speed = np.array([1e-3, -2e-4, 3e-4, 1e-3, 0, 0, 1e-6, 2e-6]), np.array([0.3, -0.1])
+    free = known_motion(lambda frame: translation(*speed * frame) @ from_parameters(zoom * frame))
     pairs = []
     for reference in (0, 25, 100):
         first, second = ReferencedTrajectory(free, reference).at([20, 70])
