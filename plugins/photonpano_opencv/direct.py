@@ -72,6 +72,8 @@ class DirectLocator:
             do not look alike after it.
         """
         config = self._config
+        if not (moving[-1].weight.any() and fixed[-1].weight.any()):
+            return NotLocated("nothing was seen far enough from what was not")
         homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
         shape = moving[0].image.shape
         for depth in reversed(range(len(moving))):
@@ -82,7 +84,7 @@ class DirectLocator:
             for _ in range(config.max_iterations):
                 step = template.step(local, fixed[depth])
                 if step is None:
-                    return NotLocated(f"less than {config.min_overlap:.0%} of the images overlap")
+                    return NotLocated("where the images overlap, if they do, there is no texture")
                 local = normalised(local @ inverse(step))
                 if reason := implausibility(rescaled(local, 1 / scale), shape, config.min_overlap):
                     return NotLocated(f"the alignment diverges at level {depth} of the pyramid: {reason}")

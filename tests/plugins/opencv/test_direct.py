@@ -103,3 +103,14 @@ def test_exposures_that_share_nothing_say_so(seen_from: Callable) -> None:
     failure = register(seen_from(STILL, seed=1), seen_from(STILL, seed=2), translation(235, 0))
     assert isinstance(failure, NotLocated)
     assert "overlap" in failure.reason
+
+
+@pytest.mark.parametrize("initial", [None, STILL], ids=["unknown", "still"])
+def test_nothing_to_see_is_not_located_and_says_why(
+    photograph: Callable, seen_from: Callable, initial: np.ndarray | None
+) -> None:
+    flat, street = photograph(np.zeros(SHAPE)), seen_from(STILL)
+    unseen = replace(flat, flux=np.full(SHAPE, np.nan, np.float32), weight=np.zeros(SHAPE, np.float32))
+    assert register(flat, flat, initial) == NotLocated("where the images overlap, if they do, there is no texture")
+    for pair in ((unseen, unseen), (unseen, street), (street, unseen)):
+        assert register(*pair, initial) == NotLocated("nothing was seen far enough from what was not")
