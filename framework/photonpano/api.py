@@ -126,6 +126,8 @@ def _recorded_plan(run_folder: Path, catalog: Catalog | None) -> Plan:
     from photonpano.spec import parse_spec
 
     file = run_folder / "run.json"
+    if not file.is_file():
+        raise InputError(f"{run_folder} has no run.json, so no run finished in it; give the run folder of one that did")
     try:
         document = json.loads(file.read_text(encoding="utf-8"))["spec"]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -167,15 +167,14 @@ def test_keypoints_on_a_line_do_not_pin_the_frame_down() -> None:
 
 
 def test_matches_that_agree_by_chance_are_no_motion() -> None:
-    """Forty right matches among two hundred: fewer than 8 + 0.3 * 200."""
+    """Two hundred matches of which none is right; 8 + 0.1 * 200 would have to agree."""
     rng = np.random.default_rng(0)
-    points = rng.uniform((0, 0), (239, 159), (200, 2))
-    moved = np.concatenate([points[:40], rng.uniform((0, 0), (239, 159), (160, 2))])
+    points, moved = rng.uniform((0, 0), (239, 159), (2, 200, 2))
     reason, evidence = few(locator().register(features(points), features(moved), None))
-    assert reason == f"{evidence['agreeing']:.0f} of 200 matches agree on a motion, which may be chance (more than 68 must)"
-    assert 40 <= evidence["agreeing"] <= 60
-    # Half of them are more than chance gives.
-    moved[:100] = points[:100] + np.array([3, 4])
+    assert reason == f"{evidence['agreeing']:.0f} of 200 matches agree on a motion, which may be chance (more than 28 must)"
+    assert 4 <= evidence["agreeing"] <= 28
+    # A third of them is more than chance gives.
+    moved[:70] = points[:70] + np.array([3, 4])
     assert error_px(locator().register(features(points), features(moved), None), translation(3, 4)) < 0.1
 
 
