@@ -46,3 +46,6 @@ class DirectConfig(Config):
     min_zncc: float = Field(
         0.2, ge=-1, le=1, description="a pair that correlates less than this after alignment is not located"
     )
+    max_noise_ratio: float = Field(
+        25.0, gt=1, description="a pair that differs by more than this many times its photon noise is not located"
+    )

@@ -104,6 +104,12 @@ class DirectLocator:
                 f"after alignment the images correlate by {quality.zncc:.2f}, less than min_zncc = {self._config.min_zncc:g}",
                 evidence,
             )
+        if quality.noise_ratio > self._config.max_noise_ratio:
+            return NotLocated(
+                f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, "
+                f"more than max_noise_ratio = {self._config.max_noise_ratio:g}",
+                evidence,
+            )
         corner_jacobian = jacobian(homography, corners(fixed.image.shape)).reshape(8, 8)
         return Located(homography, quality.information, _std_px(quality.information, corner_jacobian), evidence)
 

@@ -114,3 +114,11 @@ def test_nothing_to_see_is_not_located_and_says_why(
     assert register(flat, flat, initial) == NotLocated("where the images overlap, if they do, there is no texture")
     for pair in ((unseen, unseen), (unseen, street), (street, unseen)):
         assert register(*pair, initial) == NotLocated("nothing was seen far enough from what was not")
+
+
+def test_images_that_correlate_but_differ_by_more_than_noise_are_not_located(seen_from: Callable) -> None:
+    """As when lamps flicker: the same scene, half as bright."""
+    failure = register(seen_from(STILL, seed=1), seen_from(STILL, seed=2, brightness=0.5), STILL)
+    assert isinstance(failure, NotLocated)
+    assert failure.evidence["zncc"] > 0.9
+    assert "times the photon noise, more than max_noise_ratio = 25" in failure.reason
