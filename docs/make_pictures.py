@@ -1,0 +1,224 @@
+"""Make the pictures of the README and of the docs, from simulated captures.
+
+    python docs/make_pictures.py
+
+Simulates a capture into a folder, `runs/pictures` unless another is given, runs it in several ways, writes the PNG files of
+docs/images, and prints the scores that the docs mention. A capture or a run that is there already is not made
+again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import tifffile
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from photonpano import FrameSpan, Group, StageContext, evaluate, load_spec, open_source, parse_spec, run
+from photonpano.evaluation import FrameTrajectory
+from photonpano.photometry import tone_mapped
+from photonpano.pipeline.capture import truth_path, write_packed
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from photonpano import Plan
+
+    Picture = NDArray[np.uint8]
+
+IMAGES = Path(__file__).parent / "images"
+EXAMPLES = Path(__file__).parents[1] / "examples" / "pipelines"
+GAP, LABEL = 8, 26
+"""Pixels between pictures, and above each for its label."""
+
+STREET = {
+    "version": 1,
+    "source": {
+        "use": "simulator",
+        "with": {
+            "path": {
+                "kind": "scan",
+                "rows": 2,
+                "row_spacing_px": 150,
+                "length_px": 1200,
+                "centre": [900, 900],
+                "shake": {"rms_px": 2.0},
+            },
+            "flux": 0.1,
+            "n_frames": 10000,
+        },
+    },
+}
+"""The camera goes to and fro over the street in a tenth of a second, in a trembling hand, in little light."""
+GROUP_SIZE = 125
+LEVELS = ("one level", "two levels", "three levels")
+WAYS = ("scan", "constant groups", "naive average")
+"""Specs of examples/pipelines, on the capture that is beside them."""
+PLACE = (250, 130)
+"""The middle of the place that is compared, in pixels of the reference frame, which all ways share."""
+
+
+def main() -> None:
+    """Make all pictures."""
+    parser = argparse.ArgumentParser(description="Make the pictures of the docs.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("runs/pictures"), help="for the captures and the runs")
+    folder: Path = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+
+    street = written(parse_spec(STREET), folder / "street.npy")
+    for number, name in enumerate(LEVELS, start=1):
+        finish(parse_spec(street_spec(street), overrides=[f"levels={number}"], output=in_folder(folder, name)), name, street)
+    save("readme.png", readme(folder, street))
+    save("levels.png", levels(folder, street))
+
+    capture = written(load_spec(EXAMPLES / "capture.yaml"), folder / "capture.npy")
+    for name in WAYS:
+        path = EXAMPLES / f"{name.replace(' ', '-')}.yaml"
+        overrides = [f"source.with.path={capture.absolute()}"]
+        finish(load_spec(path, overrides=overrides, output=in_folder(folder, name)), name, capture)
+    save("first-panorama.png", picture(tifffile.imread(in_folder(folder, "scan") / "panorama.tiff"), 0.67))
+    save("baselines.png", baselines(folder))
+
+
+def in_folder(folder: Path, name: str) -> Path:
+    """Return the run folder of a run."""
+    return folder / name.replace(" ", "-")
+
+
+def written(plan: Plan, cube: Path) -> Path:
+    """Simulate a capture."""
+    if not cube.exists():
+        with open_source(plan) as source:
+            write_packed(source, cube)
+    return cube
+
+
+def finish(plan: Plan, name: str, cube: Path) -> None:
+    """Run a plan, and print its scores."""
+    directory = plan.output.directory
+    if not (directory / "run.json").exists():
+        run(plan)
+    scores = evaluate(directory, truth_path(cube))
+    assert scores.panorama is not None
+    print(
+        f"{name:16} corner error mean {scores.trajectory.mean_px:.2f} px, worst {scores.trajectory.max_px:.2f} px, "
+        f"PSNR {scores.panorama.psnr_db:.2f} dB, {scores.below_oracle_db:.2f} dB below the oracle"
+    )
+
+
+def street_spec(cube: Path) -> dict[str, Any]:
+    """Return the spec of the street."""
+    return {
+        "version": 1,
+        "source": {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96_800}},
+        "resample": {"use": "midpoint", "with": {"group_size": GROUP_SIZE}},
+    }
+
+
+def readme(folder: Path, cube: Path) -> Picture:
+    """Return one frame, the sum of all frames, and the panorama of all frames."""
+    with open_source(parse_spec(street_spec(cube))) as source:
+        info, response = source.info, source.response
+        frame = source.frames(FrameSpan(info.n_frames // 2, info.n_frames // 2 + 1))[0] * np.uint8(255)
+        mean = source.counts(info.span).astype(np.float32) / info.n_frames
+        average = response.flux(mean, info.n_frames)
+    flux = tifffile.imread(in_folder(folder, LEVELS[-1]) / "panorama.tiff")
+    white = float(np.nanquantile(flux, 0.995))
+    width = 2 * info.width + GAP
+    panorama = picture(flux, white)
+    panorama = cv2.resize(panorama, (width, round(panorama.shape[0] * width / panorama.shape[1])), interpolation=cv2.INTER_AREA)
+    n_frames = f"{info.n_frames:,}"
+    return stacked(
+        [
+            beside(
+                [
+                    labelled(frame, f"one frame of {n_frames}"),
+                    labelled(picture(average, white), f"the {n_frames} frames, averaged"),
+                ]
+            ),
+            labelled(panorama.astype(np.uint8), f"the same {n_frames} frames, as a panorama"),
+        ]
+    )
+
+
+def levels(folder: Path, cube: Path) -> Picture:
+    """Return what one group of frames gives at each level, as the motion becomes known."""
+    plan = parse_spec(street_spec(cube))
+    known = {
+        "level 1: no motion is known": None,
+        "level 2: along the motion of level 1": in_folder(folder, "one level"),
+        "level 3: along the motion of level 2": in_folder(folder, "two levels"),
+    }
+    with open_source(plan) as source:
+        choice = plan.levels[0].merge
+        merger = choice.contribution.build(choice.config, StageContext(source.info, source.response))
+        start = source.info.n_frames // 5
+        group = Group(FrameSpan(start, start + GROUP_SIZE), start + (GROUP_SIZE - 1) / 2)
+        pictures = []
+        for label, directory in known.items():
+            trajectory = None if directory is None else motion(directory)
+            flux = merger.merge(source, group, trajectory, 1.0).flux
+            pictures.append(labelled(picture(flux[:, 60:380], 0.33), label))
+    return beside(pictures)
+
+
+def baselines(folder: Path) -> Picture:
+    """Return the same place of the panoramas of several ways, twice as large."""
+    pictures = []
+    for name in WAYS:
+        flux = tifffile.imread(in_folder(folder, name) / "panorama.tiff")
+        with np.load(in_folder(folder, name) / "trajectory.npz") as trajectory:
+            x, y = (trajectory["canvas"] @ (*PLACE, 1))[:2].round().astype(int)
+        crop = picture(flux[y - 80 : y + 80, x - 80 : x + 80], 0.67)
+        pictures.append(labelled(cv2.resize(crop, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST).astype(np.uint8), name))
+    return beside(pictures)
+
+
+def motion(directory: Path) -> FrameTrajectory:
+    """Return the motion that a run found."""
+    with np.load(directory / "trajectory.npz") as trajectory:
+        return FrameTrajectory(trajectory["homographies"])
+
+
+def picture(flux: NDArray[np.float32], white: float) -> Picture:
+    """Return flux as 8-bit sRGB; what is unknown is white, as the page is."""
+    return np.where(np.isfinite(flux), tone_mapped(flux, white), np.uint8(255))
+
+
+def labelled(image: Picture, label: str) -> Picture:
+    """Write a line above a picture."""
+    strip = Figure(figsize=(image.shape[1] / 100, LABEL / 100), dpi=100)
+    strip.text(2 / image.shape[1], 0.35, label, fontsize=10, color="0.25")
+    canvas = FigureCanvasAgg(strip)
+    canvas.draw()
+    grey = np.asarray(canvas.buffer_rgba())[..., 0]
+    return np.vstack([grey[:LABEL, : image.shape[1]], image])
+
+
+def beside(pictures: Sequence[Picture]) -> Picture:
+    """Put pictures of one height side by side."""
+    gap = np.full((pictures[0].shape[0], GAP), 255, np.uint8)
+    return np.hstack([part for each in pictures for part in (each, gap)][:-1])
+
+
+def stacked(pictures: Sequence[Picture]) -> Picture:
+    """Put pictures of one width below each other."""
+    return np.vstack(pictures)
+
+
+def save(name: str, image: Picture) -> None:
+    """Write a PNG of 64 grey levels, which halves the file and cannot be seen."""
+    quantised = np.where(image == 255, 255, image & 0xFC).astype(np.uint8)
+    cv2.imwrite(str(IMAGES / name), quantised, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    print(f"{IMAGES / name}: {(IMAGES / name).stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""Bring the tables of the reference up to date with the code.
+
+    python docs/make_reference.py
+
+What stands between `<!-- generated: WHAT -->` and `<!-- end -->` is written anew; all else is left as it is. A test fails
+while a page is out of date.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from photonpano import discover, hookspecs
+from photonpano.cli.app import app
+from photonpano.registry import KINDS
+from photonpano.registry.description import config_rows
+from photonpano.spec.resolution import SETTINGS
+from photonpano.spec.settings import LevelSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pydantic import BaseModel
+
+REFERENCE = Path(__file__).parent / "reference"
+BLOCK = re.compile(r"(?<=<!-- generated: )(?P<what>[^>]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
+COMPUTED = {"directory": "`runs/` and the name of the spec"}
+"""Defaults that no model holds."""
+
+
+def main() -> None:
+    """Write every page of the reference that is out of date."""
+    for page in sorted(REFERENCE.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        if (fresh := updated(text)) != text:
+            page.write_text(fresh, encoding="utf-8")
+            print(page)
+
+
+def updated(text: str) -> str:
+    """Return a page with its generated parts as they should be."""
+    return BLOCK.sub(lambda match: f"{match['what']} -->\n{generated(match['what'])}\n", text)
+
+
+def generated(what: str) -> str:
+    """Return the Markdown of a generated part, such as "settings render", "locator opencv-sift" or "command run"."""
+    kind, *name = what.split()
+    match kind:
+        case "settings":
+            return config_table(LevelSettings if name == ["levels"] else SETTINGS[name[0]])
+        case "command":
+            return command(name)
+        case "hook":
+            return hook(name[0])
+        case "components":
+            return components()
+        case _ if kind in KINDS:
+            return config_table(discover().find(kind, name[0]).contribution.config)
+    raise ValueError(f"no rule makes {what!r}")
+
+
+def config_table(config: type[BaseModel]) -> str:
+    """Return the keys of a config."""
+    rows = []
+    for row in config_rows(config):
+        default = "required" if row.default is None else f"`{row.default}`"
+        bounds = f"{row.type}, {row.bounds}" if row.bounds else row.type
+        rows.append([f"`{row.key}`", COMPUTED.get(row.key, default), bounds, row.description])
+    return table(["Key", "Default", "Type", "Meaning"], rows)
+
+
+def components() -> str:
+    """Return what this distribution offers."""
+    rows = [
+        [f"`{KINDS[entry.kind].section}`", f"[`{entry.name}`](#{entry.name})", entry.contribution.summary]
+        for entry in discover().rows
+        if entry.plugin == "photonpano"
+    ]
+    return table(["Section", "`use`", "What it is"], rows)
+
+
+def command(names: Sequence[str]) -> str:
+    """Return what a command is called with."""
+    node: Any = typer.main.get_command(app)
+    for name in names:
+        node = node.commands[name]
+    shown = [parameter for parameter in node.params if "--help" not in parameter.opts]
+    rows = []
+    for parameter in shown:
+        flags = [*parameter.opts, *parameter.secondary_opts]
+        if parameter.param_type_name == "argument":
+            flags = [parameter.metavar]
+        elif not parameter.is_flag:
+            flags[-1] += f" {parameter.metavar}"
+        default = parameter.default if isinstance(parameter.default, bool) and parameter.secondary_opts else None
+        remark = "" if default is None else f" Default: `{flags[0] if default else flags[1]}`."
+        rows.append([", ".join(f"`{flag}`" for flag in flags), f"{parameter.help}{remark}"])
+    return table(["Argument or option", "Meaning"], rows)
+
+
+def hook(name: str) -> str:
+    """Return the example of a hook, from its docstring."""
+    docstring = inspect.getdoc(getattr(hookspecs, name)) or ""
+    return textwrap.dedent(docstring.partition("Example:\n")[2]).strip()
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    cells = [head, ["---"] * len(head), *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in cells)
+
+
+if __name__ == "__main__":
+    main()

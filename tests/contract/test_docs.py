@@ -1,0 +1,271 @@
+"""The documentation does what it says: its code runs, its specs are right, its commands print what it shows."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import re
+import shlex
+import shutil
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import typer
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from photonpano import discover, hookspecs, parse_spec
+from photonpano.cli.app import app
+from photonpano.pipeline.capture import truth_path
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "pipelines" / "README.md"]
+REFERENCE = ROOT / "docs" / "reference"
+BLOCK = re.compile(
+    r"(?:^<!-- (?P<marker>(?:test|file):[^\n]*?) *-->\n+)?^```(?P<language>\w+)\n(?P<text>.*?)^```$"
+    r"|^<!-- test: setup\n(?P<setup>.*?)^-->$",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page. A comment before the fence says what the tests do with it:
+
+    <!-- file: NAME -->         it is that file, for the blocks after it
+    <!-- test: fragment -->     YAML that is a part of a spec
+    <!-- test: parse -->        commands that are parsed and not run
+    <!-- test: with ARGS -->    commands that are run with more arguments, so that they print something else
+    <!-- test: setup ... -->    Python that prepares the blocks after it, and that readers need not see
+    """
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    marker: str = ""
+
+    def argument(self, name: str) -> str | None:
+        """Return what stands after a marker."""
+        return self.marker.removeprefix(name).strip() if self.marker.startswith(name) else None
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+def blocks_of(page: Path) -> list[Block]:
+    text = page.read_text(encoding="utf-8")
+    blocks = []
+    for match in BLOCK.finditer(text):
+        group = "text" if match["setup"] is None else "setup"
+        line = text.count("\n", 0, match.start(group))
+        blocks.append(Block(page, line, match["language"] or "python", match[group], match["marker"] or ""))
+    return blocks
+
+
+def commands_of(block: Block) -> Iterator[tuple[list[str], str]]:
+    """Yield the words of each command, and what it prints according to the page."""
+    for part in re.split(r"^\$ ", block.text.replace("\\\n", " "), flags=re.MULTILINE)[1:]:
+        line, _, output = part.partition("\n")
+        yield shlex.split(line, comments=True), output
+
+
+def ident(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture
+def make_capture(small_capture) -> Callable[[str], None]:
+    """Put a small capture and its truth into the current folder: `make_capture("capture.npy")`."""
+
+    def make(name: str) -> None:
+        shutil.copy(small_capture, name)
+        shutil.copy(truth_path(small_capture), truth_path(Path(name)))
+
+    return make
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch) -> Path:
+    """A folder of its own, from which modules are imported and plugins discovered."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - modules:
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+class Reader:
+    """Does what a reader of a page does, block by block."""
+
+    def __init__(self, workplace: Path, names: dict[str, Any]) -> None:
+        self.workplace = workplace
+        self.names = names
+
+    def follow(self, block: Block) -> None:
+        if file := block.argument("file:"):
+            path = self.workplace / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text, encoding="utf-8")
+            importlib.invalidate_caches()
+        if block.language == "yaml":
+            self.check_spec(block)
+        elif block.language == "python" and not file:
+            self.run_python(block)
+        elif block.language == "console":
+            for words, output in commands_of(block):
+                self.run_command(block, words, output)
+
+    def check_spec(self, block: Block) -> None:
+        text: Any = block.text
+        if block.marker == "test: fragment":
+            text = {"version": 1, "source": {"use": "simulator"}, **YAML(typ="safe").load(block.text)}
+        parse_spec(text, directory=self.workplace)
+
+    def run_python(self, block: Block) -> None:
+        if ">>>" in block.text:
+            test = doctest.DocTestParser().get_doctest(block.text, self.names, str(block), str(block.page), block.line)
+            report: list[str] = []
+            doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append, clear_globs=False)
+            assert not report, "".join(report)
+            self.names.update(test.globs)
+        else:
+            exec(compile("\n" * block.line + block.text, str(block.page), "exec"), self.names)
+
+    def run_command(self, block: Block, words: list[str], shown: str) -> None:
+        match words:
+            case ["photonpano", *arguments]:
+                pass
+            case ["pip", "install", "-e", "."]:
+                return self.install()
+            case ["make", target]:
+                assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), f"{block}: make {target}"
+                return None
+            case ["git" | "pip" | "cd", *_] | ["python", "-m", *_]:
+                return None
+            case ["python", script, *_]:
+                assert (ROOT / script).is_file(), f"{block}: {script}"
+                return None
+            case _:
+                pytest.fail(f"{block}: no rule for {words}")
+        arguments, target = (arguments[:-2], arguments[-1]) if ">" in arguments else (arguments, None)
+        more = "--help" if block.marker == "test: parse" else block.argument("test: with")
+        done = CliRunner().invoke(app, arguments + shlex.split(more or ""), prog_name="photonpano")
+        fails = "error:" in shown
+        assert (done.exit_code != 0) == fails, f"{block}: {words}\n{done.output}\n{done.exception!r}"
+        if target is not None:
+            (self.workplace / target).write_text(done.stdout, encoding="utf-8")
+        elif shown.strip() and more is None:
+            flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+            same = doctest.OutputChecker().check_output(f"{shown.strip()}\n", f"{done.output.strip()}\n", flags)
+            assert same, f"{block}: {words} printed\n{done.output}\nand the page shows\n{shown}"
+        return None
+
+    def install(self) -> None:
+        """Do what pip does of interest: leave the metadata of the project in this folder, beside its modules."""
+        project = tomllib.loads((self.workplace / "pyproject.toml").read_text())["project"]
+        info = self.workplace / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+        points = project["entry-points"]["photonpano"]
+        (info / "entry_points.txt").write_text("[photonpano]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()))
+        importlib.invalidate_caches()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ident)
+def test_a_reader_can_follow_the_page(page, workplace, make_capture):
+    reader = Reader(workplace, {"make_capture": make_capture})
+    for block in blocks_of(page):
+        try:
+            reader.follow(block)
+        except Exception as error:
+            raise AssertionError(f"{block}: {type(error).__name__}: {error}") from error
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ident)
+def test_no_block_escapes_the_tests(page):
+    fences = re.findall(r"^ *```", page.read_text(encoding="utf-8"), re.MULTILINE)
+    shown = [block for block in blocks_of(page) if block.text in page.read_text(encoding="utf-8")]
+    hidden = page.read_text(encoding="utf-8").count("<!-- test: setup")
+    assert len(fences) == 2 * (len(shown) - hidden)
+    assert {block.language for block in shown} <= {"python", "yaml", "console", "toml", "text"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ident)
+def test_links_and_pictures_exist(page):
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\(([^)\s]+)\)|(?:src|href)=\"([^\"]+)\"", text):
+        path, _, anchor = "".join(target).partition("#")
+        if path.startswith(("http://", "https://")):
+            continue
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page}: {path}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", BLOCK.sub("", file.read_text(encoding="utf-8")), re.MULTILINE)
+            assert anchor in map(slug, headings), f"{page}: {path}#{anchor}"
+
+
+def slug(heading: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_every_page_can_be_reached_from_the_index():
+    index = ROOT / "docs" / "README.md"
+    linked = {(index.parent / target).resolve() for target in re.findall(r"\]\(([^)#]+)", index.read_text(encoding="utf-8"))}
+    assert set((ROOT / "docs").rglob("*.md")) - {index} <= linked
+
+
+@pytest.fixture(scope="module")
+def make_reference() -> Any:
+    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", sorted(REFERENCE.glob("*.md")), ids=ident)
+def test_the_generated_tables_are_up_to_date(page, make_reference):
+    text = page.read_text(encoding="utf-8")
+    assert make_reference.updated(text) == text, "run: python docs/make_reference.py"
+
+
+def test_every_section_and_component_has_its_table():
+    page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
+    wanted = [f"settings {name}" for name in ("levels", "graph", "render", "output", "run")]
+    wanted += [f"{entry.kind} {entry.name}" for entry in discover().rows if entry.plugin == "photonpano"]
+    assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
+
+
+def test_every_command_has_its_table():
+    page = (REFERENCE / "cli.md").read_text(encoding="utf-8")
+    main: Any = typer.main.get_command(app)
+    names = [name for name in main.commands if name != "plugins"]
+    names += [f"plugins {name}" for name in main.commands["plugins"].commands]
+    assert [name for name in names if f"<!-- generated: command {name} -->" not in page] == []
+
+
+def test_every_hook_has_its_section():
+    page = (REFERENCE / "plugins.md").read_text(encoding="utf-8")
+    hooks = [name for name in vars(hookspecs) if name.startswith("photonpano_")]
+    assert [name for name in hooks if f"`{name}`\n" not in page or f"<!-- generated: hook {name} -->" not in page] == []
+
+
+def test_everything_in_a_run_folder_is_documented(small_run):
+    page = (REFERENCE / "run-folder.md").read_text(encoding="utf-8")
+    record = small_run.record
+    names = {file.name for file in small_run.directory.iterdir()}
+    with np.load(small_run.directory / "trajectory.npz") as trajectory:
+        names.update(trajectory.files)
+    names.update(key for part in (record, record["source"], record["panorama"], *record["levels"]) for key in part)
+    assert [name for name in sorted(names) if f"`{name}`" not in page] == []

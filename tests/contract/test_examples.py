@@ -1,0 +1,98 @@
+"""Every spec of examples/pipelines does what it is there for, on captures that are made small."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from photonpano.cli.app import app
+from photonpano.pipeline.capture import truth_path
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
+SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}
+SMALL_STREET = SMALL | {"source.with.scene": "{kind: street, width: 1024, height: 682}"}
+GROUPS = {"resample.with.group_size": 50}
+CAPTURES = {
+    "capture": SMALL_STREET | GROUPS,
+    "demo-capture": SMALL_STREET | GROUPS | {"source.with.path": "{kind: pan, length_px: 60}"},
+}
+"""Specs to simulate, and what makes them small. Groups are checked, though a capture has none."""
+RUNS: dict[str, dict[str, Any]] = {
+    "scan": GROUPS,
+    "naive-average": GROUPS,
+    "constant-groups": GROUPS,
+    "super-resolution": GROUPS,
+    "coarse-to-fine": GROUPS,
+    "demo": GROUPS,
+    "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
+    "photograph": SMALL
+    | GROUPS
+    | {"source.with.scene.width": 640, "source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
+}
+"""Specs to run, and what makes them small."""
+
+
+def photonpano(*arguments: str | Path, **overrides: Any) -> str:
+    options = [word for key, value in overrides.items() for word in ("--set", f"{key}={value}")]
+    done = CliRunner().invoke(app, [*map(str, arguments), *options])
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory, small_capture) -> Path:
+    """A copy of the folder, with the files that the specs read."""
+    folder = tmp_path_factory.mktemp("checkout") / "examples" / "pipelines"
+    shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs", "*.npy", "*.npz"))
+    demo = folder.parents[1] / "demo"
+    demo.mkdir()
+    for capture in (folder / "capture.npy", demo / "capture.npy"):
+        shutil.copy(small_capture, capture)
+        shutil.copy(truth_path(small_capture), truth_path(capture))
+    rng = np.random.default_rng(0)
+    blocks = cv2.resize(rng.uniform(0, 255, (40, 60)), (900, 600), interpolation=cv2.INTER_NEAREST)
+    cv2.imwrite(str(folder / "photograph.jpg"), blocks + rng.normal(0, 10, blocks.shape))
+    return folder
+
+
+def test_every_example_is_tested():
+    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS}
+
+
+def test_every_example_is_introduced():
+    page = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    assert [file.name for file in EXAMPLES.glob("*.yaml") if f"[{file.name}]({file.name})" not in page] == []
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_captures_can_be_simulated(name, examples, tmp_path):
+    photonpano("simulate", examples / f"{name}.yaml", "--output", tmp_path / "cube.npy", **CAPTURES[name])
+    assert np.load(tmp_path / "cube.npy", mmap_mode="r").shape == (240, 128, 20)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_specs_run(name, examples, tmp_path):
+    photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **RUNS[name])
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    groups = [level["groups"] for level in record["levels"]]
+    assert all(level["located"] == level["groups"] for level in record["levels"])
+    assert groups[1] == 2 * groups[0] + 1 if name != "constant-groups" else groups[1] == groups[0] + 2
+    assert ({level["scale"] for level in record["levels"]} == {0.5, 1}) == (name == "coarse-to-fine")
+    assert record["panorama"]["scale"] == (2 if name == "super-resolution" else 1)
+    assert record["spec"]["merge"]["with"]["compensate"] == (name != "naive-average")
+
+
+def test_the_tutorial_uses_the_examples():
+    page = (EXAMPLES.parents[1] / "docs" / "tutorial" / "first-panorama.md").read_text(encoding="utf-8")
+    yaml = YAML(typ="safe")
+    for name in ("capture.yaml", "scan.yaml"):
+        shown = page.partition(f"<!-- file: {name} -->\n```yaml\n")[2].partition("```")[0]
+        assert yaml.load(shown) == yaml.load((EXAMPLES / name).read_text(encoding="utf-8"))
