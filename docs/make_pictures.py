@@ -61,7 +61,7 @@ GROUP_SIZE = 125
 LEVELS = ("one level", "two levels", "three levels")
 WAYS = ("scan", "constant groups", "naive average")
 """Specs of examples/pipelines, on the capture that is beside them."""
-PLACE = (250, 130)
+PLACE = (235, 85)
 """The middle of the place that is compared, in pixels of the reference frame, which all ways share."""
 
 
@@ -170,14 +170,15 @@ def levels(folder: Path, cube: Path) -> Picture:
 
 
 def baselines(folder: Path) -> Picture:
-    """Return the same place of the panoramas of several ways, twice as large."""
+    """Return the same place of the panoramas of several ways, three times as large."""
     pictures = []
     for name in WAYS:
+        file = f"{name.replace(' ', '-')}.yaml"
         flux = tifffile.imread(in_folder(folder, name) / "panorama.tiff")
         with np.load(in_folder(folder, name) / "trajectory.npz") as trajectory:
             x, y = (trajectory["canvas"] @ (*PLACE, 1))[:2].round().astype(int)
-        crop = picture(flux[y - 80 : y + 80, x - 80 : x + 80], 0.67)
-        pictures.append(labelled(cv2.resize(crop, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST).astype(np.uint8), name))
+        crop = picture(flux[y - 54 : y + 54, x - 54 : x + 54], 0.67)
+        pictures.append(labelled(cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8), file))
     return beside(pictures)
 
 

@@ -31,6 +31,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "constant-groups": GROUPS,
     "super-resolution": GROUPS,
     "coarse-to-fine": GROUPS,
+    "direct-alignment": GROUPS,
     "demo": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "photograph": SMALL
