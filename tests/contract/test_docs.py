@@ -151,7 +151,7 @@ class Reader:
             case ["make", target]:
                 assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), f"{block}: make {target}"
                 return None
-            case ["git" | "pip" | "cd", *_] | ["python", "-m", *_]:
+            case ["git" | "pip" | "cd", *_] | ["python3", "-m", *_]:
                 return None
             case ["python", script, *_]:
                 assert (ROOT / script).is_file(), f"{block}: {script}"
