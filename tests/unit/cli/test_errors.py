@@ -134,11 +134,17 @@ def test_defects_keep_their_traceback() -> None:
         _ = 1 / 0
 
 
+def heed_interrupts() -> None:
+    """Undo what a shell does to its background jobs: they, and what they start, ignore SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise there")
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: list[str], sent: signal.Signals) -> None:
     command = [*program, "simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=100000"]
-    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=folder, text=True, preexec_fn=heed_interrupts, **pipes) as process:
         while not list(folder.glob(".cube*")) and process.poll() is None:
             time.sleep(0.02)
         process.send_signal(sent)
