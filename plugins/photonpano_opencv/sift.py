@@ -167,7 +167,9 @@ class SiftLocator:
             return Matches(pairs, None, 0)
         homography = np.asarray(found, dtype=np.float64)
         distances = np.linalg.norm(apply(homography, here) - there, axis=1)
-        agreeing = int(np.count_nonzero(distances < self._config.threshold_px))
+        # Exposures that are blurred or dark scatter more, and chance has less to choose from all over the image.
+        tolerance_px = self._config.threshold_px * (1 if guided else 2)
+        agreeing = int(np.count_nonzero(distances < tolerance_px))
         believed = agreeing > least_agreeing(len(pairs), guided)
         return Matches(pairs, normalised(homography) if believed else None, agreeing)
 
