@@ -62,7 +62,7 @@ def test_a_single_lost_exposure_is_tolerated_and_told(with_a_wall: Callable) -> 
     assert {tuple(failure["moving"]) for failure in level["failures"]} >= {(100, 150), (150, 200)}
     assert all(failure["evidence"]["keypoints_moving"] > 0 for failure in level["failures"])
     assert outcome.record["warnings"][0] == (
-        "level 1: 1 of 6 exposures are not located (frames 100 to 149); the motion is interpolated across them"
+        "level 1: 1 of 6 exposures are not located (frames 100 to 149); the motion is interpolated across 1 of them"
     )
     # Between two located exposures the motion is known.
     assert outcome.located[100:150].all()
@@ -88,7 +88,7 @@ def test_the_largest_part_is_shown_if_the_spec_asks_for_it(with_a_wall: Callable
     outcome = run(with_a_wall(50, 150), "resample.with.group_size=25", "graph.disconnected=largest")
     np.testing.assert_array_equal(np.flatnonzero(outcome.located), np.arange(162, 288))
     assert outcome.record["warnings"] == [
-        "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others); the motion is interpolated across them",
+        "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others)",
         "174 of 300 frames lie outside what was located and are left out",
     ]
     # Seen from a frame that was not located: where the held velocity puts it.

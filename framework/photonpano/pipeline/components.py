@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
 from photonpano.errors import PhotonpanoError, PluginError
@@ -74,7 +74,7 @@ def build_levels(plan: Plan, source: Source) -> tuple[Level, ...]:
     def component(choice: Choice[Contribution[Any, StageContext, ComponentT]]) -> ComponentT:
         for known, value in made:
             if known.contribution is choice.contribution and known.config == choice.config:
-                return value  # type: ignore[no-any-return]
+                return cast("ComponentT", value)
         value = _built(choice, context)
         made.append((choice, value))
         return value

@@ -73,11 +73,13 @@ def warnings_of(results: Sequence[LevelResult]) -> list[str]:
     warnings = []
     for result in results:
         located = result.located
-        lost = [str(group) for group, tied in zip(result.groups, located.solution.located, strict=True) if not tied]
+        lost = [group for group, tied in zip(result.groups, located.solution.located, strict=True) if not tied]
         if lost:
+            between = [group for group in lost if located.instants[0] < group.reference < located.instants[-1]]
+            across = f"; the motion is interpolated across {len(between)} of them" if between else ""
             warnings.append(
                 f"level {result.level.number}: {len(lost)} of {len(result.groups)} exposures are not located "
-                f"({lost[0]}{' and others' if len(lost) > 1 else ''}); the motion is interpolated across them"
+                f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
             )
         if located.solution.contradictions:
             edge = located.edges[located.solution.contradictions[0]]

@@ -15,6 +15,8 @@ from photonpano_opencv.direct import DirectLocator
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from photonpano import VirtualExposure
+
 SHAPE = (160, 240)
 STILL = np.eye(3)
 LOCATOR = DirectLocator(DirectConfig())
@@ -22,8 +24,8 @@ ROTATED = from_parameters([np.cos(0.03) - 1, np.sin(0.03), -np.sin(0.03), np.cos
 PROJECTIVE = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
 
 
-def register(moving: object, fixed: object, initial: np.ndarray | None = None) -> Located | NotLocated:
-    return LOCATOR.register(LOCATOR.describe(moving), LOCATOR.describe(fixed), initial)  # type: ignore[arg-type]
+def register(moving: VirtualExposure, fixed: VirtualExposure, initial: np.ndarray | None = None) -> Located | NotLocated:
+    return LOCATOR.register(LOCATOR.describe(moving), LOCATOR.describe(fixed), initial)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from photonpano.pipeline.diagnosis import Contrast, contrast_of, require_tied
 from photonpano.values import Edge
 
 if TYPE_CHECKING:
-    from typing import Literal
+    from typing import Any, Literal
 
 RESPONSE = BinaryResponse()
 
@@ -85,9 +85,9 @@ def test_a_lone_group_needs_no_ties() -> None:
     require_tied(1, GROUPS[:1], [], np.array([True]), {0: CLEAR}, "error")
 
 
-def refusal(*args: object, **kwargs: object) -> str:
+def refusal(*args: Any, **kwargs: Any) -> str:
     with pytest.raises(LocationError) as caught:
-        require(*args, **kwargs)  # type: ignore[arg-type]
+        require(*args, **kwargs)
     return str(caught.value)
 
 

@@ -37,7 +37,7 @@ def test_a_stream_refuses_frames_it_does_not_hold() -> None:
 
 
 @pytest.mark.parametrize("value", [FrameSpan(0, 1), Group(FrameSpan(0, 1), 0), StreamInfo(1, 1, 1, None)])
-def test_values_are_frozen(value: object) -> None:
-    field = dataclasses.fields(value)[0].name  # type: ignore[arg-type]
+def test_values_are_frozen(value: FrameSpan | Group | StreamInfo) -> None:
+    field = dataclasses.fields(value)[0].name
     with pytest.raises(dataclasses.FrozenInstanceError):
         setattr(value, field, None)
