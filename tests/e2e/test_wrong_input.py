@@ -138,13 +138,14 @@ CASES = {
     "all zero": Case(
         saved(0 * PACKED),
         1,
-        "error: no pixel is lit in any of 40 frames looked at all over the capture; "
+        "error: DIR/spec.yaml:2:1: source: no pixel is lit in any of 40 frames looked at all over the capture; "
         "check that the file is the right one, and that the lens was open\n",
     ),
     "all one": Case(
         saved(0 * PACKED + 255),
         1,
-        "error: every pixel is lit in all of 40 frames looked at all over the capture, so that no flux can be told; "
+        "error: DIR/spec.yaml:2:1: source: every pixel is lit in all of 40 frames looked at all over the capture, "
+        "so that no flux can be told; "
         "check the layout of the file, or expose less\n",
     ),
     "one group at one level": Case(

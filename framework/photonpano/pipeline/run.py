@@ -23,6 +23,7 @@ from photonpano.pipeline.record import (
     warnings_of,
 )
 from photonpano.pipeline.threads import one_thread_inside, thread_count
+from photonpano.spec.tree import Place
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
@@ -74,7 +75,11 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     threads = thread_count(plan.run)
     stream = source.info
     reference = _reference_frame(plan, stream.n_frames)
-    require_photons(source)
+    try:
+        require_photons(source)
+    except InputError as error:
+        # The source knows its file, the spec knows where that is named.
+        raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
     levels = build_levels(plan, source)
     with one_thread_inside():
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress)
