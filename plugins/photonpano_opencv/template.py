@@ -1,0 +1,217 @@
+"""The inverse-compositional step on homographies (Baker and Matthews 2004), from moments of a few images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano.geometry import corners, from_parameters, jacobian
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano_opencv.pyramid import Layer
+
+ALL = (0, 1, 2, 3, 4, 5, 6, 7)
+"""All of p1..p8."""
+_BOLDEST = 0.2
+"""The curvature of the scene is taken to be at least this share of what is seen, so that steps in the dark stay bounded."""
+_UNKNOWN = 1e-3
+"""Where noise exceeds the scene, next to nothing is known: this share of the least curvature that is seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quality:
+    """How well two images agree.
+
+    Attributes:
+        information: (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images.
+        zncc: correlation of the images where they overlap.
+        noise_ratio: mean square of their difference over that which photon noise makes.
+        overlap: share of the template that both see.
+    """
+
+    information: NDArray[np.float64]
+    zncc: float
+    noise_ratio: float
+    overlap: float
+
+
+class Template:
+    """The moving image, with what a small change of p1..p8 of its own frame does to it.
+
+    A parameter changes a pixel by its gradient times a polynomial of its place of degree two at most. So sums over all pixels
+    are moments of a few images, each two small matrix products, and no image for each parameter is ever made. Parameters are
+    those of coordinates of about unit size.
+    """
+
+    def __init__(self, layer: Layer) -> None:
+        self._layer = layer
+        height, width = layer.image.shape
+        self._half = half = max(height, width) / 2
+        self._unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+        self._from_unit = np.linalg.inv(self._unit)
+        self._gx, self._gy = (np.float32(half) * gradient for gradient in _gradients(layer.image))
+        self._powers = _powers(width, half), _powers(height, half)
+        self._hessian: NDArray[np.float64] | None = None
+
+    def step(
+        self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], blur_px: float
+    ) -> NDArray[np.float64] | None:
+        """Return the small homography of the template's frame that explains what differs; None without overlap or texture.
+
+        Args:
+            homography: (3, 3), pixels of the template to pixels of the fixed layer.
+            fixed: what the template is aligned to.
+            free: which of p1..p8 may change; the same in every call.
+            blur_px: the blur of the images, in px of the layer.
+        """
+        residual, weight = self._residual(homography, fixed)
+        if self._hessian is None:
+            if not weight.any():
+                return None
+            self._hessian = self._curvature(weight, blur_px, _BOLDEST)[np.ix_(free, free)]
+        weighted = residual * weight
+        along_x, along_y = self._moments(weighted * self._gx, 3), self._moments(weighted * self._gy, 3)
+        gradient = np.einsum("aij,ij->a", _ALONG_X, along_x) + np.einsum("aij,ij->a", _ALONG_Y, along_y)
+        p = np.zeros(8)
+        try:
+            p[list(free)] = np.linalg.solve(self._hessian, gradient[list(free)])
+        except np.linalg.LinAlgError:
+            return None
+        return np.asarray(self._from_unit @ from_parameters(p) @ self._unit)
+
+    def size_px(self, step: NDArray[np.float64]) -> float:
+        """Return how far a step moves the corners of the template at most, in px of its layer."""
+        frame = corners(self._layer.image.shape)
+        moved = np.concatenate([frame, np.ones((4, 1))], axis=1) @ step.T
+        return float(np.abs(moved[:, :2] / moved[:, 2:] - frame).max())
+
+    def quality(self, homography: NDArray[np.float64], fixed: Layer, blur_px: float) -> Quality:
+        """Return how well the images agree, and what their photons tell about p1..p8 of `homography`."""
+        residual, weight = self._residual(homography, fixed)
+        seen = weight > 0
+        here = self._layer.image[seen]
+        there = here + residual[seen]
+        here, there = here - here.mean(), there - there.mean()
+        spread = float(np.sqrt(np.mean(here**2) * np.mean(there**2)))
+        # White noise, and what the blur leaves of it in a pixel.
+        variance = float(np.median(1 / weight[seen]))
+        noise_ratio = float(np.mean(residual[seen] ** 2)) * 4 * np.pi * blur_px**2 / variance
+        # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
+        # place hardly change within the blur, so that it is enough to blur the gradients.
+        hessian = self._curvature(weight, blur_px, _UNKNOWN)
+        bx, by = (cv2.GaussianBlur(weight * gradient, (0, 0), blur_px) for gradient in (self._gx, self._gy))
+        scatter = self._quadratic(bx * bx, bx * by, by * by) * variance
+        information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio)
+        return Quality(
+            information=self._in_parameters(homography, information),
+            zncc=float(np.mean(here * there)) / max(spread, 1e-12),
+            noise_ratio=noise_ratio,
+            overlap=float(seen.mean()),
+        )
+
+    def _residual(self, homography: NDArray[np.float64], fixed: Layer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the fixed image seen from the template minus the template, and the inverse variance of the difference."""
+        height, width = self._layer.image.shape
+        # Linear interpolation would blur one image and not the other, which looks like a change of scale.
+        cubic, linear = (kind | cv2.WARP_INVERSE_MAP for kind in (cv2.INTER_CUBIC, cv2.INTER_LINEAR))
+        seen = cv2.warpPerspective(fixed.image, homography, (width, height), flags=cubic)
+        weight = cv2.warpPerspective(fixed.weight, homography, (width, height), flags=linear)
+        both = self._layer.weight + weight
+        combined = np.divide(self._layer.weight * weight, both, out=np.zeros_like(both), where=both > 0)
+        return seen - self._layer.image, combined
+
+    def _curvature(self, weight: NDArray[np.float32], blur_px: float, least: float) -> NDArray[np.float64]:
+        """Return the (8, 8) curvature that the scene causes, without that of the noise, which has gradients too.
+
+        Args:
+            weight: (H, W) inverse variance of a pixel of the difference.
+            blur_px: the blur of the images, in px of the layer.
+            least: what is left of a direction in which there is more noise than scene, as a share of what is seen.
+        """
+        gx, gy = self._gx, self._gy
+        seen = self._quadratic(weight * gx * gx, weight * gx * gy, weight * gy * gy)
+        noise = np.divide(weight, self._layer.weight, out=np.zeros_like(weight), where=self._layer.weight > 0)
+        # Variance of a central difference of white noise after a Gaussian; a narrow one leaves pixels as they are.
+        noise *= self._half**2 * 0.5 * (1 - np.exp(-1 / blur_px**2)) * min(1.0, 1 / (4 * np.pi * blur_px**2))
+        floor = self._quadratic(noise, np.zeros_like(noise), noise)
+        # In units in which what is seen is the identity, so that no parameter drowns another.
+        try:
+            root = np.linalg.cholesky(seen)
+        except np.linalg.LinAlgError:
+            return seen
+        whitening = np.linalg.inv(root)
+        values, vectors = np.linalg.eigh(np.eye(8) - whitening @ floor @ whitening.T)
+        half = root @ (vectors * np.sqrt(np.maximum(values, least)))
+        return np.asarray(half @ half.T)
+
+    def _quadratic(self, xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the (8, 8) sums over pixels of products of two parameters' images, for products of gradients."""
+        moments = [self._moments(image, 5) for image in (xx, xy, yy)]
+        return np.asarray(sum(np.einsum("abij,ij->ab", product, m) for product, m in zip(_products(), moments, strict=True)))
+
+    def _moments(self, image: NDArray[np.float32], count: int) -> NDArray[np.float64]:
+        """Return the sums of an image times x^i y^j, i and j below `count`: (count, count)."""
+        x, y = self._powers
+        return np.asarray((image @ x[:, :count]).astype(np.float64).T @ y[:, :count])
+
+    def _in_parameters(self, homography: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert the information on a step to that on p1..p8 of the homography it changes."""
+        frame = corners(self._layer.image.shape)
+        generators = self._from_unit @ (from_parameters(np.eye(8)) - np.eye(3)) @ self._unit
+        rows = np.concatenate([frame, np.ones((4, 1))], axis=1).T
+        mapped = homography @ rows
+        changed = homography @ generators @ rows
+        d = (changed[:, :2] - mapped[:2] / mapped[2] * changed[:, 2:]) / mapped[2]
+        to_corners = d.transpose(2, 1, 0).reshape(8, 8)
+        to_step = np.linalg.solve(to_corners, jacobian(homography, frame).reshape(8, 8))
+        return np.asarray(to_step.T @ information @ to_step)
+
+
+def _polynomials(terms: dict[int, tuple[tuple[float, int, int], ...]]) -> NDArray[np.float64]:
+    """Return the coefficients of x^i y^j for each parameter: (8, 3, 3)."""
+    coefficients = np.zeros((8, 3, 3))
+    for parameter, polynomial in terms.items():
+        for factor, i, j in polynomial:
+            coefficients[parameter, i, j] = factor
+    return coefficients
+
+
+# A small change of p1..p8 moves (x, y) by (p1 x + p3 y + p5 - p7 x^2 - p8 x y, p2 x + p4 y + p6 - p7 x y - p8 y^2).
+_ALONG_X = _polynomials({0: ((1, 1, 0),), 2: ((1, 0, 1),), 4: ((1, 0, 0),), 6: ((-1, 2, 0),), 7: ((-1, 1, 1),)})
+_ALONG_Y = _polynomials({1: ((1, 1, 0),), 3: ((1, 0, 1),), 5: ((1, 0, 0),), 6: ((-1, 1, 1),), 7: ((-1, 0, 2),)})
+
+
+@cache
+def _products() -> tuple[NDArray[np.float64], ...]:
+    """Return the coefficients of x^i y^j of two parameters' product, (8, 8, 5, 5), for gx gx, gx gy and gy gy."""
+
+    def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+        result = np.zeros((8, 8, 5, 5))
+        for i in range(3):
+            for j in range(3):
+                result[:, :, i : i + 3, j : j + 3] += first[:, None, i, j, None, None] * second[None]
+        return result
+
+    return (
+        product(_ALONG_X, _ALONG_X),
+        product(_ALONG_X, _ALONG_Y) + product(_ALONG_Y, _ALONG_X),
+        product(_ALONG_Y, _ALONG_Y),
+    )
+
+
+def _powers(length: int, half: float) -> NDArray[np.float32]:
+    """Return the powers 0 to 4 of the coordinates of a side, from its middle, in units of half the longer side."""
+    coordinates = (np.arange(length) - (length - 1) / 2) / half
+    return np.asarray(np.power(coordinates[:, None], np.arange(5)), dtype=np.float32)
+
+
+def _gradients(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    kernel = np.array([[-0.5, 0, 0.5]], dtype=np.float32)
+    along_x, along_y = (cv2.filter2D(image, cv2.CV_32F, each) for each in (kernel, kernel.T))
+    return np.asarray(along_x, dtype=np.float32), np.asarray(along_y, dtype=np.float32)
