@@ -1,5 +1,6 @@
 """photonpano explain."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -57,9 +58,7 @@ class _Writer:
                 yield "levels:"
                 for index, (level, comment) in enumerate(zip(value, self._levels, strict=True)):
                     yield f"  # {comment}"
-                    first, *others = self._mapping(level, f"levels.{index}", "")
-                    yield f"  - {first}"
-                    yield from (f"    {line}" for line in others)
+                    yield from self._item(level, f"levels.{index}", "  ")
             else:
                 yield from self._mapping({section: value}, "", "")
 
@@ -72,16 +71,25 @@ class _Writer:
             if isinstance(value, dict) and value:
                 yield f"{indent}{key}:"
                 yield from self._mapping(value, path, f"{indent}  ")
+            elif value and re.fullmatch(r"(levels\.\d+\.)?locate\.fallback", path):
+                yield f"{indent}{key}:"
+                for index, item in enumerate(value):
+                    yield from self._item(item, f"{path}.{index}", f"{indent}  ")
             else:
                 remarks = [self._origin(path, value), self._written(path)]
                 comment = ", ".join(filter(None, remarks))
                 yield f"{indent}{key}: {flow(value)}" + (f"  # {comment}" if comment else "")
 
+    def _item(self, mapping: Mapping[str, Any], where: str, indent: str) -> Iterator[str]:
+        first, *others = self._mapping(mapping, where, "")
+        yield f"{indent}- {first}"
+        yield from (f"{indent}  {line}" for line in others)
+
     def _origin(self, path: str, value: Any) -> str:
         """Say which plugin gives a component."""
         from photonpano.registry import KINDS
 
-        *_, section, key = ["", *path.split(".")]
+        *_, section, key = ["", *re.sub(r"\.fallback\.\d+", "", path).split(".")]
         kinds = [kind.name for kind in KINDS.values() if kind.section == section]
         if key != "use" or not kinds:
             return ""
@@ -94,8 +102,10 @@ class _Writer:
         place = places.get(path)
         if place is None and path.startswith("levels."):
             _, index, stage, *rest = path.split(".")
-            # A level that does not choose another component goes on from the keys of the stage.
-            if rest and f"levels.{index}.{stage}.use" not in places:
+            # A level that does not choose another component goes on from the keys and the fallback of the stage.
+            own = f"levels.{index}.{stage}"
+            replaced = f"{own}.use" in places or (rest[:1] == ["fallback"] and f"{own}.fallback.0" in places)
+            if rest and not replaced:
                 place = places.get(".".join([stage, *rest]))
         if place is not None and place.override is not None:
             return "--set"

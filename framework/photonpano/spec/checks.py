@@ -26,10 +26,13 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
     """
     sentences: dict[tuple[str, str], str] = {}
     for index, (level, written) in enumerate(zip(plan.levels, plan.document["levels"], strict=True)):
-        for stage in STAGES:
-            where = f"levels.{index}.{stage}" if stage in written else stage
-            for sentence in complaints(getattr(level, stage), info):
-                sentences.setdefault((stage, sentence), where)
+        choices = {f"levels.{index}.{stage}" if stage in written else stage: getattr(level, stage) for stage in STAGES}
+        own = f"levels.{index}.locate.fallback"
+        fallback = own if f"{own}.0" in plan.places else "locate.fallback"
+        choices |= {f"{fallback}.{rank}": choice for rank, choice in enumerate(level.fallbacks)}
+        for where, choice in choices.items():
+            for sentence in complaints(choice, info):
+                sentences.setdefault((choice.contribution.name, sentence), where)
     problems = [plan.places.get(where, Place(where)).problem(sentence) for (_, sentence), where in sentences.items()]
     reference = plan.render.reference
     if isinstance(reference, int) and reference >= info.n_frames:

@@ -38,6 +38,10 @@ def json_schema(catalog: Catalog) -> Schema:
         own = [entry for entry in entries if entry.kind == kind.name]
         sections[kind.section] = _component(kind, own, schemas, DEFAULTS.get(kind.section))
         overrides[kind.section] = _component(kind, own, schemas, None)
+    locators = overrides["locate"] | {"type": "object", "required": ["use"]}
+    definitions["fallback"] = _fallback(locators)
+    for section in (sections["locate"], overrides["locate"]):
+        section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback"}}
     level["properties"] |= {name: schema for name, schema in overrides.items() if name in DEFAULTS}
     sections["source"]["required"] = ["use"]
     return {
@@ -93,3 +97,12 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
+
+
+def _fallback(locator: Schema) -> Schema:
+    """Return the schema of the locators to which lost pairs are offered: one or a list, each a name or a mapping."""
+    one = {"anyOf": [locator["properties"]["use"], locator]}
+    return {
+        "description": "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}",
+        "anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}],
+    }

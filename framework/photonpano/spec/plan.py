@@ -42,11 +42,15 @@ class Choice(Generic[ContributionT]):
 
 @dataclass(frozen=True, slots=True)
 class LevelPlan:
-    """The components of one level, and the scale of its exposures (pixels per pixel of a frame)."""
+    """The components of one level, and the scale of its exposures (pixels per pixel of a frame).
+
+    Pairs that `locate` loses are offered to the `fallbacks`, in order.
+    """
 
     resample: Choice[ResamplerContribution[Any]]
     merge: Choice[MergerContribution[Any]]
     locate: Choice[LocatorContribution[Any]]
+    fallbacks: tuple[Choice[LocatorContribution[Any]], ...]
     interpolate: Choice[InterpolatorContribution[Any]]
     scale: float
 

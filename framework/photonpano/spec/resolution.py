@@ -43,11 +43,12 @@ SECTIONS = ("version", *KIND_OF, "levels", *SETTINGS)
 
 @dataclass(frozen=True, slots=True)
 class _Selection:
-    """What a section chooses: found in the catalog or not, its keys, and the choice if all of it is right."""
+    """What a section chooses: found in the catalog or not, its keys, the choice if all of it is right, and its fallbacks."""
 
     entry: Entry | None
     keys: Value
     choice: Choice[Any] | None
+    fallbacks: tuple[Choice[Any], ...] = ()
 
 
 def resolve(root: Value, directory: Path, catalog: Catalog, problems: list[Problem]) -> Plan:
@@ -84,6 +85,7 @@ class _Resolver:
         self.directory = directory
         self.catalog = catalog
         self.problems = problems
+        self.places = root.places()
 
     def plan(self) -> Plan | None:
         """Resolve everything; None if there are problems."""
@@ -101,9 +103,7 @@ class _Resolver:
         settings: dict[str, Any] = {name: self.validated(model, sections[name]) for name, model in SETTINGS.items()}
         if source is None or self.problems:
             return None
-        plan = Plan(
-            source, tuple(filter(None, levels)), **settings, document={}, places=self.root.places(), file=self.root.head.file
-        )
+        plan = Plan(source, tuple(filter(None, levels)), **settings, document={}, places=self.places, file=self.root.head.file)
         return replace(plan, document=self.document(plan, stages))
 
     def version(self, value: Value | None) -> None:
@@ -126,20 +126,73 @@ class _Resolver:
         content = self.mapping(value, " such as {use: NAME}")
         if content is None:
             return _Selection(None, value, None)
-        here = replace(value.head, where=joined(value.head.where, "with"))
-        keys = content.get("with") or Value({}, here, here)
-        if "use" in content:
-            entry = self.entry(kind, content["use"])
-        elif base is not None:
+        keys = _keys(value, content)
+        if base is not None and "use" not in content:
             entry, keys = base.entry, _updated(base, keys)
-        elif section in DEFAULTS:
-            entry = self.entry(kind, Value(DEFAULTS[section], value.head))
         else:
-            known = listed(self.catalog.names(kind.name)) or "none"
-            self.problems.append(value.head.problem(f"required: the name of the {kind.name}; known: {known}", "use"))
-            entry = None
-        self.known_keys(content, ("use", "with"), entry.contribution.config.model_fields if entry else ())
-        return _Selection(entry, keys, self.choice(entry, keys, base) if entry else None)
+            default = Value(DEFAULTS[section], value.head) if section in DEFAULTS else None
+            entry = self.entry(kind, value, content.get("use", default))
+        known = ("use", "with", "fallback") if section == "locate" else ("use", "with")
+        self.known_keys(content, known, entry.contribution.config.model_fields if entry else ())
+        choice = self.choice(entry, keys, base) if entry else None
+        fallbacks = self.fallbacks(value, content, choice, base) if section == "locate" else ()
+        return _Selection(entry, keys, choice, fallbacks)
+
+    def fallbacks(
+        self, value: Value, content: dict[str, Value], first: Choice[Any] | None, base: _Selection | None
+    ) -> tuple[Choice[Any], ...]:
+        """Resolve the locators to which lost pairs are offered: one or a list, each a name or a mapping.
+
+        Args:
+            value: the section.
+            content: its keys.
+            first: the locator that the section chooses.
+            base: what a level goes on from: it keeps the fallbacks of that, unless it names another locator or fallbacks.
+        """
+        again = "would lose the same pairs again"
+        written = content.get("fallback")
+        if written is None or written.content is None:
+            if base is None or "use" in content:
+                return ()
+            if first is not None and first != base.choice and first in base.fallbacks:
+                name = first.contribution.name
+                self.problems.append(value.head.problem(f"the fallback {name!r} has the same keys, and {again}"))
+            return base.fallbacks
+        tried = [] if first is None else [first]
+        found = []
+        for index, item in enumerate(written.content if isinstance(written.content, list) else [written]):
+            self.remember(item, joined(written.place.where, index))
+            choice = self.fallback(item)
+            if choice in tried:
+                name = choice.contribution.name
+                self.problems.append(item.head.problem(f"{name!r} with the same keys is tried before, and {again}"))
+            elif choice is not None:
+                tried.append(choice)
+                found.append(choice)
+        return tuple(found)
+
+    def fallback(self, item: Value) -> Choice[Any] | None:
+        """Resolve one locator to which lost pairs are offered."""
+        kind = KIND_OF["locate"]
+        content = {"use": item} if isinstance(item.content, str) else item.content
+        if not isinstance(content, dict):
+            expected = "the name of a locator, or a mapping such as {use: NAME}"
+            self.problems.append(item.place.problem(f"expected {expected}, got {given(item.content)}"))
+            return None
+        entry = self.entry(kind, item, content.get("use"))
+        if nested := content.get("fallback"):
+            message = "a fallback has none of its own; list all of them, in the order in which they are tried"
+            self.problems.append(nested.head.problem(message))
+        own = {key: value for key, value in content.items() if key != "fallback"}
+        self.known_keys(own, ("use", "with"), entry.contribution.config.model_fields if entry else ())
+        return self.choice(entry, _keys(item, content), None) if entry else None
+
+    def remember(self, item: Value, where: str) -> None:
+        """Remember where a fallback is written, by its path in the resolved spec, where it is a mapping in a list."""
+        for each in item.walk():
+            self.places[where + each.place.where.removeprefix(item.place.where)] = each.head
+        if isinstance(item.content, str):
+            self.places[joined(where, "use")] = item.head
 
     def choice(self, entry: Entry, keys: Value, base: _Selection | None) -> Choice[Any] | None:
         """Validate the keys of a component; what is wrong in the base of a level is not said again."""
@@ -158,8 +211,12 @@ class _Resolver:
         self.problems += found
         return None if config is None else Choice(entry.contribution, config, entry.plugin, entry.version)
 
-    def entry(self, kind: Kind, use: Value) -> Entry | None:
-        """Look a component up."""
+    def entry(self, kind: Kind, value: Value, use: Value | None) -> Entry | None:
+        """Look up the component that a section names; None if it names none, or one that there is not."""
+        if use is None:
+            known = listed(self.catalog.names(kind.name)) or "none"
+            self.problems.append(value.head.problem(f"required: the name of the {kind.name}; known: {known}", "use"))
+            return None
         if not isinstance(use.content, str):
             self.problems.append(use.place.problem(f"expected the name of the {kind.name}, got {given(use.content)}"))
             return None
@@ -195,20 +252,21 @@ class _Resolver:
             name: self.select(name, content[name], stages[name]) if name in content else stages[name] for name in STAGES
         }
         choices: dict[str, Any] = {name: selection.choice for name, selection in selected.items()}
-        return None if settings is None or None in choices.values() else LevelPlan(**choices, scale=settings.scale)
+        if settings is None or None in choices.values():
+            return None
+        return LevelPlan(**choices, fallbacks=selected["locate"].fallbacks, scale=settings.scale)
 
     def document(self, plan: Plan, stages: dict[str, _Selection]) -> dict[str, Any]:
         """Write a plan down as plain data: every default is filled in, and a level has the stages in which it differs."""
-        chosen: dict[str, Any] = {name: stages[name].choice for name in STAGES}
-        levels = [
-            {"scale": level.scale}
-            | {name: _written(getattr(level, name)) for name in STAGES if getattr(level, name) != chosen[name]}
-            for level in plan.levels
-        ]
+        chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
+        levels = []
+        for level in plan.levels:
+            own = {name: _stage(name, getattr(level, name), level.fallbacks) for name in STAGES}
+            levels.append({"scale": level.scale} | {name: own[name] for name in STAGES if own[name] != chosen[name]})
         return {
             "version": VERSION,
             "source": _written(plan.source),
-            **{name: _written(choice) for name, choice in chosen.items()},
+            **chosen,
             "levels": levels,
             **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
         }
@@ -234,11 +292,21 @@ class _Resolver:
         return validate(model, value, self.directory, self.problems)
 
 
+def _keys(value: Value, content: dict[str, Value]) -> Value:
+    """Return the keys of a component; where there are none, an empty mapping where they would stand."""
+    here = replace(value.head, where=joined(value.head.where, "with"))
+    return content.get("with") or Value({}, here, here)
+
+
 def _updated(base: _Selection, keys: Value) -> Value:
     """Lay keys over those of the base."""
     if not isinstance(keys.content, dict) or not isinstance(base.keys.content, dict):
         return base.keys if keys.content is None else keys
     return Value(base.keys.content | keys.content, keys.place, keys.key)
+
+
+def _stage(name: str, choice: Any, fallbacks: Iterable[Choice[Any]]) -> dict[str, Any]:
+    return _written(choice) | ({"fallback": [_written(each) for each in fallbacks]} if name == "locate" else {})
 
 
 def _written(choice: Choice[Any]) -> dict[str, Any]:

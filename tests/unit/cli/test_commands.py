@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -124,6 +125,26 @@ def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[...,
     assert f"directory: {folder}/runs/capture  # default" in lines
     assert "# level 1: 4 groups of 50 frames, 5 pairs" in lines
     assert "# level 2: 9 groups of 50 frames, 20 pairs" in lines
+
+
+def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
+    stages = (
+        "locate: {use: direct, fallback: opencv-sift}\n"
+        "levels:\n  - {locate: {with: {blur_px: 2}}}\n  - {locate: {fallback: {use: opencv-sift, with: {ratio: 0.9}}}}\n"
+    )
+    spec = (folder / "capture.yaml").read_text().replace("levels: 1\n", stages)
+    (folder / "capture.yaml").write_text(spec)
+    printed = invoke("explain", "capture.yaml").stdout
+    assert YAML(typ="safe").load(printed) == load_spec("capture.yaml").document
+    top, first, second = (part.partition("fallback:\n")[2].splitlines() for part in re.split("# level .:", printed))
+    assert top[:3] == ["    - use: opencv-sift  # photonpano 0.1.0", "      with:", "        max_keypoints: 2000  # default"]
+    assert first[:2] == ["        - use: opencv-sift  # photonpano 0.1.0", "          with:"]
+    assert "            ratio: 0.8  # default" in first
+    assert "            ratio: 0.9" in second
+    replaced = invoke("explain", "capture.yaml", "--set", "locate.fallback=[]", "--set", "levels=1").stdout
+    assert "  fallback: []  # --set\n" in replaced
+    named = invoke("explain", "capture.yaml", "--set", "locate={use: opencv-sift, fallback: direct}").stdout
+    assert "    - use: direct  # photonpano 0.1.0, --set\n" in named
 
 
 def test_schema(folder: Path, invoke: Callable[..., Any]) -> None:

@@ -1,8 +1,9 @@
 """What components say about a capture."""
 
 import pytest
+from pydantic import Field
 
-from photonpano import Config, ResamplerContribution, SourceContribution, SpecError, StreamInfo
+from photonpano import Config, LocatorContribution, ResamplerContribution, SourceContribution, SpecError, StreamInfo
 from photonpano.registry import Catalog
 from photonpano.spec import check_stream, load_spec, parse_spec
 
@@ -26,6 +27,26 @@ def test_levels_repeat_nothing_and_stand_at_their_overrides(catalog, tmp_path):
         f"{path}:3:1: resample: {TOO_LARGE.format(200)}",
         f"{path}:8:6: levels.2.resample: {TOO_LARGE.format(300)}",
         f"{path}:4:10: render.reference: expected a frame of the capture, 0 to 99, got 100",
+    ]
+
+
+def test_fallbacks_are_checked_where_they_are_written(catalog):
+    class Sized(Config):
+        at_least: int = Field(description="frames")
+
+    def too_short(config, info):
+        return [f"the capture has fewer than {config.at_least} frames"] if info.n_frames < config.at_least else []
+
+    sized = LocatorContribution(name="sized", summary="Toy", config=Sized, build=fail, check=too_short)
+    spec = (
+        "version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 50}}\n"
+        "locate: {fallback: {use: sized, with: {at_least: 101}}}\n"
+        "levels:\n  - {locate: {with: {ratio: 0.5}}}\n  - {locate: {fallback: [direct, {use: sized, with: {at_least: 102}}]}}\n"
+    )
+    plan = parse_spec(spec, catalog=Catalog(catalog.rows).including(sized))
+    assert [str(problem) for problem in check_stream(plan, SHORT)] == [
+        "4:10: locate.fallback: the capture has fewer than 101 frames",
+        "7:34: levels.1.locate.fallback.1: the capture has fewer than 102 frames",
     ]
 
 

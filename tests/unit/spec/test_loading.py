@@ -45,6 +45,50 @@ def test_level_replaces_a_stage_with_use_and_updates_it_without(catalog):
     assert empty == base
 
 
+def test_level_keeps_the_fallbacks_until_it_names_a_locator_or_fallbacks_of_its_own(catalog):
+    steps = {"max_steps": 5}
+    overrides = {
+        "nothing": {},
+        "null": {"fallback": None},
+        "keys": {"with": {"ratio": 0.6}},
+        "locator": {"use": "direct"},
+        "fallback": {"fallback": {"use": "direct", "with": steps}},
+        "both": {"use": "direct", "fallback": ["opencv-sift", {"use": "direct", "with": steps}]},
+        "none": {"fallback": []},
+    }
+    levels = [{"locate": override} for override in overrides.values()]
+    plan = parse_spec(MINIMAL | {"locate": {"fallback": "direct"}, "levels": levels}, catalog=catalog)
+    tried = {
+        name: [
+            (each.contribution.name, each.config.model_dump(exclude_unset=True)) for each in (level.locate, *level.fallbacks)
+        ]
+        for name, level in zip(overrides, plan.levels, strict=True)
+    }
+    sift, direct, short = ("opencv-sift", {}), ("direct", {}), ("direct", steps)
+    assert tried == {
+        "nothing": [sift, direct],
+        "null": [sift, direct],
+        "keys": [("opencv-sift", {"ratio": 0.6}), direct],
+        "locator": [direct],
+        "fallback": [sift, short],
+        "both": [direct, sift, short],
+        "none": [sift],
+    }
+    assert "locate" not in plan.document["levels"][0]
+    assert plan.document["levels"][3]["locate"]["fallback"] == []
+
+
+def test_places_of_fallbacks_are_found_by_their_paths_in_the_document(catalog):
+    """Where a fallback is one name or one mapping, the document has a list of mappings."""
+    spec = "version: 1\nsource: {use: simulator}\nlocate: {fallback: direct}\nlevels: [{locate: {fallback: {use: direct}}}]"
+    places = parse_spec(spec, catalog=catalog).places
+    found = {path: (places[path].where, places[path].column) for path in places if path.endswith(".0.use")}
+    assert found == {
+        "locate.fallback.0.use": ("locate.fallback", 10),
+        "levels.0.locate.fallback.0.use": ("levels.0.locate.fallback.use", 31),
+    }
+
+
 def test_paths_count_from_the_folder_of_the_spec(catalog, tmp_path, monkeypatch):
     (tmp_path / "specs").mkdir()
     (tmp_path / "cube.npy").touch()

@@ -20,6 +20,7 @@ SPEC = "version: 1\nsource: {use: simulator}\nlevels: [{}, {scale: 0.5}]\nrun: {
         ("graph.skips=[1, 2]", ("graph", "skips"), [1.0, 2.0]),
         ("resample.with.group_size=7", ("resample", "with", "group_size"), 7),
         ("locate.use=direct", ("locate", "use"), "direct"),
+        ("locate.fallback=direct", ("locate", "fallback", 0, "use"), "direct"),
         ("run=", ("run", "seed"), 0),
         ("run.memory=1 GiB", ("run", "memory"), 2**30),
     ],
