@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -12,7 +13,8 @@ from photonpano.errors import PhotonpanoError, PluginError
 from photonpano.pipeline.threads import thread_count
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
+    from contextlib import AbstractContextManager
 
     from photonpano.contributions import Contribution
     from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
@@ -23,37 +25,47 @@ ComponentT = TypeVar("ComponentT")
 
 
 @dataclass(frozen=True, slots=True)
+class NamedLocator:
+    """A locator of a level.
+
+    Attributes:
+        name: as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2".
+        component: the locator.
+        origin: who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0".
+    """
+
+    name: str
+    component: Locator
+    origin: str
+
+
+@dataclass(frozen=True, slots=True)
 class Level:
     """The components of one level, built.
 
     Attributes:
         number: from 1.
         scale: pixels of the level's exposures per pixel of a frame.
-        origins: who provides the component of each kind, such as "merger 'photon-mle' of photonpano 0.1.0".
+        locators: at least one; a pair that one of them loses is offered to the next.
+        origins: who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0".
     """
 
     number: int
     scale: float
     resampler: Resampler
     merger: Merger
-    locator: Locator
+    locators: tuple[NamedLocator, ...]
     interpolator: Interpolator
     origins: Mapping[str, str]
 
-    @contextmanager
-    def blaming(self, kind: str) -> Iterator[None]:
-        """Name the component of a kind, such as "merger", in what it raises by mistake.
+    def blaming(self, component: str | NamedLocator) -> AbstractContextManager[None]:
+        """Name a component, given as its kind (such as "merger") or as a locator, in what it raises by mistake.
 
         Raises:
             PluginError: the block raised something that was not made for users.
         """
-        try:
-            yield
-        except PhotonpanoError:
-            raise
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}"
-            raise PluginError(f"{self.origins[kind]} failed at level {self.number}: {reason}") from error
+        origin = self.origins[component] if isinstance(component, str) else component.origin
+        return _blaming(origin, self.number)
 
 
 def build_source(plan: Plan) -> Source:
@@ -85,15 +97,34 @@ def build_levels(plan: Plan, source: Source) -> tuple[Level, ...]:
             level.scale,
             component(level.resample),
             component(level.merge),
-            component(level.locate),
+            tuple(
+                NamedLocator(name, component(choice), _origin(choice))
+                for name, choice in _named((level.locate, *level.fallbacks))
+            ),
             component(level.interpolate),
-            {
-                choice.contribution.kind: _origin(choice)
-                for choice in (level.resample, level.merge, level.locate, level.interpolate)
-            },
+            {choice.contribution.kind: _origin(choice) for choice in (level.resample, level.merge, level.interpolate)},
         )
         for number, level in enumerate(plan.levels, start=1)
     )
+
+
+def _named(choices: Iterable[Choice[Any]]) -> Iterator[tuple[str, Choice[Any]]]:
+    """Give each choice its name, with a number from the second of the same name on."""
+    seen: Counter[str] = Counter()
+    for choice in choices:
+        name = choice.contribution.name
+        seen[name] += 1
+        yield (name if seen[name] == 1 else f"{name} {seen[name]}"), choice
+
+
+@contextmanager
+def _blaming(origin: str, level: int) -> Iterator[None]:
+    try:
+        yield
+    except PhotonpanoError:
+        raise
+    except Exception as error:
+        raise PluginError(f"{origin} failed at level {level}: {type(error).__name__}: {error}") from error
 
 
 def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: ContextT) -> ComponentT:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,17 +18,17 @@ from photonpano.pipeline.pairs import pairs_of, shared_share
 from photonpano.values import Edge, Located, NotLocated
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from concurrent.futures import Future
 
-    from photonpano.pipeline.components import Level
+    from photonpano.pipeline.components import Level, NamedLocator
     from photonpano.pipeline.graph import GraphSolution
     from photonpano.pipeline.merge import VirtualExposures
     from photonpano.pipeline.progress import Progress
     from photonpano.pipeline.stopwatch import Stopwatch
     from photonpano.protocols import Trajectory
     from photonpano.spec.settings import GraphSettings
-    from photonpano.values import FloatArray, Group, Homography
+    from photonpano.values import FloatArray, Group, Homography, VirtualExposure
 
 BRIDGE = 3
 """An exposure that none of its pairs ties to an earlier one is tried against so many predecessors."""
@@ -82,10 +83,11 @@ def locate(
     """Register the pairs of a level, and solve the motion graph.
 
     Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and forgotten after the last.
+    What the first locator loses is offered to the next; only for these pairs are exposures merged and described once more.
 
     Raises:
         LocationError: exposures cannot be tied to each other, and the settings do not allow to go on without them.
-        PluginError: the locator failed in its own way, or returned what is no motion.
+        PluginError: a locator failed in its own way, or returned what is no motion.
     """
     groups = exposures.groups
     registrar = _Registrar(level, exposures, known, clock)
@@ -102,6 +104,21 @@ def locate(
     return LocatedLevel(groups, edges, solution)
 
 
+@dataclass(slots=True)
+class _Described:
+    """What is kept of an exposure while pairs of it are due.
+
+    Attributes:
+        contrast: how much there is to see in it.
+        features: what the locators made of it, by their names.
+        lock: held while a locator is asked, so that each is asked once.
+    """
+
+    contrast: Contrast
+    features: dict[str, Any] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
+
+
 class _Registrar:
     """Describes exposures and registers pairs of them, in px of frames."""
 
@@ -110,7 +127,7 @@ class _Registrar:
         self._exposures = exposures
         self._known = known
         self._clock = clock
-        self._features: dict[int, Any] = {}
+        self._described: dict[int, _Described] = {}
         self.contrasts: dict[int, Contrast] = {}
 
     def edges(
@@ -123,14 +140,14 @@ class _Registrar:
             partners[moving].append(fixed)
             needed_until[fixed] = max(needed_until[fixed], moving)
         described = _in_order(pool, self._describe, range(len(self._exposures)), threads)
-        for moving, (features, contrast) in enumerate(described):
-            self._features[moving], self.contrasts[moving] = features, contrast
+        for moving, each in enumerate(described):
+            self._described[moving], self.contrasts[moving] = each, each.contrast
             found = list(pool.map(lambda fixed, moving=moving: self._register(moving, fixed), partners[moving]))
             if not any(isinstance(edge.motion, Located) for edge in found):
                 found += self._bridge(moving, partners[moving])
             yield from found
-            for index in [index for index in self._features if needed_until[index] <= moving]:
-                del self._features[index]
+            for index in [index for index in self._described if needed_until[index] <= moving]:
+                del self._described[index]
             advance(1)
 
     def _bridge(self, moving: int, tried: Sequence[int]) -> Iterator[Edge]:
@@ -141,24 +158,55 @@ class _Registrar:
                 if isinstance(edge.motion, Located):
                     return
 
-    def _describe(self, index: int) -> tuple[Any, Contrast]:
+    def _describe(self, index: int) -> _Described:
         exposure = self._exposures[index]
         with self._clock("locate"):
             contrast = contrast_of(exposure)
-            with self._level.blaming("locator"):
-                return (None if contrast.blank else self._level.locator.describe(exposure)), contrast
+        described = _Described(contrast)
+        if not contrast.blank:
+            first = self._level.locators[0]
+            described.features[first.name] = self._described_by(first, exposure)
+        return described
+
+    def _described_by(self, locator: NamedLocator, exposure: VirtualExposure) -> Any:
+        with self._clock("locate"), self._level.blaming(locator):
+            return locator.component.describe(exposure)
+
+    def _features(self, locator: NamedLocator, index: int) -> Any:
+        """Return what a locator makes of an exposure; a fallback is shown only those of pairs that were lost."""
+        described = self._described[index]
+        with described.lock:
+            if locator.name not in described.features:
+                described.features[locator.name] = self._described_by(locator, self._exposures[index])
+            return described.features[locator.name]
 
     def _register(self, moving: int, fixed: int) -> Edge:
+        """Offer a pair to one locator after the other, until one finds a motion that a camera makes."""
+        for index in (moving, fixed):
+            if blank := self.contrasts[index].blank:
+                return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
         with self._clock("locate"):
-            for index in (moving, fixed):
-                if blank := self.contrasts[index].blank:
-                    return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
             initial = self._initial(moving, fixed)
-            with self._level.blaming("locator"):
-                motion = self._level.locator.register(self._features[moving], self._features[fixed], initial)
-            if not isinstance(motion, NotLocated):
-                motion = self._checked(motion, moving, fixed)
-            return Edge(moving, fixed, motion)
+        lost: dict[str, NotLocated] = {}
+        for locator in self._level.locators:
+            motion = self._registered_by(locator, moving, fixed, initial)
+            if isinstance(motion, Located):
+                return Edge(moving, fixed, motion, locator.name)
+            lost[locator.name] = motion
+        return Edge(moving, fixed, _lost_by_all(lost))
+
+    def _registered_by(
+        self, locator: NamedLocator, moving: int, fixed: int, initial: Homography | None
+    ) -> Located | NotLocated:
+        features = self._features(locator, moving), self._features(locator, fixed)
+        with self._clock("locate"):
+            with self._level.blaming(locator):
+                motion = locator.component.register(*features, initial)
+            if isinstance(motion, NotLocated):
+                return motion
+            if broken := broken_promise(motion):
+                raise PluginError(f"{locator.origin} broke its contract at level {self._level.number}: {broken}")
+            return self._checked(motion, moving, fixed)
 
     def _initial(self, moving: int, fixed: int) -> Homography | None:
         """Return the motion known so far, in px of exposures."""
@@ -170,8 +218,6 @@ class _Registrar:
 
     def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
         """Convert a motion to px of frames, and refuse what no camera does."""
-        if broken := broken_promise(motion):
-            raise PluginError(f"{self._level.origins['locator']} broke its contract at level {self._level.number}: {broken}")
         homography = rescaled(motion.homography, 1 / self._level.scale)
         if reason := implausibility(homography, self._exposures.frame_shape):
             return NotLocated(reason, motion.evidence)
@@ -184,6 +230,14 @@ class _Registrar:
             information = information * np.outer(units, units) * new
         residual_px = None if motion.residual_px is None else motion.residual_px / self._level.scale
         return replace(motion, homography=homography, information=information, residual_px=residual_px)
+
+
+def _lost_by_all(lost: Mapping[str, NotLocated]) -> NotLocated:
+    """Join what several locators say of a pair, each under its name; what a single one says stays as it is."""
+    if len(lost) == 1:
+        return next(iter(lost.values()))
+    reason = "; ".join(f"{name}: {each.reason}" for name, each in lost.items())
+    return NotLocated(reason, {f"{name}.{key}": value for name, each in lost.items() for key, value in each.evidence.items()})
 
 
 def broken_promise(motion: object) -> str | None:

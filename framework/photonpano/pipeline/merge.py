@@ -33,7 +33,7 @@ def merge(
 class VirtualExposures:
     """The virtual exposures of a level: `exposures[i]` merges group i along the motion known so far.
 
-    Nothing is kept; ask for each one once. May be used from several threads.
+    Nothing is kept: an exposure that is asked for again is merged again. May be used from several threads.
     """
 
     def __init__(

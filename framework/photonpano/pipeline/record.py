@@ -36,7 +36,8 @@ def plugin_records(plan: Plan) -> list[dict[str, str]]:
     seen: dict[tuple[str, str], dict[str, str]] = {}
     chosen: list[tuple[str, Any]] = [("source", plan.source)]
     for level in plan.levels:
-        chosen += [(stage, getattr(level, stage)) for stage in ("resample", "merge", "locate", "interpolate")]
+        chosen += [("resample", level.resample), ("merge", level.merge), ("locate", level.locate)]
+        chosen += [*(("locate", choice) for choice in level.fallbacks), ("interpolate", level.interpolate)]
     for stage, choice in chosen:
         name = choice.contribution.name
         seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.plugin, "version": choice.version}
@@ -61,6 +62,9 @@ def level_record(result: LevelResult) -> dict[str, Any]:
         "group_frames": int(np.median([len(group.span) for group in result.groups])),
         "pairs": len(located.edges),
         "located": located.n_located,
+        "located_by": {
+            locator.name: sum(edge.locator == locator.name for edge in located.edges) for locator in result.level.locators
+        },
         "failures": list(_failures(result)),
         "change_px": result.change_px,
         "residual_px": located.solution.residual_px,

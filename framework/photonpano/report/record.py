@@ -44,8 +44,9 @@ class FailureRecord(TypedDict):
 class LevelRecord(TypedDict):
     """One level.
 
-    `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them. `change_px` is how far the level
-    moved the corners of the frames, None at the first level. `seconds` has an entry for each stage.
+    `groups` and `located` count virtual exposures, `pairs`, `located_by` and `failures` pairs of them. `located_by` has an entry
+    for each locator, `seconds` for each stage. `change_px` is how far the level moved the corners of the frames, None at the
+    first level.
     """
 
     level: int
@@ -54,6 +55,7 @@ class LevelRecord(TypedDict):
     group_frames: int
     pairs: int
     located: int
+    located_by: Mapping[str, int]
     failures: Sequence[FailureRecord]
     change_px: float | None
     residual_px: float | None

@@ -47,14 +47,16 @@ class NotLocated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """One pair of virtual exposures of the motion graph, and what the locator said of it.
+    """One pair of virtual exposures of the motion graph, and what was found of it.
 
     Attributes:
         moving: number of the exposure that is mapped.
         fixed: number of the exposure that it is mapped to.
         motion: the map in pixels of frames (not of rescaled exposures), or the reason why there is none.
+        locator: the name of the locator that found the motion; empty where none did.
     """
 
     moving: int
     fixed: int
     motion: Located | NotLocated
+    locator: str = ""

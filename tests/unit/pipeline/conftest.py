@@ -10,10 +10,10 @@ import pytest
 from photonpano import FrameSpan, Group, Located, VirtualExposure
 from photonpano.geometry import inverse, normalised, rescaled
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.components import Level
+from photonpano.pipeline.components import Level, NamedLocator
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from photonpano import NotLocated, Source, Trajectory
 
@@ -81,7 +81,7 @@ def _truth(moving: Group, fixed: Group, found: Located) -> Located:
 
 @pytest.fixture
 def make_level() -> Callable[..., Level]:
-    """Build a level: `make_level(motion, answer, number, scale)`, and other components by their kinds.
+    """Build a level: `make_level(motion, answer, number, scale)`, other components by their kinds, fallbacks by their names.
 
     `answer(moving, fixed, found)` gets the groups of a pair and its true motion, and returns what the locator returns.
     """
@@ -91,10 +91,13 @@ def make_level() -> Callable[..., Level]:
         answer: Callable[..., Any] = _truth,
         number: int = 1,
         scale: float = 1.0,
+        fallbacks: Mapping[str, Any] | None = None,
+        locator: Any = None,
         **components: Any,
     ) -> Level:
-        kinds = ("resampler", "merger", "locator", "interpolator")
-        toys = dict(zip(kinds, (SideBySide(), Noise(), Knowing(motion, answer), Linear()), strict=True)) | components
-        return Level(number, scale, **toys, origins={kind: f"{kind} 'toy' of toys 1.0" for kind in kinds})
+        named = {"toy": locator or Knowing(motion, answer)} | (fallbacks or {})
+        locators = tuple(NamedLocator(name, each, f"locator {name!r} of toys 1.0") for name, each in named.items())
+        toys = {"resampler": SideBySide(), "merger": Noise(), "interpolator": Linear()} | components
+        return Level(number, scale, locators=locators, **toys, origins={kind: f"{kind} 'toy' of toys 1.0" for kind in toys})
 
     return make

@@ -62,11 +62,11 @@ def test_components_are_told_what_they_may_know() -> None:
     source = build_source(made)
     assert source.context == SourceContext(seed=7, threads=3)
     (level,) = build_levels(made, source)
-    assert level.locator.context == StageContext(source.info, source.response, seed=7, threads=3)
+    assert level.locators[0].component.context == StageContext(source.info, source.response, seed=7, threads=3)
+    assert level.locators[0].origin == "locator 'toy' of toys 1.0"
     assert level.origins == {
         "resampler": "resampler 'toy' of toys 1.0",
         "merger": "merger 'toy' of toys 1.0",
-        "locator": "locator 'toy' of toys 1.0",
         "interpolator": "interpolator 'toy' of toys 1.0",
     }
 
@@ -74,11 +74,28 @@ def test_components_are_told_what_they_may_know() -> None:
 def test_levels_that_choose_alike_share_a_component() -> None:
     made = plan(levels=[{"scale": 0.5}, {"locate": {"with": {"size": 2}}}, {}])
     first, second, third = build_levels(made, build_source(made))
-    assert first.locator is third.locator is not second.locator
+    locators = [level.locators[0].component for level in (first, second, third)]
+    assert locators[0] is locators[2] is not locators[1]
     assert first.merger is second.merger is third.merger
     assert [level.number for level in (first, second, third)] == [1, 2, 3]
     assert [level.scale for level in (first, second, third)] == [0.5, 1, 1]
-    assert second.locator.config == Keys(size=2)
+    assert locators[1].config == Keys(size=2)
+
+
+def test_fallbacks_follow_the_locator_in_order_and_share_its_component() -> None:
+    larger = {"use": "toy", "with": {"size": 2}}
+    made = plan(
+        levels=[
+            {"locate": {"fallback": larger}},
+            {"locate": larger | {"fallback": ["toy", {"use": "toy", "with": {"size": 3}}]}},
+        ]
+    )
+    first, second = build_levels(made, build_source(made))
+    assert [(each.name, each.component.config.size) for each in first.locators] == [("toy", 1), ("toy 2", 2)]
+    assert [(each.name, each.component.config.size) for each in second.locators] == [("toy", 2), ("toy 2", 1), ("toy 3", 3)]
+    assert {each.origin for each in second.locators} == {"locator 'toy' of toys 1.0"}
+    assert first.locators[0].component is second.locators[1].component
+    assert first.locators[1].component is second.locators[0].component
 
 
 def broken(*_: Any) -> Any:
@@ -115,5 +132,6 @@ def test_the_response_reaches_every_stage() -> None:
     made = plan()
     source = build_source(made)
     (level,) = build_levels(made, source)
-    responses: set[Response] = {getattr(level, kind.kind).context.response for kind in KINDS[1:]}
+    stages: list[Any] = [level.resampler, level.merger, level.locators[0].component, level.interpolator]
+    responses: set[Response] = {stage.context.response for stage in stages}
     assert responses == {source.response}

@@ -85,6 +85,10 @@ def test_it_notes_a_line_for_each_level(source: Any, make_level: Callable, pan: 
     ]
 
 
+def component(level: Level, kind: str) -> Any:
+    return level.locators[0].component if kind == "locator" else getattr(level, kind)
+
+
 def raising(error: BaseException) -> Callable[..., Any]:
     def fail(*_: Any) -> Any:
         raise error
@@ -104,7 +108,7 @@ CALLS = [
 @pytest.mark.parametrize(("kind", "method"), CALLS)
 def test_a_component_that_fails_is_named(run: Callable, make_level: Callable, pan: Callable, kind: str, method: str) -> None:
     second = make_level(pan(0.3), number=2)
-    setattr(getattr(second, kind), method, raising(ZeroDivisionError("by nothing")))
+    setattr(component(second, kind), method, raising(ZeroDivisionError("by nothing")))
     with pytest.raises(PluginError) as caught:
         run(make_level(pan(0.3)), second)
     assert str(caught.value) == f"{kind} 'toy' of toys 1.0 failed at level 2: ZeroDivisionError: by nothing"
@@ -117,7 +121,7 @@ def test_what_is_meant_for_users_passes(
     run: Callable, make_level: Callable, pan: Callable, kind: str, method: str, error: BaseException
 ) -> None:
     level = make_level(pan(0.3))
-    setattr(getattr(level, kind), method, raising(error))
+    setattr(component(level, kind), method, raising(error))
     with pytest.raises(type(error)) as caught:
         run(level)
     assert caught.value is error

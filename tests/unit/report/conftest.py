@@ -69,6 +69,7 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             "group_frames": 250,
             "pairs": groups - 1,
             "located": groups - (number == 2),
+            "located_by": {"opencv-sift": groups - 1 - (10 if number == 2 else 0)},
             "failures": failures if number == 2 else [],
             "change_px": change,
             "residual_px": 0.42 / number,

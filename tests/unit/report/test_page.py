@@ -77,6 +77,16 @@ def test_the_page_says_what_happened(record, arrays, no_figures):
         assert sentence in text
 
 
+def test_fallbacks_that_located_pairs_are_counted(record, arrays, no_figures):
+    assert "located by" not in text_of(render_report(record, arrays))
+    for level, counts in zip(record["levels"], ((39, 0), (67, 1), (150, 6)), strict=True):
+        level["located_by"] = dict(zip(("direct", "opencv-sift"), counts, strict=True))
+    text = text_of(render_report(record, arrays))
+    assert "Level 1:" not in text
+    assert "Level 2: 67 pairs located by direct , 1 pair located by opencv-sift ." in text
+    assert "Level 3: 150 pairs located by direct , 6 pairs located by opencv-sift ." in text
+
+
 def test_each_level_is_a_row(record, arrays, no_figures):
     tree = ElementTree.fromstring(render_report(record, arrays))
     [table] = [table for table in tree.iter("table") if table.get("class") == "figures"]

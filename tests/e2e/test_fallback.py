@@ -1,0 +1,93 @@
+"""A locator that loses some pairs, and another one that they are offered to."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from photonpano import Config, LocatorContribution, NotLocated, api
+from photonpano.pipeline.progress import Quiet
+from photonpano.pipeline.run import execute
+from photonpano.registry import Catalog, discover
+from photonpano.registry.catalog import make_entry
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from photonpano import Homography, Located, StageContext, VirtualExposure
+    from photonpano.pipeline.run import RunOutcome
+
+SIFT = discover().find("locator", "opencv-sift").contribution
+
+
+class ForgetfulConfig(Config):
+    every: int = Field(ge=1, description="one in so many groups is lost")
+    group_size: int = Field(50, ge=1, description="frames of a group")
+
+
+class Forgetful:
+    """SIFT, but for the pairs of some groups."""
+
+    def __init__(self, config: ForgetfulConfig, context: StageContext) -> None:
+        self._config = config
+        self._sift = SIFT.build(SIFT.config(), context)
+
+    def describe(self, exposure: VirtualExposure) -> Any:
+        number = exposure.group.span.start // self._config.group_size
+        return number, self._sift.describe(exposure)
+
+    def register(self, moving: Any, fixed: Any, initial: Homography | None) -> Located | NotLocated:
+        if not (moving[0] % self._config.every and fixed[0] % self._config.every):
+            return NotLocated("it slipped my mind", {"every": self._config.every})
+        return self._sift.register(moving[1], fixed[1], initial)
+
+
+FORGETFUL = LocatorContribution(name="forgetful", summary="Loses pairs", config=ForgetfulConfig, build=Forgetful)
+
+
+@pytest.fixture(scope="module")
+def catalog() -> Catalog:
+    return Catalog((*discover().rows, make_entry(FORGETFUL, "toys", "1.2", "toys = toys.hooks")))
+
+
+def run(spec: dict[str, Any], catalog: Catalog, threads: int = 2) -> RunOutcome:
+    plan = parse_spec(spec | {"levels": 1, "run": {"threads": threads}}, catalog=catalog)
+    with api.open_source(plan) as source:
+        return execute(plan, source, "tests", Quiet())
+
+
+def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog: Catalog) -> None:
+    forgetful = {"use": "forgetful", "with": {"every": 3}}
+    with_sift = small_spec | {"locate": forgetful | {"fallback": "opencv-sift"}}
+    rescued, again = (run(with_sift, catalog, threads) for threads in (3, 1))
+    sift = run(small_spec, catalog)
+    np.testing.assert_array_equal(rescued.homographies, sift.homographies)
+    np.testing.assert_array_equal(rescued.homographies, again.homographies)
+    (level,) = rescued.record["levels"]
+    # Of the pairs of six groups, 1-0, 2-1, ... and 2-0, 3-1, ..., all with group 0 or 3.
+    assert level["located_by"] == {"forgetful": 3, "opencv-sift": 6}
+    assert (level["pairs"], level["located"], level["failures"]) == (9, 6, [])
+    assert sift.record["levels"][0]["located_by"] == {"opencv-sift": 9}
+    located = [each for each in rescued.record["plugins"] if each["stage"] == "locate"]
+    assert [(each["use"], each["plugin"], each["version"]) for each in located] == [
+        ("forgetful", "toys", "1.2"),
+        ("opencv-sift", "photonpano", discover().find("locator", "opencv-sift").version),
+    ]
+    recorded = parse_spec(json.loads(json.dumps(rescued.record["spec"])), catalog=catalog)
+    assert [each.contribution.name for each in recorded.levels[0].fallbacks] == ["opencv-sift"]
+
+
+def test_what_nobody_locates_lists_what_each_said(small_spec: dict[str, Any], catalog: Catalog) -> None:
+    """The first and the fifth of six groups are found by neither; the others hold together."""
+    forgetful = {"use": "forgetful", "with": {"every": 4}}
+    fallback = {"use": "forgetful", "with": {"every": 4, "group_size": 49}}
+    record = run(small_spec | {"locate": forgetful | {"fallback": fallback}}, catalog).record
+    (level,) = record["levels"]
+    assert level["located_by"] == {"forgetful": level["pairs"] - len(level["failures"]), "forgetful 2": 0}
+    reasons = {failure["reason"] for failure in level["failures"]}
+    assert reasons == {"forgetful: it slipped my mind; forgetful 2: it slipped my mind"}
+    assert level["failures"][0]["evidence"] == {"forgetful.every": 4, "forgetful 2.every": 4}
+    assert len([each for each in record["plugins"] if each["stage"] == "locate"]) == 1
