@@ -44,9 +44,9 @@ class FailureRecord(TypedDict):
 class LevelRecord(TypedDict):
     """One level.
 
-    `groups` and `located` count virtual exposures, `pairs`, `located_by` and `failures` pairs of them. `located_by` has an entry
-    for each locator, `seconds` for each stage. `change_px` is how far the level moved the corners of the frames, None at the
-    first level.
+    `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them; `located_by` counts pairs by locator.
+    `change_px` is how far the level moved the corners of the frames, None at the first level. `seconds` has an entry for each
+    stage.
     """
 
     level: int
