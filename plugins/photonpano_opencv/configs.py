@@ -38,9 +38,9 @@ class OpencvSiftConfig(Config):
 class DirectConfig(Config):
     """Inverse-compositional alignment, coarse to fine."""
 
-    blur_px: float = Field(1.1, gt=0, le=16, description="standard deviation of the Gaussian that quiets photon noise, in px")
+    blur_px: float = Field(0.8, gt=0, le=16, description="standard deviation of the Gaussian that quiets photon noise, in px")
     pyramid_levels: int = Field(4, ge=1, le=8, description="levels of the pyramid, each half as large as the one before")
-    max_iterations: int = Field(50, ge=1, le=1000, description="steps at each level of the pyramid")
+    max_iterations: int = Field(30, ge=1, le=1000, description="steps at each level of the pyramid")
     converged_px: float = Field(0.01, gt=0, le=1, description="the alignment is done when a step moves no corner further")
     min_overlap: float = Field(0.1, gt=0, le=1, description="the least share of the image that both exposures must see")
     min_zncc: float = Field(

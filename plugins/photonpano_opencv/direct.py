@@ -44,31 +44,36 @@ class DirectLocator:
             `NotLocated` with the numbers that decided when the alignment diverges, when too little overlaps, or when the images
             do not look alike after it.
         """
-        config = self._config
         if not (moving[-1].weight.any() and fixed[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
         homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
-        shape = moving[0].image.shape
         for depth in reversed(range(len(moving))):
             template = Template(moving[depth])
-            free = _model(depth, len(moving), initial is not None)
             scale = 0.5**depth
-            local = rescaled(homography, scale)
-            tolerance = config.converged_px * (1 if depth == 0 else _COARSE_TOLERANCE)
-            for _ in range(config.max_iterations):
-                step = template.step(local, fixed[depth], free, config.blur_px * scale)
-                if step is None:
-                    return NotLocated("where the images overlap, if they do, there is no texture")
-                local = normalised(local @ inverse(step))
-                if reason := implausibility(rescaled(local, 1 / scale), shape, config.min_overlap):
-                    return NotLocated(f"the alignment diverges at level {depth} of the pyramid: {reason}")
-                if template.size_px(step) < tolerance:
-                    break
-            else:
-                if depth == 0:
-                    return NotLocated(f"the alignment has not settled after {config.max_iterations} steps")
-            homography = rescaled(local, 1 / scale)
+            found = self._aligned(template, rescaled(homography, scale), fixed[depth], _model(depth, len(moving)), depth == 0)
+            if not isinstance(found, str):
+                homography = rescaled(found, 1 / scale)
+            elif depth == 0:
+                # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
+                return NotLocated(found)
         return self._judged(template, homography, fixed[0])
+
+    def _aligned(
+        self, template: Template, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], finest: bool
+    ) -> NDArray[np.float64] | str:
+        """Return the homography, in px of the layers, that aligns two layers, or why there is none."""
+        config = self._config
+        tolerance = config.converged_px * (1 if finest else _COARSE_TOLERANCE)
+        for _ in range(config.max_iterations):
+            step = template.step(homography, fixed, free)
+            if step is None:
+                return "where the images overlap, if they do, there is no texture"
+            homography = normalised(homography @ inverse(step))
+            if reason := implausibility(homography, fixed.image.shape, config.min_overlap):
+                return f"the alignment diverges: {reason}"
+            if template.size_px(step) < tolerance:
+                return homography
+        return f"the alignment has not settled after {config.max_iterations} steps"
 
     def _judged(self, template: Template, homography: NDArray[np.float64], fixed: Layer) -> Located | NotLocated:
         quality = template.quality(homography, fixed, self._config.blur_px)
@@ -88,12 +93,10 @@ class DirectLocator:
         return Located(homography, quality.information, _std_px(quality.information, corner_jacobian), evidence)
 
 
-def _model(depth: int, levels: int, known: bool) -> tuple[int, ...]:
-    """Return which of p1..p8 are free at a level of the pyramid."""
-    from_coarsest = levels - 1 - depth
-    if not known and from_coarsest < len(_COARSE_MODELS):
-        return _COARSE_MODELS[from_coarsest]
-    return ALL
+def _model(depth: int, layers: int) -> tuple[int, ...]:
+    """Return which of p1..p8 are free in a layer of the pyramid; few pixels bear few parameters."""
+    from_coarsest = layers - 1 - depth
+    return _COARSE_MODELS[from_coarsest] if depth > 0 and from_coarsest < len(_COARSE_MODELS) else ALL
 
 
 def _by_phase(moving: Layer, fixed: Layer, levels: int) -> NDArray[np.float64]:

@@ -41,17 +41,16 @@ def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[
         blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
     """
     known = exposure.weight > 0
-    # arcsin(sqrt(k / n)) has the variance 1 / (4 n), whatever the flux.
-    precision = np.zeros(known.shape, dtype=np.float32)
-    precision[known] = exposure.response.stabilised_std(exposure.weight[known]) ** -2.0
-    stabilised = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0))
-    smooth = cv2.GaussianBlur(stabilised * precision, (0, 0), blur_px)
-    norm = cv2.GaussianBlur(precision, (0, 0), blur_px)
-    image = np.divide(smooth, norm, out=np.zeros_like(smooth), where=norm > 0)
+    stabilised = np.where(known, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(0))
+    variance = np.zeros(known.shape, dtype=np.float32)
+    variance[known] = exposure.response.stabilised_std(exposure.weight[known]) ** 2
+    # Blurred alike everywhere: more weight for pixels that more frames saw would shift what lies between them.
+    image, variance = (cv2.GaussianBlur(each, (0, 0), blur_px) for each in (stabilised, variance))
     border = int(np.ceil(_BORDER * blur_px))
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
-    inside = cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    layers = [Layer(image, precision * inside)]
+    inside = cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    weight = np.divide(1, variance, out=np.zeros_like(variance), where=inside)
+    layers = [Layer(np.asarray(image, dtype=np.float32), weight)]
     while len(layers) < levels and min(layers[-1].image.shape) >= 2 * _SMALLEST_SIDE:
         layers.append(_halved(layers[-1]))
     return tuple(layers)

@@ -18,10 +18,12 @@ if TYPE_CHECKING:
 
 ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 """All of p1..p8."""
-_BOLDEST = 0.2
-"""The curvature of the scene is taken to be at least this share of what is seen, so that steps in the dark stay bounded."""
+_BOLDEST = 0.3
+"""The curvature common to both images is taken to be at least this share of the template's, so that steps stay bounded."""
 _UNKNOWN = 1e-3
-"""Where noise exceeds the scene, next to nothing is known: this share of the least curvature that is seen."""
+"""Where noise exceeds the scene, next to nothing is known: this share of the template's curvature."""
+_RENEWED_PX = 0.25
+"""The curvature is taken anew until steps are smaller than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,22 +61,19 @@ class Template:
         self._powers = _powers(width, half), _powers(height, half)
         self._hessian: NDArray[np.float64] | None = None
 
-    def step(
-        self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], blur_px: float
-    ) -> NDArray[np.float64] | None:
+    def step(self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...]) -> NDArray[np.float64] | None:
         """Return the small homography of the template's frame that explains what differs; None without overlap or texture.
 
         Args:
             homography: (3, 3), pixels of the template to pixels of the fixed layer.
             fixed: what the template is aligned to.
             free: which of p1..p8 may change; the same in every call.
-            blur_px: the blur of the images, in px of the layer.
         """
         residual, weight = self._residual(homography, fixed)
         if self._hessian is None:
             if not weight.any():
                 return None
-            self._hessian = self._curvature(weight, blur_px, _BOLDEST)[np.ix_(free, free)]
+            self._hessian = self._curvature(residual, weight, _BOLDEST)[np.ix_(free, free)]
         weighted = residual * weight
         along_x, along_y = self._moments(weighted * self._gx, 3), self._moments(weighted * self._gy, 3)
         gradient = np.einsum("aij,ij->a", _ALONG_X, along_x) + np.einsum("aij,ij->a", _ALONG_Y, along_y)
@@ -83,7 +82,10 @@ class Template:
             p[list(free)] = np.linalg.solve(self._hessian, gradient[list(free)])
         except np.linalg.LinAlgError:
             return None
-        return np.asarray(self._from_unit @ from_parameters(p) @ self._unit)
+        step = np.asarray(self._from_unit @ from_parameters(p) @ self._unit)
+        if self.size_px(step) > _RENEWED_PX:
+            self._hessian = None
+        return step
 
     def size_px(self, step: NDArray[np.float64]) -> float:
         """Return how far a step moves the corners of the template at most, in px of its layer."""
@@ -104,7 +106,7 @@ class Template:
         noise_ratio = float(np.mean(residual[seen] ** 2)) * 4 * np.pi * blur_px**2 / variance
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
-        hessian = self._curvature(weight, blur_px, _UNKNOWN)
+        hessian = self._curvature(residual, weight, _UNKNOWN)
         bx, by = (cv2.GaussianBlur(weight * gradient, (0, 0), blur_px) for gradient in (self._gx, self._gy))
         scatter = self._quadratic(bx * bx, bx * by, by * by) * variance
         information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio)
@@ -118,35 +120,38 @@ class Template:
     def _residual(self, homography: NDArray[np.float64], fixed: Layer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the fixed image seen from the template minus the template, and the inverse variance of the difference."""
         height, width = self._layer.image.shape
-        # Linear interpolation would blur one image and not the other, which looks like a change of scale.
-        cubic, linear = (kind | cv2.WARP_INVERSE_MAP for kind in (cv2.INTER_CUBIC, cv2.INTER_LINEAR))
-        seen = cv2.warpPerspective(fixed.image, homography, (width, height), flags=cubic)
-        weight = cv2.warpPerspective(fixed.weight, homography, (width, height), flags=linear)
+        # Linear, because OpenCV's cubic kernel bends even a ramp by up to 0.05 px, which would bend the homography.
+        seen, weight = (
+            cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            for image in (fixed.image, fixed.weight)
+        )
         both = self._layer.weight + weight
         combined = np.divide(self._layer.weight * weight, both, out=np.zeros_like(both), where=both > 0)
         return seen - self._layer.image, combined
 
-    def _curvature(self, weight: NDArray[np.float32], blur_px: float, least: float) -> NDArray[np.float64]:
-        """Return the (8, 8) curvature that the scene causes, without that of the noise, which has gradients too.
+    def _curvature(self, residual: NDArray[np.float32], weight: NDArray[np.float32], least: float) -> NDArray[np.float64]:
+        """Return the (8, 8) curvature that both images have in common: that of the scene.
+
+        The noise of the template has gradients too, and in the dark larger ones than the scene. With those of the other image
+        it has nothing in common.
 
         Args:
-            weight: (H, W) inverse variance of a pixel of the difference.
-            blur_px: the blur of the images, in px of the layer.
-            least: what is left of a direction in which there is more noise than scene, as a share of what is seen.
+            residual: (H, W) the fixed image seen from the template minus the template.
+            weight: (H, W) inverse variance of a pixel of the residual.
+            least: what is left of a direction in which there is nothing in common, as a share of the template's curvature.
         """
         gx, gy = self._gx, self._gy
-        seen = self._quadratic(weight * gx * gx, weight * gx * gy, weight * gy * gy)
-        noise = np.divide(weight, self._layer.weight, out=np.zeros_like(weight), where=self._layer.weight > 0)
-        # Variance of a central difference of white noise after a Gaussian; a narrow one leaves pixels as they are.
-        noise *= self._half**2 * 0.5 * (1 - np.exp(-1 / blur_px**2)) * min(1.0, 1 / (4 * np.pi * blur_px**2))
-        floor = self._quadratic(noise, np.zeros_like(noise), noise)
-        # In units in which what is seen is the identity, so that no parameter drowns another.
+        wx, wy = weight * gx, weight * gy
+        own = self._quadratic(wx * gx, wx * gy, wy * gy)
+        dx, dy = (np.float32(self._half) * gradient for gradient in _gradients(residual))
+        difference = self._quadratic(wx * dx, (wx * dy + wy * dx) / 2, wy * dy)
+        # In units in which the template's is the identity, so that no parameter drowns another.
         try:
-            root = np.linalg.cholesky(seen)
+            root = np.linalg.cholesky(own)
         except np.linalg.LinAlgError:
-            return seen
+            return own
         whitening = np.linalg.inv(root)
-        values, vectors = np.linalg.eigh(np.eye(8) - whitening @ floor @ whitening.T)
+        values, vectors = np.linalg.eigh(np.eye(8) + whitening @ difference @ whitening.T)
         half = root @ (vectors * np.sqrt(np.maximum(values, least)))
         return np.asarray(half @ half.T)
 

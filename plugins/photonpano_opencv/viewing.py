@@ -36,9 +36,9 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
         The image, (H, W) uint8, and the mask of pixels that were seen, (H, W) uint8, 0 or 255.
     """
     known = exposure.weight > 0
-    # Each pixel weighs by how well it is known, so that nothing leaks in from where nothing was seen.
-    weight = np.where(known, exposure.weight, np.float32(0))
-    weighted = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0)) * weight
+    # Nothing leaks in from where nothing was seen. More weight for pixels that more frames saw would shift what lies between.
+    weight = known.astype(np.float32)
+    weighted = np.where(known, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(0))
     if blur_px > 0:
         weighted = cv2.GaussianBlur(weighted, (0, 0), blur_px)
         weight = cv2.GaussianBlur(weight, (0, 0), blur_px)

@@ -21,7 +21,7 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
     known = exposure.weight > 0
     if not known.any():
         return 0.0
-    values = np.where(known, exposure.response.stabilised(exposure.flux), np.float32(0))
+    values = np.where(known, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(0))
     sums, counts = _block_sums(values), _block_sums(known.astype(np.float32))
     full = counts == _BLOCK**2
     if np.count_nonzero(full) < 2:

@@ -30,9 +30,14 @@ class BinaryResponse:
         ceiling = 1 - 0.5 / np.maximum(frames, 1)
         return np.asarray(-np.log1p(-np.clip(mean_count, 0, ceiling)), dtype=np.float32)
 
-    def stabilised(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return `arcsin(sqrt(mean_count))`, from 0 to pi/2, which makes binomial noise uniform (Anscombe 1948)."""
-        return np.asarray(np.arcsin(np.sqrt(np.clip(self.mean_count(flux), 0, 1))), dtype=np.float32)
+    def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return `arcsin(sqrt((k + 3/8) / (n + 3/4)))` of k counts in n frames, from 0 to pi/2 (Anscombe 1948).
+
+        It makes binomial noise uniform. Without the two fractions the mean would fall with the number of frames in the
+        dark: the ends of a merged exposure, which few frames saw, would look darker than they are.
+        """
+        counts = np.clip(self.mean_count(flux), 0, 1) * frames
+        return np.asarray(np.arcsin(np.sqrt((counts + 0.375) / (frames + np.float32(0.75)))), dtype=np.float32)
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `1 / (2 sqrt(frames))`."""

@@ -27,8 +27,11 @@ class Response(Protocol):
         """Return the maximum-likelihood flux of a mean count over so many frames; finite for finite input."""
         ...
 
-    def stabilised(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Map flux to a scale on which its noise is the same everywhere: see `stabilised_std`."""
+    def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Map flux estimated from so many frames to a scale on which its noise is the same everywhere: see `stabilised_std`.
+
+        The mean does not depend on the number of frames, so that exposures of different lengths look alike.
+        """
         ...
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:

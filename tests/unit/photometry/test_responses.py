@@ -44,9 +44,20 @@ def test_noise_is_uniform_on_the_stabilised_scale(frames: int) -> None:
     flux = f32(0.2, 0.5, 1.0, 2.0)[:, None]
     rng = np.random.default_rng(0)
     counts = rng.binomial(frames, -np.expm1(-flux.astype(float)), (4, 20_000))
-    stabilised = RESPONSE.stabilised(RESPONSE.flux((counts / frames).astype(np.float32), frames))
+    stabilised = RESPONSE.stabilised(RESPONSE.flux((counts / frames).astype(np.float32), frames), frames)
     np.testing.assert_allclose(stabilised.std(axis=1), float(RESPONSE.stabilised_std(frames)), rtol=0.03)
 
 
 def test_the_stabilised_scale_runs_from_zero_to_a_right_angle() -> None:
-    np.testing.assert_allclose(RESPONSE.stabilised(f32(0, np.log(2), 100)), [0, np.pi / 4, np.pi / 2], atol=1e-6)
+    np.testing.assert_allclose(RESPONSE.stabilised(f32(0, np.log(2), 100), 1e6), [0, np.pi / 4, np.pi / 2], atol=2e-3)
+
+
+def test_few_frames_in_the_dark_look_as_bright_as_many() -> None:
+    """Four counts in forty frames, on average, and 40 in 400; the means of 200,000 draws are known to 0.0003."""
+    rng = np.random.default_rng(0)
+    few, many = (
+        RESPONSE.stabilised(RESPONSE.flux((rng.binomial(n, 0.1, 200_000) / n).astype(np.float32), n), n).mean()
+        for n in (40, 400)
+    )
+    assert few == pytest.approx(many, abs=0.004)
+    assert np.arcsin(np.sqrt(rng.binomial(40, 0.1, 200_000) / 40)).mean() < many - 0.008
