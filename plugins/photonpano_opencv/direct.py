@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import corners, implausibility, inverse, jacobian, normalised, rescaled, translation
+from photonpano.geometry import implausibility, inverse, normalised, rescaled, translation
 from photonpano_opencv.pyramid import pyramid_of
 from photonpano_opencv.template import ALL, Template
 
@@ -47,16 +47,19 @@ class DirectLocator:
         if not (moving[-1].weight.any() and fixed[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
         homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
+        best: tuple[float, Located | NotLocated] = np.inf, NotLocated("")
         for depth in reversed(range(len(moving))):
-            template = Template(moving[depth])
-            scale = 0.5**depth
-            found = self._aligned(template, rescaled(homography, scale), fixed[depth], _model(depth, len(moving)), depth == 0)
+            template, free, scale = Template(moving[depth]), _model(depth, len(moving)), 0.5**depth
+            found = self._aligned(template, rescaled(homography, scale), fixed[depth], free, depth == 0)
             if not isinstance(found, str):
                 homography = rescaled(found, 1 / scale)
-            elif depth == 0:
+                if free == ALL:
+                    # Photons blurred by motion say nothing about details, whose noise a coarse layer averages out.
+                    best = min(best, self._judged(template, found, fixed[depth], scale), key=lambda judged: judged[0])
+            elif depth == 0 and best[0] == np.inf:
                 # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
                 return NotLocated(found)
-        return self._judged(template, homography, fixed[0])
+        return best[1]
 
     def _aligned(
         self, template: Template, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], finest: bool
@@ -75,22 +78,32 @@ class DirectLocator:
                 return homography
         return f"the alignment has not settled after {config.max_iterations} steps"
 
-    def _judged(self, template: Template, homography: NDArray[np.float64], fixed: Layer) -> Located | NotLocated:
-        quality = template.quality(homography, fixed, self._config.blur_px)
-        evidence = {"zncc": quality.zncc, "noise_ratio": quality.noise_ratio, "overlap": quality.overlap}
-        if quality.zncc < self._config.min_zncc:
-            return NotLocated(
-                f"after alignment the images correlate by {quality.zncc:.2f}, less than min_zncc = {self._config.min_zncc:g}",
-                evidence,
-            )
-        if quality.noise_ratio > self._config.max_noise_ratio:
-            return NotLocated(
+    def _judged(
+        self, template: Template, homography: NDArray[np.float64], fixed: Layer, scale: float
+    ) -> tuple[float, Located | NotLocated]:
+        """Return the expected error of a corner, in px of the finest layer, and what is to be said of the pair."""
+        quality, config = template.quality(homography, fixed), self._config
+        evidence = {
+            "zncc": quality.zncc,
+            "noise_ratio": quality.noise_ratio,
+            "overlap": quality.overlap,
+            "pixel": 1 / scale,
+        }
+        std_px = quality.std_px / scale
+        if quality.zncc < config.min_zncc:
+            reason = f"after alignment the images correlate by {quality.zncc:.2f}, less than min_zncc = {config.min_zncc:g}"
+        elif quality.noise_ratio > config.max_noise_ratio:
+            reason = (
                 f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, "
-                f"more than max_noise_ratio = {self._config.max_noise_ratio:g}",
-                evidence,
+                f"more than max_noise_ratio = {config.max_noise_ratio:g}"
             )
-        corner_jacobian = jacobian(homography, corners(fixed.image.shape)).reshape(8, 8)
-        return Located(homography, quality.information, _std_px(quality.information, corner_jacobian), evidence)
+        elif std_px > config.max_std_px:
+            reason = f"the photons tell where corners lie to {std_px:.2g} px, worse than max_std_px = {config.max_std_px:g}"
+        else:
+            units = np.array([1, 1, 1, 1, scale, scale, 1 / scale, 1 / scale])
+            information = quality.information * np.outer(units, units)
+            return std_px, Located(rescaled(homography, 1 / scale), information, std_px, evidence)
+        return std_px, NotLocated(reason, evidence)
 
 
 def _model(depth: int, layers: int) -> tuple[int, ...]:
@@ -106,9 +119,3 @@ def _by_phase(moving: Layer, fixed: Layer, levels: int) -> NDArray[np.float64]:
     flat = [np.where(layer.weight > 0, layer.image - layer.image[layer.weight > 0].mean(), 0) for layer in (moving, fixed)]
     (x, y), _ = cv2.phaseCorrelate(flat[0].astype(np.float32), flat[1].astype(np.float32), window)
     return rescaled(translation(x, y), 2.0 ** (levels - 1))
-
-
-def _std_px(information: NDArray[np.float64], to_corners: NDArray[np.float64]) -> float:
-    """Return the expected distance of a corner from where it should be, in px."""
-    covariance = to_corners @ np.linalg.inv(information) @ to_corners.T
-    return float(np.sqrt(np.trace(covariance) / 4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,10 +27,13 @@ class Layer:
     Attributes:
         image: (H, W) float32, variance-stabilised and blurred.
         weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
+        blur_px: standard deviation of the Gaussian that leaves as much of white noise as the blur and the halving did, in px
+            of the layer.
     """
 
     image: NDArray[np.float32]
     weight: NDArray[np.float32]
+    blur_px: float
 
 
 def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[Layer, ...]:
@@ -45,22 +49,33 @@ def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[
     variance = np.zeros(known.shape, dtype=np.float32)
     variance[known] = exposure.response.stabilised_std(exposure.weight[known]) ** 2
     # Blurred alike everywhere: more weight for pixels that more frames saw would shift what lies between them.
-    image, variance = (cv2.GaussianBlur(each, (0, 0), blur_px) for each in (stabilised, variance))
+    image, blurred_variance = (cv2.GaussianBlur(each, (0, 0), blur_px) for each in (stabilised, variance))
     border = int(np.ceil(_BORDER * blur_px))
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
     inside = cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    weight = np.divide(1, variance, out=np.zeros_like(variance), where=inside)
-    layers = [Layer(np.asarray(image, dtype=np.float32), weight)]
+    weight = np.divide(1, blurred_variance, out=np.zeros_like(variance), where=inside)
+    layers = [Layer(np.asarray(image, dtype=np.float32), weight, _equivalent_blur_px(blur_px, 1))]
     while len(layers) < levels and min(layers[-1].image.shape) >= 2 * _SMALLEST_SIDE:
-        layers.append(_halved(layers[-1]))
+        layers.append(_halved(layers[-1], _equivalent_blur_px(blur_px, 2 ** len(layers))))
     return tuple(layers)
 
 
-def _halved(layer: Layer) -> Layer:
+def _equivalent_blur_px(blur_px: float, factor: int) -> float:
+    """Return the blur of a layer of pixels `factor` times as large, in px of the layer.
+
+    A Gaussian of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
+    """
+    kernel = cv2.getGaussianKernel(2 * math.ceil(4 * blur_px) + 1, blur_px).ravel()
+    averaged = np.convolve(kernel, np.full(factor, 1 / factor))
+    left = factor**2 * float(np.sum(averaged**2)) ** 2
+    return 1 / math.sqrt(4 * math.pi * left)
+
+
+def _halved(layer: Layer, blur_px: float) -> Layer:
     """Average squares of four pixels; a square counts if all of it was seen."""
     height, width = (side // 2 * 2 for side in layer.image.shape)
     size = (width // 2, height // 2)
     image = np.asarray(cv2.resize(layer.image[:height, :width], size, interpolation=cv2.INTER_AREA), dtype=np.float32)
     weight = cv2.resize(layer.weight[:height, :width], size, interpolation=cv2.INTER_AREA)
     whole = cv2.resize((layer.weight[:height, :width] > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return Layer(image, np.where(whole == 1, 4 * weight, np.float32(0)))
+    return Layer(image, np.where(whole == 1, 4 * weight, np.float32(0)), blur_px)

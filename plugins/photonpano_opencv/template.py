@@ -35,9 +35,11 @@ class Quality:
         zncc: correlation of the images where they overlap.
         noise_ratio: mean square of their difference over that which photon noise makes.
         overlap: share of the template that both see.
+        std_px: expected distance of a corner from where it should be, in px of the layer.
     """
 
     information: NDArray[np.float64]
+    std_px: float
     zncc: float
     noise_ratio: float
     overlap: float
@@ -93,7 +95,7 @@ class Template:
         moved = np.concatenate([frame, np.ones((4, 1))], axis=1) @ step.T
         return float(np.abs(moved[:, :2] / moved[:, 2:] - frame).max())
 
-    def quality(self, homography: NDArray[np.float64], fixed: Layer, blur_px: float) -> Quality:
+    def quality(self, homography: NDArray[np.float64], fixed: Layer) -> Quality:
         """Return how well the images agree, and what their photons tell about p1..p8 of `homography`."""
         residual, weight = self._residual(homography, fixed)
         seen = weight > 0
@@ -103,15 +105,18 @@ class Template:
         spread = float(np.sqrt(np.mean(here**2) * np.mean(there**2)))
         # White noise, and what the blur leaves of it in a pixel.
         variance = float(np.median(1 / weight[seen]))
-        noise_ratio = float(np.mean(residual[seen] ** 2)) * 4 * np.pi * blur_px**2 / variance
+        noise_ratio = float(np.mean(residual[seen] ** 2)) * 4 * np.pi * self._layer.blur_px**2 / variance
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
         hessian = self._curvature(residual, weight, _UNKNOWN)
-        bx, by = (cv2.GaussianBlur(weight * gradient, (0, 0), blur_px) for gradient in (self._gx, self._gy))
+        bx, by = (cv2.GaussianBlur(weight * gradient, (0, 0), self._layer.blur_px) for gradient in (self._gx, self._gy))
         scatter = self._quadratic(bx * bx, bx * by, by * by) * variance
         information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio)
+        in_parameters = self._in_parameters(homography, information)
+        to_corners = jacobian(homography, corners(self._layer.image.shape)).reshape(8, 8)
         return Quality(
-            information=self._in_parameters(homography, information),
+            information=in_parameters,
+            std_px=float(np.sqrt(np.trace(to_corners @ np.linalg.inv(in_parameters) @ to_corners.T) / 4)),
             zncc=float(np.mean(here * there)) / max(spread, 1e-12),
             noise_ratio=noise_ratio,
             overlap=float(seen.mean()),

@@ -40,8 +40,7 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     weight = known.astype(np.float32)
     weighted = np.where(known, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(0))
     if blur_px > 0:
-        weighted = cv2.GaussianBlur(weighted, (0, 0), blur_px)
-        weight = cv2.GaussianBlur(weight, (0, 0), blur_px)
+        weighted, weight = (np.asarray(cv2.GaussianBlur(each, (0, 0), blur_px), np.float32) for each in (weighted, weight))
     image = weighted / np.maximum(weight, 1e-6)
     mask = np.where(known, np.uint8(255), np.uint8(0))
     if not known.any():
