@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from photonpano_core.configs import MidpointConfig
 
 
+_SHORTEST = 16
+"""The groups at the ends get no shorter than this, in frames: too few photons tell nothing."""
+
+
 class MidpointResampler:
     """floor(n / m) groups at the first level; each further level adds one centred between every two."""
 
@@ -19,12 +23,12 @@ class MidpointResampler:
         self._config = config
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        """Return k = floor(n / m) groups at level 1, 2k - 1 at level 2, 4k - 3 at level 3, ..., and the two end groups.
+        """Return k = floor(n / m) groups at level 1, 2k - 1 at level 2, 4k - 3 at level 3, ..., and shorter ones at the ends.
 
         The k groups are spread evenly, so that the first starts at frame 0 and the last ends with the capture; frames that do
-        not fill a group are left out between groups at level 1, never at one end. References are the centres, but for the
-        end groups, whose references are the first and the last frame. No instant comes twice: where groups start at every
-        frame, there is nothing between them.
+        not fill a group are left out between groups at level 1, never at one end. Every reference is the centre of its
+        group. Each further level halves what remains beyond the first and the last reference, by a group of m / 2, of m / 4,
+        ... frames. No instant comes twice: where groups start at every frame, there is nothing between them.
 
         Raises:
             InputError: the capture has fewer frames than a group.
@@ -38,11 +42,14 @@ class MidpointResampler:
         if count == 1:
             starts = np.array([(n_frames - size) // 2])
         spans = [FrameSpan(int(start), int(start) + size) for start in starts]
-        groups = [Group(span, span.centre) for span in spans]
-        if level > 1 and self._config.endpoints and size > 1:
-            first, last = FrameSpan(0, size), FrameSpan(n_frames - size, n_frames)
-            groups = [Group(first, 0.0), *groups, Group(last, float(n_frames - 1))]
-        return tuple(groups)
+        if self._config.endpoints:
+            halves = [size >> step for step in range(level - 1, 0, -1) if size >> step >= _SHORTEST]
+            spans = [
+                *(FrameSpan(0, half) for half in halves),
+                *spans,
+                *(FrameSpan(n_frames - half, n_frames) for half in reversed(halves)),
+            ]
+        return tuple(Group(span, span.centre) for span in spans)
 
 
 def too_short(group_size: int, n_frames: int) -> str | None:

@@ -26,10 +26,21 @@ def test_the_first_level_fills_the_capture_side_by_side() -> None:
     assert [group.reference for group in found] == [49.5, 149.5, 249.5, 349.5]
 
 
-def test_the_second_level_adds_a_group_between_every_two_and_one_at_each_end() -> None:
+def test_each_level_adds_a_group_between_every_two_and_a_shorter_one_at_each_end() -> None:
     found = groups(400, 2)
-    assert [group.span for group in found] == spans(0, 0, 50, 100, 150, 200, 250, 300, 300)
-    assert [group.reference for group in found] == [0, 49.5, 99.5, 149.5, 199.5, 249.5, 299.5, 349.5, 399]
+    assert [group.span for group in found] == [FrameSpan(0, 50), *spans(0, 50, 100, 150, 200, 250, 300), FrameSpan(350, 400)]
+    assert [group.reference for group in found] == [24.5, 49.5, 99.5, 149.5, 199.5, 249.5, 299.5, 349.5, 374.5]
+    ends = groups(400, 3)
+    assert [group.span for group in (*ends[:2], *ends[-2:])] == [
+        FrameSpan(0, 25),
+        FrameSpan(0, 50),
+        FrameSpan(350, 400),
+        FrameSpan(375, 400),
+    ]
+
+
+def test_groups_at_the_ends_get_no_shorter_than_16_frames() -> None:
+    assert min(len(group.span) for group in groups(400, 9)) == 25
 
 
 def test_frames_that_fill_no_group_are_left_out_between_groups() -> None:
@@ -38,12 +49,12 @@ def test_frames_that_fill_no_group_are_left_out_between_groups() -> None:
 
 def test_a_single_group_lies_in_the_middle() -> None:
     assert [group.span for group in groups(160, 1)] == spans(30)
-    assert [group.reference for group in groups(160, 2)] == [0, 79.5, 159]
+    assert [group.reference for group in groups(160, 2)] == [24.5, 79.5, 134.5]
 
 
 @pytest.mark.parametrize(("level", "count"), [(1, 10), (2, 19), (3, 37), (4, 73)])
 def test_levels_get_denser_as_in_the_paper(level: int, count: int) -> None:
-    ends = 2 if level > 1 else 0
+    ends = 2 * min(level - 1, 2)
     assert len(groups(1000, level)) == count + ends
     assert len(groups(1000, level, endpoints=False)) == count
 
@@ -57,14 +68,14 @@ def test_the_ablation_keeps_the_number_of_groups(level: int) -> None:
 def test_any_capture_is_covered_evenly(group_size: int, more: int, level: int) -> None:
     n_frames = group_size + more
     found = groups(n_frames, level, group_size)
-    assert all(len(group.span) == group_size and group.span.stop <= n_frames for group in found)
+    assert all(min(16, group_size) <= len(group.span) <= group_size and group.span.stop <= n_frames for group in found)
+    assert all(group.reference == group.span.centre for group in found)
     references = [group.reference for group in found]
     assert all(earlier < later for earlier, later in pairwise(references))
-    if level > 1:
-        assert (references[0], references[-1]) == (0, n_frames - 1)
+    if level > 1 and group_size >= 32:
         assert (found[0].span.start, found[-1].span.stop) == (0, n_frames)
     centred = groups(n_frames, level, group_size, endpoints=False)
-    assert all(group.reference == group.span.centre for group in centred)
+    assert all(len(group.span) == group_size for group in centred)
     count = n_frames // group_size
     distance = (n_frames - group_size) / max(1, (count - 1) * 2 ** (level - 1))
     if distance >= 1:
