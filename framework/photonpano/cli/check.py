@@ -20,5 +20,5 @@ def check(spec: Spec, overrides: Overrides = None) -> None:
     plan = load_spec(spec, overrides or ())
     with open_source(plan) as source:
         count = len(plan.levels)
-        levels = f"{count} level{'' if count == 1 else 's'}"
+        levels = f"{'up to ' if plan.until_converged else ''}{count} level{'' if count == 1 else 's'}"
         typer.echo(f"{spec}: ok, {levels} on {plan.source.contribution.name}: {capture_words(source.info)}")

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from photonpano.registry import Catalog
     from photonpano.spec import Plan
 
+FORETOLD = 3
+"""How many levels are described of a plan whose number of levels is open."""
+
 
 def explain(spec: Spec, overrides: Overrides = None) -> None:
     """Print a spec as it will run, with all defaults.
@@ -33,12 +36,15 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
     predictions = []
     with open_source(plan) as source:
         capture = capture_words(source.info)
-        for level in build_levels(plan, source):
+        for level in build_levels(plan, source)[: FORETOLD if plan.until_converged else None]:
             groups = level.resampler.groups(source.info.n_frames, level.number)
             sizes = sorted({len(group.span) for group in groups})
             frames = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
             pairs = len(pairs_of(groups, plan.graph.skips))
             predictions.append(f"level {level.number}: {len(groups)} groups of {frames} frames, {pairs} pairs")
+    if plan.until_converged:
+        predictions.insert(0, f"up to {len(plan.levels)} levels, until the motion has settled")
+        predictions.append("each further level: about twice the groups and pairs of the one before")
     typer.echo(f"# {spec} as it will run, on {capture}")
     typer.echo("\n".join(_Writer(plan, catalog, predictions).lines()))
 
@@ -46,17 +52,20 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
 class _Writer:
     """Writes a resolved spec as YAML with comments."""
 
-    def __init__(self, plan: "Plan", catalog: "Catalog", levels: Sequence[str]) -> None:
+    def __init__(self, plan: "Plan", catalog: "Catalog", predictions: Sequence[str]) -> None:
         self._plan = plan
         self._catalog = catalog
-        self._levels = levels
+        self._predictions = predictions
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of the whole spec."""
         for section, value in self._plan.document.items():
-            if section == "levels":
+            if section == "levels" and self._plan.until_converged:
+                yield from (f"# {comment}" for comment in self._predictions)
+                yield from self._mapping({section: value}, "", "")
+            elif section == "levels":
                 yield "levels:"
-                for index, (level, comment) in enumerate(zip(value, self._levels, strict=True)):
+                for index, (level, comment) in enumerate(zip(value, self._predictions, strict=True)):
                     yield f"  # {comment}"
                     yield from self._item(level, f"levels.{index}", "  ")
             else:

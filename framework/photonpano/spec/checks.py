@@ -25,10 +25,11 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         The problems, each at its place in the spec; empty if there are none.
     """
     sentences: dict[tuple[str, str], str] = {}
-    for index, (level, written) in enumerate(zip(plan.levels, plan.document["levels"], strict=True)):
+    own = [{}] * len(plan.levels) if plan.until_converged else plan.document["levels"]
+    for index, (level, written) in enumerate(zip(plan.levels, own, strict=True)):
         choices = {f"levels.{index}.{stage}" if stage in written else stage: getattr(level, stage) for stage in STAGES}
-        own = f"levels.{index}.locate.fallback"
-        fallback = own if f"{own}.0" in plan.places else "locate.fallback"
+        replaced = f"levels.{index}.locate.fallback"
+        fallback = replaced if f"{replaced}.0" in plan.places else "locate.fallback"
         choices |= {f"{fallback}.{rank}": choice for rank, choice in enumerate(level.fallbacks)}
         for where, choice in choices.items():
             for sentence in complaints(choice, info):

@@ -9,7 +9,7 @@ from pydantic.json_schema import models_json_schema
 
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.wording import TolerantJsonSchema
-from photonpano.spec.resolution import DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, VERSION
+from photonpano.spec.resolution import DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
 from photonpano.spec.settings import LevelSettings, OutputSettings
 
 if TYPE_CHECKING:
@@ -54,10 +54,11 @@ def json_schema(catalog: Catalog) -> Schema:
             "version": {"const": VERSION, "description": "the version of the format"},
             **sections,
             "levels": {
-                "description": "how many levels, or one entry a level that overrides stages for that level",
+                "description": "how many levels, as many as it takes, or an entry for each level that overrides stages for it",
                 "default": LEVELS,
                 "anyOf": [
                     {"type": "integer", "minimum": 1, "maximum": MAX_LEVELS},
+                    {"const": UNTIL_CONVERGED},
                     {"type": "array", "minItems": 1, "maxItems": MAX_LEVELS, "items": schemas[LevelSettings]},
                 ],
             },

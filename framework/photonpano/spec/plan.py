@@ -62,6 +62,7 @@ class Plan:
     Attributes:
         source: the capture.
         levels: one plan for each level, in order.
+        until_converged: the loop ends once the motion has settled, at the latest after the last of `levels`, all of them alike.
         graph: which pairs are registered, and what happens when the graph falls apart.
         render: the panorama.
         output: the run folder.
@@ -73,6 +74,7 @@ class Plan:
 
     source: Choice[SourceContribution[Any]]
     levels: tuple[LevelPlan, ...]
+    until_converged: bool
     graph: GraphSettings
     render: RenderSettings
     output: OutputSettings

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 VERSION = 1
 LEVELS = 3
-MAX_LEVELS = 10
+MAX_LEVELS = 8
+UNTIL_CONVERGED = "until-converged"
+"""Instead of a number of levels: as many as it takes, `MAX_LEVELS` at most."""
 DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "opencv-sift", "interpolate": "lucas-kanade"}
 """The components of a spec that does not choose."""
 KIND_OF = {kind.section: kind for kind in KINDS.values()}
@@ -100,10 +102,19 @@ class _Resolver:
             self.problems += map(sections["source"].head.problem, complaints(source))
         stages = {name: self.select(name, sections[name]) for name in STAGES}
         levels = [self.level(each, stages) for each in self.levels(sections["levels"])]
+        until_converged = sections["levels"].content == UNTIL_CONVERGED
         settings: dict[str, Any] = {name: self.validated(model, sections[name]) for name, model in SETTINGS.items()}
         if source is None or self.problems:
             return None
-        plan = Plan(source, tuple(filter(None, levels)), **settings, document={}, places=self.places, file=self.root.head.file)
+        plan = Plan(
+            source,
+            tuple(filter(None, levels)),
+            until_converged,
+            **settings,
+            document={},
+            places=self.places,
+            file=self.root.head.file,
+        )
         return replace(plan, document=self.document(plan, stages))
 
     def version(self, value: Value | None) -> None:
@@ -234,9 +245,11 @@ class _Resolver:
         content = LEVELS if value.content is None else value.content
         if type(content) is int and 1 <= content <= MAX_LEVELS:
             return [Value({}, value.place)] * content
+        if content == UNTIL_CONVERGED:
+            return [Value({}, value.place)] * MAX_LEVELS
         if isinstance(content, list) and 1 <= len(content) <= MAX_LEVELS:
             return content
-        expected = f"an integer from 1 to {MAX_LEVELS}, or a list with an entry for each level"
+        expected = f"an integer from 1 to {MAX_LEVELS}, {UNTIL_CONVERGED}, or a list with an entry for each level"
         self.problems.append(value.place.problem(f"expected {expected}, got {given(value.content)}"))
         return []
 
@@ -267,7 +280,7 @@ class _Resolver:
             "version": VERSION,
             "source": _written(plan.source),
             **chosen,
-            "levels": levels,
+            "levels": UNTIL_CONVERGED if plan.until_converged else levels,
             **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
         }
 

@@ -98,6 +98,21 @@ def test_check_says_ok(folder: Path, invoke: Callable[..., Any]) -> None:
     assert result.stdout == "capture.yaml: ok, 1 level on simulator: 4,000 binary frames of 96x160 at 96,800 Hz\n"
 
 
+def test_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> None:
+    arguments = ["capture.yaml", "--set", "levels=until-converged"]
+    assert invoke("check", *arguments).stdout.startswith("capture.yaml: ok, up to 8 levels on simulator: ")
+    printed = invoke("explain", *arguments).stdout
+    comments = printed.partition("levels: until-converged")[0].splitlines()[-5:]
+    assert comments == [
+        "# up to 8 levels, until the motion has settled",
+        "# level 1: 4 groups of 50 frames, 5 pairs",
+        "# level 2: 9 groups of 25 to 50 frames, 22 pairs",
+        "# level 3: 15 groups of 25 to 50 frames, 38 pairs",
+        "# each further level: about twice the groups and pairs of the one before",
+    ]
+    assert parse_spec(printed).document == load_spec("capture.yaml", ["levels=until-converged"]).document
+
+
 def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) -> None:
     levels = "levels=[{scale: 0.5, locate: {with: {ratio: 0.7}}}, {}]"
     arguments = ["capture.yaml", "--set", levels, "--set", "run.seed=3"]
@@ -124,7 +139,7 @@ def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[...,
     assert "seed: 3  # --set" in lines
     assert f"directory: {folder}/runs/capture  # default" in lines
     assert "# level 1: 4 groups of 50 frames, 5 pairs" in lines
-    assert "# level 2: 9 groups of 50 frames, 20 pairs" in lines
+    assert "# level 2: 9 groups of 25 to 50 frames, 22 pairs" in lines
 
 
 def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder: Path, invoke: Callable[..., Any]) -> None:

@@ -30,6 +30,13 @@ def test_levels_repeat_nothing_and_stand_at_their_overrides(catalog, tmp_path):
     ]
 
 
+def test_levels_until_converged_are_checked_once(catalog):
+    spec = "version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 200}}\nlevels: until-converged"
+    assert [str(problem) for problem in check_stream(parse_spec(spec, catalog=catalog), SHORT)] == [
+        f"3:1: resample: {TOO_LARGE.format(200)}"
+    ]
+
+
 def test_fallbacks_are_checked_where_they_are_written(catalog):
     class Sized(Config):
         at_least: int = Field(description="frames")

@@ -42,6 +42,8 @@ def is_valid(spec, catalog):
         ({"levels": [{"locate": {"with": {"max_steps": 5}}}]}, True),
         ({"levels": [{"locate": {"use": "opencv-sift", "with": {"max_steps": 5}}}]}, False),
         ({"levels": [{"source": {"use": "simulator"}}]}, False),
+        ({"levels": "until-converged"}, True),
+        ({"levels": "until-convergd"}, False),
         ({"output": {}}, True),
         ({"locate": {"fallback": "direct"}}, True),
         ({"locate": {"fallback": ["direct", {"use": "opencv-sift", "with": {"ratio": 0.9}}]}}, True),

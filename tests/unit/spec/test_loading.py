@@ -35,6 +35,14 @@ def test_levels_without_overrides_share_their_choices(catalog):
     assert plan.levels[0].locate is plan.levels[1].locate
 
 
+def test_until_converged_is_as_many_equal_levels_as_there_may_be(catalog):
+    plan = parse_spec(MINIMAL | {"levels": "until-converged"}, catalog=catalog)
+    assert plan.until_converged
+    assert plan.levels == (plan.levels[0],) * 8
+    assert plan.document["levels"] == "until-converged"
+    assert not parse_spec(MINIMAL | {"levels": 8}, catalog=catalog).until_converged
+
+
 def test_level_replaces_a_stage_with_use_and_updates_it_without(catalog):
     levels = [{"locate": {"use": "direct"}}, {"locate": {"with": {"ratio": 0.6}}}, {}, {"locate": None}]
     spec = MINIMAL | {"locate": {"use": "opencv-sift", "with": {"max_keypoints": 99}}, "levels": levels}

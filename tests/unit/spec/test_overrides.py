@@ -15,6 +15,7 @@ SPEC = "version: 1\nsource: {use: simulator}\nlevels: [{}, {scale: 0.5}]\nrun: {
         ("run.seed = 1e3 ", ("run", "seed"), 1000),
         ("levels.1.scale=0.25", ("levels", 1, "scale"), 0.25),
         ("levels=1", ("levels",), [{"scale": 1.0}]),
+        ("levels=until-converged", ("levels",), "until-converged"),
         ("levels.0={scale: 2}", ("levels", 0, "scale"), 2.0),
         ("render.reference=first", ("render", "reference"), "first"),
         ("graph.skips=[1, 2]", ("graph", "skips"), [1.0, 2.0]),
