@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
 """What moves at the coarsest level of the pyramid (translation) and at the next (affine); the others use all of p1..p8."""
+_DAMPING = 0.1
+"""Where a step leads astray, the next is shortened by this share of the template's curvature, and by more where that does too."""
 _COARSE_TOLERANCE = 4
 """The coarser levels of the pyramid only start the finest, and may stop this much earlier."""
 
@@ -46,10 +48,11 @@ class DirectLocator:
         """
         if not (moving[-1].weight.any() and fixed[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
-        homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
+        start = homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
         best: tuple[float, Located | NotLocated] = np.inf, NotLocated("")
         for depth in reversed(range(len(moving))):
-            template, free, scale = Template(moving[depth]), _model(depth, len(moving)), 0.5**depth
+            free, scale = _model(depth, len(moving)), 0.5**depth
+            template = Template(moving[depth], rescaled(start, scale))
             found = self._aligned(template, rescaled(homography, scale), fixed[depth], free, depth == 0)
             if not isinstance(found, str):
                 homography = rescaled(found, 1 / scale)
@@ -67,14 +70,21 @@ class DirectLocator:
         """Return the homography, in px of the layers, that aligns two layers, or why there is none."""
         config = self._config
         tolerance = config.converged_px * (1 if finest else _COARSE_TOLERANCE)
+        damping, before, least = 0.0, homography, np.inf
         for _ in range(config.max_iterations):
-            step = template.step(homography, fixed, free)
-            if step is None:
+            looked = template.step(homography, fixed, free, damping)
+            if looked is None:
                 return "where the images overlap, if they do, there is no texture"
+            step, differs = looked
+            if differs > least:
+                # The last step led astray; a shorter one from the same place will not.
+                homography, least, damping = before, np.inf, max(_DAMPING, 4 * damping)
+                continue
+            before, least, damping = homography, differs, damping / 2
             homography = normalised(homography @ inverse(step))
             if reason := implausibility(homography, fixed.image.shape, config.min_overlap):
                 return f"the alignment diverges: {reason}"
-            if template.size_px(step) < tolerance:
+            if template.settled(step, tolerance):
                 return homography
         return f"the alignment has not settled after {config.max_iterations} steps"
 

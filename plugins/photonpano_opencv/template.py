@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from photonpano.geometry import corners, from_parameters, jacobian
+from photonpano.geometry import corners, from_parameters, jacobian, normalised, parameters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,10 +18,17 @@ if TYPE_CHECKING:
 
 ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 """All of p1..p8."""
-_BOLDEST = 0.3
-"""The curvature common to both images is taken to be at least this share of the template's, so that steps stay bounded."""
+_BOLDEST = 5.0
+"""The curvature common to both images is taken to be at least so many times what noise alone leaves in common by chance, which
+is the template's over the root of the number of independent pixels; so steps stay bounded."""
 _UNKNOWN = 1e-3
 """Where noise exceeds the scene, next to nothing is known: this share of the template's curvature."""
+_PRIOR_STD = np.array([0.03, 0.03, 0.03, 0.03, np.inf, np.inf, 0.03, 0.03])
+"""How much p1..p8, in coordinates of about unit size, may differ from the start where photons do not tell: a camera that turns
+between two exposures shifts the image by any amount, but rolls by a degree or two and changes the perspective by little."""
+_PRIOR = np.diag(_PRIOR_STD**-2.0)
+_NEGLIGIBLE = 0.02
+"""Steps of this share of what photons leave open do not count: where they tell little, steps stay small for long."""
 _RENEWED_PX = 0.25
 """The curvature is taken anew until steps are smaller than this."""
 
@@ -53,8 +60,15 @@ class Template:
     those of coordinates of about unit size.
     """
 
-    def __init__(self, layer: Layer) -> None:
+    def __init__(self, layer: Layer, start: NDArray[np.float64]) -> None:
+        """Prepare a layer.
+
+        Args:
+            layer: the moving image.
+            start: (3, 3) what is thought of the homography before the photons are asked.
+        """
         self._layer = layer
+        self._to_start = np.linalg.inv(start)
         height, width = layer.image.shape
         self._half = half = max(height, width) / 2
         self._unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
@@ -62,32 +76,50 @@ class Template:
         self._gx, self._gy = (np.float32(half) * gradient for gradient in _gradients(layer.image))
         self._powers = _powers(width, half), _powers(height, half)
         self._hessian: NDArray[np.float64] | None = None
+        self._own = np.zeros((8, 8))
+        self._std_px = 0.0
 
-    def step(self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...]) -> NDArray[np.float64] | None:
-        """Return the small homography of the template's frame that explains what differs; None without overlap or texture.
+    def step(
+        self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], damping: float
+    ) -> tuple[NDArray[np.float64], float] | None:
+        """Return the small homography of the template's frame that explains what differs, and how much differs.
 
         Args:
             homography: (3, 3), pixels of the template to pixels of the fixed layer.
             fixed: what the template is aligned to.
             free: which of p1..p8 may change; the same in every call.
+            damping: how much shorter than its best guess the step is to be: 0 for not at all (Levenberg 1944).
+
+        Returns:
+            The step, and the mean square of the differences in units of their noise; None without overlap or texture.
         """
         residual, weight = self._residual(homography, fixed)
+        seen = int(np.count_nonzero(weight))
+        if not seen:
+            return None
         if self._hessian is None:
-            if not weight.any():
-                return None
-            self._hessian = self._curvature(residual, weight, _BOLDEST)[np.ix_(free, free)]
+            self._own, common = self._curvatures(residual, weight, self._boldest(seen))
+            self._hessian = common + _PRIOR
+            self._std_px = self._expected_px(free)
         weighted = residual * weight
         along_x, along_y = self._moments(weighted * self._gx, 3), self._moments(weighted * self._gy, 3)
         gradient = np.einsum("aij,ij->a", _ALONG_X, along_x) + np.einsum("aij,ij->a", _ALONG_Y, along_y)
+        moved = parameters(normalised(self._unit @ self._to_start @ homography @ self._from_unit))
+        gradient += _PRIOR @ moved
+        differs = (float(np.vdot(weighted, residual)) + float(moved @ _PRIOR @ moved)) / seen
         p = np.zeros(8)
         try:
-            p[list(free)] = np.linalg.solve(self._hessian, gradient[list(free)])
+            p[list(free)] = np.linalg.solve((self._hessian + damping * self._own)[np.ix_(free, free)], gradient[list(free)])
         except np.linalg.LinAlgError:
             return None
         step = np.asarray(self._from_unit @ from_parameters(p) @ self._unit)
         if self.size_px(step) > _RENEWED_PX:
             self._hessian = None
-        return step
+        return step, differs
+
+    def settled(self, step: NDArray[np.float64], tolerance_px: float) -> bool:
+        """Tell whether steps have become small: below the tolerance, or of no weight beside what photons leave open."""
+        return self.size_px(step) < max(tolerance_px, _NEGLIGIBLE * self._std_px)
 
     def size_px(self, step: NDArray[np.float64]) -> float:
         """Return how far a step moves the corners of the template at most, in px of its layer."""
@@ -108,10 +140,10 @@ class Template:
         noise_ratio = float(np.mean(residual[seen] ** 2)) * 4 * np.pi * self._layer.blur_px**2 / variance
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
-        hessian = self._curvature(residual, weight, _UNKNOWN)
+        _, hessian = self._curvatures(residual, weight, _UNKNOWN)
         bx, by = (cv2.GaussianBlur(weight * gradient, (0, 0), self._layer.blur_px) for gradient in (self._gx, self._gy))
         scatter = self._quadratic(bx * bx, bx * by, by * by) * variance
-        information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio)
+        information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio) + _PRIOR
         in_parameters = self._in_parameters(homography, information)
         to_corners = jacobian(homography, corners(self._layer.image.shape)).reshape(8, 8)
         return Quality(
@@ -134,8 +166,10 @@ class Template:
         combined = np.divide(self._layer.weight * weight, both, out=np.zeros_like(both), where=both > 0)
         return seen - self._layer.image, combined
 
-    def _curvature(self, residual: NDArray[np.float32], weight: NDArray[np.float32], least: float) -> NDArray[np.float64]:
-        """Return the (8, 8) curvature that both images have in common: that of the scene.
+    def _curvatures(
+        self, residual: NDArray[np.float32], weight: NDArray[np.float32], least: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the (8, 8) curvature of the template, and that which both images have in common: that of the scene.
 
         The noise of the template has gradients too, and in the dark larger ones than the scene. With those of the other image
         it has nothing in common.
@@ -154,11 +188,11 @@ class Template:
         try:
             root = np.linalg.cholesky(own)
         except np.linalg.LinAlgError:
-            return own
+            return own, own
         whitening = np.linalg.inv(root)
         values, vectors = np.linalg.eigh(np.eye(8) + whitening @ difference @ whitening.T)
         half = root @ (vectors * np.sqrt(np.maximum(values, least)))
-        return np.asarray(half @ half.T)
+        return own, np.asarray(half @ half.T)
 
     def _quadratic(self, xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the (8, 8) sums over pixels of products of two parameters' images, for products of gradients."""
@@ -169,6 +203,24 @@ class Template:
         """Return the sums of an image times x^i y^j, i and j below `count`: (count, count)."""
         x, y = self._powers
         return np.asarray((image @ x[:, :count]).astype(np.float64).T @ y[:, :count])
+
+    def _boldest(self, seen: int) -> float:
+        independent = seen / max(1.0, 4 * np.pi * self._layer.blur_px**2)
+        return min(0.5, _BOLDEST / float(np.sqrt(independent)))
+
+    def _expected_px(self, free: tuple[int, ...]) -> float:
+        """Return the expected distance of a corner from where it should be, in px of the layer, if noise were white."""
+        frame = corners(self._layer.image.shape)
+        rows = np.concatenate([frame, np.ones((4, 1))], axis=1).T
+        generators = self._from_unit @ (from_parameters(np.eye(8)) - np.eye(3)) @ self._unit
+        moved = (generators @ rows)[list(free)]
+        to_corners = (moved[:, :2] - rows[:2] * moved[:, 2:]).transpose(2, 1, 0).reshape(8, -1)
+        assert self._hessian is not None
+        try:
+            covariance = to_corners @ np.linalg.solve(self._hessian[np.ix_(free, free)], to_corners.T)
+        except np.linalg.LinAlgError:
+            return 0.0
+        return float(np.sqrt(max(np.trace(covariance), 0.0) / 4))
 
     def _in_parameters(self, homography: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert the information on a step to that on p1..p8 of the homography it changes."""

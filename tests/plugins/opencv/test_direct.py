@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from photonpano import Located, NotLocated
+from photonpano.evaluation import pair_bound_px
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.photometry import BinaryResponse
 from photonpano_opencv.configs import DirectConfig
 from photonpano_opencv.direct import DirectLocator
 
@@ -70,6 +72,25 @@ def test_the_information_is_that_of_the_scatter(seen_from: Callable, brightness:
         predicted.append(np.trace(to_corners @ np.linalg.inv(located.information) @ to_corners.T))
         errors.append(np.sum((apply(located.homography, frame) - apply(true, frame)) ** 2))
     assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
+
+
+def test_it_comes_close_to_what_photons_allow(seen_from: Callable, street: np.ndarray) -> None:
+    """At flux 0.1, over 24 pairs: the bound of Cramer and Rao for a scene that nobody knows. Shifts by whole pixels, because
+    between them the fixture samples its street bluntly."""
+    errors, bounds = [], []
+    for seed in range(24):
+        shift = np.array([3 + seed % 7, -4 + seed % 5])
+        true = translation(*shift)
+        located = register(
+            seen_from(true, seed=2 * seed, brightness=0.2), seen_from(STILL, seed=2 * seed + 1, brightness=0.2), true
+        )
+        assert isinstance(located, Located), located
+        errors.append(np.mean(corner_displacements(located.homography, true, SHAPE) ** 2))
+        rows, columns = (slice(280 + shift[1], 280 + shift[1] + SHAPE[0]), slice(400 + shift[0], 400 + shift[0] + SHAPE[1]))
+        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] + shift[::-1, None, None]
+        also_seen = (x < SHAPE[1]) & (y >= 0) & (y < SHAPE[0])
+        bounds.append(pair_bound_px(0.2 * street[rows, columns], BinaryResponse(), 250, np.where(also_seen, 250.0, 0.0)))
+    assert np.sqrt(np.mean(errors)) < 1.3 * np.sqrt(np.mean(np.square(bounds)))
 
 
 def test_the_same_input_gives_the_same_bytes_from_any_thread(seen_from: Callable) -> None:
