@@ -14,6 +14,8 @@ from photonpano.values import FrameSpan, NotLocated
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from photonpano.values import BoolArray, Edge, Group, VirtualExposure
 
 TOLERATED_RUN = 2
@@ -55,15 +57,27 @@ def require_tied(
     level: int,
     groups: Sequence[Group],
     edges: Sequence[Edge],
-    tied: BoolArray,
+    parts: NDArray[np.integer],
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
 ) -> None:
-    """Refuse to go on when too many exposures are tied to nothing.
+    """Refuse to go on when too many exposures are not tied to the others.
 
     Single exposures may be lost, since the motion is interpolated across them. A longer run is an error unless the spec
     asks for the largest part; less than two located exposures is always one.
+
+    Args:
+        level: from 1.
+        groups: the groups of the level.
+        edges: the pairs that were tried.
+        parts: (N,) number of the part that each exposure is tied to, 0 for the largest.
+        contrasts: how much there is to see in each exposure.
+        disconnected: what the spec asks for.
+
+    Raises:
+        LocationError: says which frames are lost, which are tied together, and why pairs failed.
     """
+    tied = parts == 0
     if len(groups) == 1:
         return
     runs = _runs(~tied)
@@ -78,6 +92,8 @@ def require_tied(
         if tied.sum() >= 2
         else f"level {level}: none of the {len(edges)} pairs of exposures could be located"
     ]
+    if tied.sum() >= 2:
+        lines.append(f"Tied together are {_tied_together(groups, parts)}.")
     lines += [_pair(edge, groups) for edge in failures[:_SHOWN]]
     if len(failures) > _SHOWN:
         lines.append(f"  ... and {len(failures) - _SHOWN} more")
@@ -85,6 +101,16 @@ def require_tied(
     if tied.sum() >= 2:
         lines.append("To go on with the largest part alone, set graph.disconnected to largest.")
     raise LocationError("\n".join(lines))
+
+
+def _tied_together(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
+    """List the parts of at least two exposures by the frames that they hold, the largest first."""
+    sizes = np.bincount(parts)
+    held = [
+        " with ".join(_frames(groups, start, stop) for start, stop in _runs(parts == part))
+        for part in np.flatnonzero(sizes >= 2)[: _SHOWN + 1]
+    ]
+    return "; ".join(held[:_SHOWN]) + ("; and others" if len(held) > _SHOWN else "")
 
 
 def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Contrast]) -> list[str]:

@@ -1,15 +1,28 @@
-"""Which exposures are registered with which: neighbours, and those a few group lengths away."""
+"""Which exposures are registered with which: neighbours, those a few group lengths away, and places seen again."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.signal import find_peaks
+
+from photonpano.geometry import apply, corners, inverse
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from photonpano.values import FrameSpan, Group
+    from photonpano.values import BoolArray, FloatArray, FrameSpan, Group
+
+_GRID = 8
+"""The overlap of two fields of view is counted on so many points squared."""
+_CLOSURE_SKIP = 2.0
+"""Places seen again lie so many times further away in time than the most distant skip."""
+_PROMINENCE = 0.25
+"""Between two visits the overlap falls by at least this: a camera that only trembles has not been away. It is what two
+columns of the grid hold."""
+_MOST_REVISITS = 3
+"""An exposure is registered with so many earlier visits at most, those that it shares most with."""
 
 
 def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int, int]]:
@@ -17,23 +30,83 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
 
     Args:
         groups: the groups of the level, in order of their instants.
-        skips: besides its predecessor, each exposure is paired with the one whose instant lies closest to so many group
-            lengths before its own. A pair a whole group length apart shares no photons, so that its noise cannot vote for
-            the motion known so far; a distant pair ties down drift.
+        skips: besides its neighbours, each exposure is paired with those whose instants lie closest to so many group lengths
+            before and after its own; between groups of different lengths, their mean counts. A pair a whole group length
+            apart shares no photons, so that its noise cannot vote for the motion known so far; a distant pair ties down drift.
     """
-    instants = np.array([group.reference for group in groups])
+    instants, lengths = _instants(groups), _lengths(groups)
     pairs = {(later, later - 1) for later in range(1, len(groups))}
-    for later, group in enumerate(groups):
+    for index, (instant, length) in enumerate(zip(instants, lengths, strict=True)):
+        distances = (instants - instant) / ((lengths + length) / 2)
         for skip in skips:
-            target = group.reference - skip * len(group.span)
-            if target >= instants[0] - 0.5:
-                earlier = int(np.argmin(np.abs(instants - target)))
-                if earlier < later:
-                    pairs.add((later, earlier))
+            for target in (-skip, skip):
+                if not distances[0] - 0.5 / length <= target <= distances[-1] + 0.5 / length:
+                    continue
+                partner = int(np.argmin(np.abs(distances - target)))
+                if partner != index:
+                    pairs.add((max(index, partner), min(index, partner)))
     return sorted(pairs)
+
+
+def revisits(
+    groups: Sequence[Group],
+    homographies: FloatArray,
+    located: BoolArray,
+    frame_shape: tuple[int, int],
+    skips: Sequence[float],
+    min_overlap: float,
+) -> list[tuple[int, int]]:
+    """Return pairs (moving, fixed) of exposures that see one place at different times: candidates for loop closures.
+
+    For an exposure, the best view of each earlier visit counts: going back in time, the overlap first falls and then rises.
+    Exposures that lie denser than their length are thinned out, since they say the same.
+
+    Args:
+        groups: the groups of the level, in order of their instants.
+        homographies: (N, 3, 3) frame pixels to a common plane.
+        located: (N,) which of them are known.
+        frame_shape: (height, width) of a frame.
+        skips: the pairs that are registered anyway, in group lengths.
+        min_overlap: the least share of the field of view that both see.
+    """
+    instants, lengths = _instants(groups), _lengths(groups)
+    length = float(np.median(lengths))
+    spacing = float(np.median(np.diff(instants))) if len(groups) > 1 else length
+    chosen = np.flatnonzero(located & (lengths == length))[:: max(1, round(length / spacing))]
+    away = _CLOSURE_SKIP * max([1.0, *skips]) * length
+    pairs: list[tuple[int, int]] = []
+    for position, moving in enumerate(chosen):
+        earlier = chosen[:position]
+        overlap = _overlaps(homographies[moving], homographies[earlier], frame_shape)
+        # Between nothing before the first exposure and the exposure itself.
+        profile = np.concatenate([[0.0], overlap, [1.0]])
+        peaks = find_peaks(profile, height=min_overlap, prominence=_PROMINENCE)[0] - 1
+        peaks = peaks[instants[earlier[peaks]] <= instants[moving] - away]
+        best = peaks[np.argsort(-overlap[peaks], kind="stable")[:_MOST_REVISITS]]
+        pairs += [(int(moving), int(fixed)) for fixed in np.sort(earlier[best])]
+    return pairs
 
 
 def shared_share(first: FrameSpan, second: FrameSpan) -> float:
     """Return which share of its frames the shorter of two spans has in common with the other."""
     common = min(first.stop, second.stop) - max(first.start, second.start)
     return max(0, common) / min(len(first), len(second))
+
+
+def _instants(groups: Sequence[Group]) -> FloatArray:
+    return np.array([group.reference for group in groups])
+
+
+def _lengths(groups: Sequence[Group]) -> FloatArray:
+    return np.array([float(len(group.span)) for group in groups])
+
+
+def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the share of one field of view that each of N others sees: (N,)."""
+    low, high = corners(frame_shape)[[0, 2]]
+    # Centres of cells: on the border, points would leave the field of view at the least motion.
+    x, y = (low[axis] + (high[axis] - low[axis]) * (np.arange(_GRID) + 0.5) / _GRID for axis in (0, 1))
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    seen = apply(inverse(fixed) @ moving, points)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.all((seen >= low) & (seen <= high), axis=-1).mean(axis=-1))

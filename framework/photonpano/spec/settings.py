@@ -23,6 +23,11 @@ class GraphSettings(Config):
         description="besides its neighbour, each exposure is registered with the ones so many group lengths away; "
         "an empty list leaves a chain of neighbours",
     )
+    closure_overlap: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+        0.5,
+        description="exposures that see one place at different times are registered too if they share so much of the field "
+        "of view; null registers none",
+    )
     disconnected: Literal["error", "largest"] = Field(
         "error",
         description="when some exposures cannot be tied to the others: stop with an error that names them, "

@@ -11,9 +11,10 @@ from photonpano import FrameSpan, Group, Located, VirtualExposure
 from photonpano.geometry import inverse, normalised, rescaled
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import Level, NamedLocator
+from photonpano.pipeline.threads import one_thread_inside
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from photonpano import NotLocated, Source, Trajectory
 
@@ -77,6 +78,13 @@ class Linear:
 
 def _truth(moving: Group, fixed: Group, found: Located) -> Located:
     return found
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Let libraries start no threads, as in a run: over the matrices of small graphs they would fight for the cores."""
+    with one_thread_inside():
+        yield
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ def require(
     """Ask for a chain of ten exposures, of which those that are lost fail in every pair."""
     found, failed = Located(np.eye(3)), NotLocated(reason)
     edges = [Edge(later, later - 1, failed if {later, later - 1} & set(lost) else found) for later in range(1, N)]
-    tied = np.array([index not in lost for index in range(N)])
+    tied = np.array([0 if index not in lost else 1 + index for index in range(N)])
     contrasts = {index: contrast if index in lost else CLEAR for index in range(N)}
     require_tied(2, GROUPS, edges, tied, contrasts, disconnected)
 
@@ -82,7 +82,7 @@ def test_the_largest_part_is_enough_if_the_spec_says_so(lost: tuple[int, ...]) -
 
 
 def test_a_lone_group_needs_no_ties() -> None:
-    require_tied(1, GROUPS[:1], [], np.array([True]), {0: CLEAR}, "error")
+    require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
 
 
 def refusal(*args: Any, **kwargs: Any) -> str:
@@ -99,6 +99,7 @@ def test_a_part_without_texture_is_named_with_its_pairs() -> None:
     assert refusal((4, 5, 6)) == golden(
         """
         level 2: 4 of 9 pairs of exposures could not be located, so that frames 400 to 699 cannot be tied to the rest
+        Tied together are frames 0 to 399 with frames 700 to 999.
           frames 400 to 499 onto frames 300 to 399: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
           frames 500 to 599 onto frames 400 to 499: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
           frames 600 to 699 onto frames 500 to 599: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
@@ -124,6 +125,28 @@ def test_several_spans_are_listed() -> None:
         "level 2: 6 of 9 pairs of exposures could not be located, "
         "so that frames 0 to 299 and frames 700 to 999 cannot be tied to the rest"
     )
+
+
+def parts_refusal(parts: list[int]) -> str:
+    groups = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(len(parts)))
+    contrasts = dict.fromkeys(range(len(parts)), CLEAR)
+    with pytest.raises(LocationError) as caught:
+        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], np.array(parts), contrasts, "error")
+    return str(caught.value).splitlines()[1]
+
+
+def test_the_parts_are_named_by_what_they_hold_the_largest_first() -> None:
+    """Exposures that are tied to no other make no part."""
+    assert parts_refusal([1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2]) == (
+        "Tied together are frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099."
+    )
+    assert parts_refusal([0, 0, 1, 2, 3]) == "Tied together are frames 0 to 199."
+
+
+def test_a_long_list_of_parts_is_cut() -> None:
+    shown = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
+    assert parts_refusal([part for part in range(6) for _ in range(2)]) == f"Tied together are {shown}."
+    assert parts_refusal([part for part in range(7) for _ in range(2)]) == f"Tied together are {shown}; and others."
 
 
 def test_a_long_list_of_pairs_is_cut() -> None:

@@ -9,20 +9,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import Located, LocationError, NotLocated, PluginError
+from photonpano import FrameSpan, Group, Located, LocationError, NotLocated, PluginError
 from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, rescaled, translation
-from photonpano.pipeline.locate import BRIDGE, broken_promise, locate
+from photonpano.pipeline.locate import locate
 from photonpano.pipeline.merge import VirtualExposures
 from photonpano.pipeline.progress import Quiet
+from photonpano.pipeline.registration import BRIDGE, broken_promise
 from photonpano.pipeline.stopwatch import Stopwatch
 from photonpano.spec.settings import GraphSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from photonpano import Group, Trajectory
+    from photonpano import Trajectory
     from photonpano.pipeline.components import Level
     from photonpano.pipeline.locate import LocatedLevel
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 SHAPE = (40, 60)
 N_FRAMES = 120
@@ -130,6 +133,33 @@ def test_two_lost_exposures_are_bridged_and_three_are_not(run: Callable, make_le
         run(make_level(pan(0.3), failing(4, 5, 6)))
     found = run(make_level(pan(0.3), failing(4, 5, 6)), graph=GraphSettings(skips=(), disconnected="largest"))
     np.testing.assert_array_equal(np.flatnonzero(found.solution.located), [7, 8, 9, 10, 11])
+
+
+def test_what_is_covered_reaches_from_the_first_to_the_last_frame_of_located_exposures(
+    run: Callable, make_level: Callable, pan: Callable
+) -> None:
+    assert run(make_level(pan(0.3), failing(5))).covered == FrameSpan(0, 120)
+    assert run(make_level(pan(0.3), failing(0, 1, 11))).covered == FrameSpan(20, 110)
+
+
+def test_nothing_is_known_of_a_single_exposure(run: Callable, make_level: Callable, pan: Callable) -> None:
+    class Whole:
+        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+            return (Group(FrameSpan(0, n_frames), 60.0),)
+
+    found = run(make_level(pan(0.3), resampler=Whole()), graph=GraphSettings())
+    assert (found.n_located, found.edges, found.information) == (1, (), None)
+    np.testing.assert_array_equal(found.homographies, [np.eye(3)])
+
+
+def test_what_is_known_of_each_exposure_is_passed_on(run: Callable, make_level: Callable, pan: Callable) -> None:
+    """Each is held by the one before and the one after; the camera hardly moves, so that both say the same of it."""
+
+    def told(moving: Group, fixed: Group, found: Located) -> Located:
+        return replace(found, information=np.diag([1e3, 1e3, 1e3, 1e3, 4, 4, 1e7, 1e7]))
+
+    found = run(make_level(pan(1e-9), told))
+    np.testing.assert_allclose(found.information[[0, 5, 11], 4, 4], [4, 8, 4], rtol=1e-6)
 
 
 def test_a_pair_that_no_camera_makes_is_refused(run: Callable, make_level: Callable, pan: Callable) -> None:

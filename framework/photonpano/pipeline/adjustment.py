@@ -1,0 +1,199 @@
+"""The adjustment of a motion graph: the least squares behind `graph.solve`, and how far its solution can be trusted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from photonpano.geometry import apply, corners, from_parameters, inverse, jacobian, normalised, parameters
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from photonpano.values import BoolArray, FloatArray, Located
+
+MAX_ITERATIONS = 30
+CONVERGED_PX = 1e-4
+CAUCHY = 2.385
+"""Residuals of so many typical ones weigh half (95 % efficiency for Gaussian noise)."""
+CONTRADICTION = 8.0
+"""An edge that disagrees with the others by more than so many typical residuals is dropped."""
+MEDIAN_NORM = 0.958
+"""The median of the root mean square of eight Gaussian numbers of unit variance."""
+SAMPLES = 64
+"""Solutions drawn to tell how far the true one may lie: standard deviations are known to a few per cent."""
+
+
+class Adjustment:
+    """Residuals and steps of a connected graph; the unknowns of a node are p1..p8 in coordinates of about unit size.
+
+    A node changes by a small homography of its own frame, so that its unknowns mean the same wherever it lies.
+    """
+
+    def __init__(
+        self,
+        pairs: NDArray[np.integer],
+        anchor: int,
+        observed: FloatArray,
+        motions: Sequence[Located],
+        frame_shape: tuple[int, int],
+    ) -> None:
+        """Set up the problem.
+
+        Args:
+            pairs: (E, 2) the moving and the fixed node of each edge.
+            anchor: the node that does not change.
+            observed: (E, 3, 3) what was measured, pixels of the moving frame to pixels of the fixed one.
+            motions: where it comes from, with its information.
+            frame_shape: (height, width) of a frame.
+        """
+        self._moving, self._fixed = pairs.T
+        self._anchor = anchor
+        self._n_nodes = int(pairs.max()) + 1
+        self._corners = corners(frame_shape)
+        self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
+        self._targets = apply(observed, self._corners)
+        self._whitening = np.array([_whitening(motion, self._corners) for motion in motions])
+        height, width = frame_shape
+        self._half = half = max(height, width) / 2
+        self._unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+        self._generators = np.linalg.inv(self._unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ self._unit
+
+    def minimise(self, homographies: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return the (N, 3, 3) homographies that agree best, and the whitened residual of each edge, (E,).
+
+        Args:
+            homographies: (N, 3, 3) where to start.
+            kept: (E,) the edges that have a say.
+        """
+        # All edges weigh the same at first: a start that agrees perfectly with half of them would outvote the others for good.
+        weights = kept.astype(np.float64)
+        for _ in range(MAX_ITERATIONS):
+            jacobians, residuals = self._linearised(homographies, weights)
+            free = self._free
+            step = np.zeros(8 * self._n_nodes)
+            step[free] = -splu((jacobians.T @ jacobians)[free][:, free].tocsc()).solve((jacobians.T @ residuals)[free])
+            change = np.linalg.inv(self._unit) @ from_parameters(step.reshape(-1, 8)) @ self._unit
+            homographies = normalised(homographies @ change)
+            weights = self._robust_weights(self._norms(homographies), kept)
+            if np.abs(step).max() * self._half < CONVERGED_PX:
+                break
+        # The anchor does not move, but rounding may show in its last digits.
+        homographies[self._anchor] = np.eye(3)
+        return homographies, self._norms(homographies)
+
+    def agreeing(self, norms: FloatArray) -> BoolArray:
+        """Tell which edges do not contradict the others, from their whitened residuals: (E,)."""
+        return np.asarray(norms <= CONTRADICTION * self._typical(norms, np.ones(len(norms), dtype=bool)))
+
+    def residuals_px(self, homographies: FloatArray) -> FloatArray:
+        """Return the root mean square distance of the corners, for each edge: (E,)."""
+        return np.asarray(np.sqrt(np.mean(np.sum(self._residuals(homographies) ** 2, axis=-1), axis=-1)))
+
+    def uncertainty(self, homographies: FloatArray, norms: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return the information on each node while the others are held, and the expected error of its corners.
+
+        The error is that of solutions drawn from what the information of the edges allows, each aligned with the best one as
+        an evaluation would align planes. Where the edges disagree by more than their information says, it is as much larger.
+
+        Returns:
+            (N, 8, 8) inverse covariances of p1..p8 of the homographies; (N,) in px.
+        """
+        misfit = self._typical(norms, kept) / MEDIAN_NORM
+        jacobians, _ = self._linearised(homographies, self._robust_weights(norms, kept) / misfit**2)
+        normal, free = jacobians.T @ jacobians, self._free
+        nodes = np.arange(self._n_nodes)
+        blocks = np.stack([normal[8 * node : 8 * node + 8, 8 * node : 8 * node + 8].toarray() for node in nodes])
+        draws = np.random.default_rng(0).normal(size=(jacobians.shape[0], SAMPLES))
+        changes = np.zeros((8 * self._n_nodes, SAMPLES))
+        changes[free] = splu(normal[free][:, free].tocsc()).solve((jacobians.T @ draws)[free])
+        return self._in_parameters(homographies, blocks), self._corner_std_px(homographies, changes)
+
+    @property
+    def _free(self) -> BoolArray:
+        """The unknowns that may change: (8 N,)."""
+        return np.repeat(np.arange(self._n_nodes) != self._anchor, 8)
+
+    def _corner_std_px(self, homographies: FloatArray, changes: FloatArray) -> FloatArray:
+        """Return the root mean square distance of corners that (8 N, S) changes cause, after the best alignment: (N,)."""
+        here = np.broadcast_to(self._rows, (self._n_nodes, 3, 4))
+        to_corners = _perspective(here, np.broadcast_to(self._generators @ self._rows, (self._n_nodes, 8, 3, 4)))
+        # What a change of the plane does to the corners of each frame.
+        seen = inverse(homographies)[:, None] @ self._generators @ homographies[:, None] @ self._rows
+        of_plane = _perspective(here, seen).reshape(-1, 8)
+        errors = (to_corners @ changes.reshape(self._n_nodes, 8, -1)).reshape(len(of_plane), -1)
+        scale = np.linalg.norm(of_plane, axis=0)
+        best = np.linalg.lstsq(of_plane / scale, errors, rcond=None)[0]
+        left = errors - of_plane / scale @ best
+        return np.asarray(np.sqrt((left**2).reshape(self._n_nodes, -1).sum(axis=1) / (4 * left.shape[1])))
+
+    def _in_parameters(self, homographies: FloatArray, blocks: FloatArray) -> FloatArray:
+        """Convert (N, 8, 8) information on changes of nodes to that on p1..p8 of their homographies."""
+        changed = homographies[:, None] @ self._generators
+        slopes = changed - homographies[:, None] * changed[..., 2:, 2:]
+        to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
+        to_change = np.linalg.inv(to_parameters)
+        return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)
+
+    def _typical(self, norms: FloatArray, kept: BoolArray) -> float:
+        """Return the size of a typical error of an edge: at least what its information says, which is about 1."""
+        # Each node takes up as many residuals as an edge has; what is left over tells the typical size of an error. Robust
+        # weights can make half of the edges agree exactly and the rest outliers, so that the median alone would not do.
+        n_edges = int(kept.sum())
+        left = n_edges - self._n_nodes + 1
+        spread = float(np.median(norms[kept])) * float(np.sqrt(n_edges / left)) if left > 0 else 0.0
+        return max(spread, MEDIAN_NORM)
+
+    def _robust_weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
+        """Return the Cauchy weights of the edges, 0 for those that are not kept: (E,)."""
+        scale = self._typical(norms, kept) * CAUCHY
+        return np.asarray(np.where(kept, 1 / (1 + (norms / scale) ** 2), 0.0))
+
+    def _relative(self, homographies: FloatArray) -> FloatArray:
+        return np.linalg.solve(homographies[self._fixed], homographies[self._moving])
+
+    def _residuals(self, homographies: FloatArray) -> FloatArray:
+        return apply(self._relative(homographies), self._corners) - self._targets
+
+    def _norms(self, homographies: FloatArray) -> FloatArray:
+        whitened = np.einsum("eij,ej->ei", self._whitening, self._residuals(homographies).reshape(-1, 8))
+        return np.asarray(np.linalg.norm(whitened, axis=1) / np.sqrt(8))
+
+    def _linearised(self, homographies: FloatArray, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
+        """Return the weighted derivatives of the residuals, (8 E, 8 N), and the weighted residuals, (8 E,)."""
+        mapped = self._relative(homographies) @ self._rows
+        d_moving = np.einsum("eij,kjl,lc->ekic", self._relative(homographies), self._generators, self._rows)
+        d_fixed = -np.einsum("kij,ejc->ekic", self._generators, mapped)
+        root = np.sqrt(weights)[:, None, None] * self._whitening
+        n_edges = len(weights)
+        edge_rows = np.arange(8 * n_edges).reshape(n_edges, 8, 1)
+        data, row, column = [], [], []
+        for nodes, d in ((self._moving, d_moving), (self._fixed, d_fixed)):
+            block = root @ _perspective(mapped, d)
+            data.append(block.ravel())
+            row.append(np.broadcast_to(edge_rows, block.shape).ravel())
+            column.append(np.broadcast_to(8 * nodes[:, None, None] + np.arange(8), block.shape).ravel())
+        entries = (np.concatenate(data), (np.concatenate(row), np.concatenate(column)))
+        residuals = np.einsum("eij,ej->ei", root, self._residuals(homographies).reshape(-1, 8))
+        return sparse.csr_array(entries, shape=(8 * n_edges, 8 * self._n_nodes)), residuals.ravel()
+
+
+def _perspective(mapped: FloatArray, derivatives: FloatArray) -> FloatArray:
+    """Return d(x/z, y/z) of (E, 3, 4) mapped corners for (E, 8, 3, 4) derivatives: (E, 8 coordinates, 8 parameters)."""
+    z = mapped[:, None, 2:]
+    points = mapped[:, None, :2] / z
+    d = (derivatives[:, :, :2] - points * derivatives[:, :, 2:]) / z
+    return d.transpose(0, 3, 2, 1).reshape(len(mapped), 8, 8)
+
+
+def _whitening(motion: Located, frame: FloatArray) -> FloatArray:
+    """Return the (8, 8) map from errors of the corners, in px, to errors of unit variance."""
+    if motion.information is None:
+        return np.eye(8) / max(motion.residual_px or 1.0, 1e-3)
+    root = np.linalg.cholesky(motion.information).T
+    return np.asarray(root @ np.linalg.inv(jacobian(motion.homography, frame).reshape(8, 8)))

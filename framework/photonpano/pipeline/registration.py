@@ -1,0 +1,250 @@
+"""Describing exposures and registering pairs of them: what the locators are asked, and what is believed of their answers."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.errors import PluginError
+from photonpano.geometry import implausibility, inverse, rescaled
+from photonpano.pipeline.agreement import agreement
+from photonpano.pipeline.diagnosis import Contrast, contrast_of
+from photonpano.pipeline.pairs import shared_share
+from photonpano.values import Edge, Located, NotLocated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+    from photonpano.pipeline.components import Level, NamedLocator
+    from photonpano.pipeline.merge import VirtualExposures
+    from photonpano.pipeline.stopwatch import Stopwatch
+    from photonpano.protocols import Trajectory
+    from photonpano.values import FloatArray, Homography, VirtualExposure
+
+BRIDGE = 3
+"""An exposure that none of its pairs ties to an earlier one is tried against so many predecessors."""
+SHARED_PHOTONS = 0.05
+"""The least weight of a pair. Photons that two exposures share say where the motion known so far puts them, and nothing new."""
+MIN_AGREEMENT = 0.7
+"""Views of one place at different times agree by 0.9 and more where photons tell; different places by less than half."""
+
+
+@dataclass(slots=True)
+class _Described:
+    """What is kept of an exposure while pairs of it are due.
+
+    Attributes:
+        contrast: how much there is to see in it.
+        features: what the locators made of it, by their names.
+        lock: held while a locator is asked, so that each is asked once.
+        exposure: the exposure itself, where pairs are to be looked at once more.
+    """
+
+    contrast: Contrast
+    features: dict[str, Any] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
+    exposure: VirtualExposure | None = None
+
+
+class Registrar:
+    """Describes the exposures of a level and registers pairs of them, in px of frames."""
+
+    def __init__(self, level: Level, exposures: VirtualExposures, known: Trajectory | None, clock: Stopwatch) -> None:
+        self._level = level
+        self._exposures = exposures
+        self._known = known
+        self._clock = clock
+        self._described: dict[int, _Described] = {}
+        self.contrasts: dict[int, Contrast] = {}
+
+    def edges(
+        self, pairs: Sequence[tuple[int, int]], pool: ThreadPoolExecutor, threads: int, advance: Callable[[int], None]
+    ) -> Iterator[Edge]:
+        """Yield the pairs in order, as located or not."""
+        partners: dict[int, list[int]] = {moving: [] for moving in range(len(self._exposures))}
+        needed_until = {index: index + BRIDGE for index in partners}
+        for moving, fixed in pairs:
+            partners[moving].append(fixed)
+            needed_until[fixed] = max(needed_until[fixed], moving)
+        described = _in_order(pool, self._describe, range(len(self._exposures)), threads)
+        for moving, each in enumerate(described):
+            self._described[moving], self.contrasts[moving] = each, each.contrast
+            found = list(
+                pool.map(
+                    lambda fixed, moving=moving: self._register(moving, fixed, self._initial(moving, fixed)), partners[moving]
+                )
+            )
+            if not any(isinstance(edge.motion, Located) for edge in found):
+                found += self._bridge(moving, partners[moving])
+            yield from found
+            for index in [index for index in self._described if needed_until[index] <= moving]:
+                del self._described[index]
+            advance(1)
+
+    def revisits(self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor) -> Iterator[Edge]:
+        """Yield pairs of exposures that may see one place at different times; only those that look alike are located.
+
+        Both exposures of a pair are merged and described once more, since they were forgotten.
+
+        Args:
+            pairs: (moving, fixed), ordered by the moving exposure.
+            homographies: (N, 3, 3) where the level's other pairs put the exposures, frame pixels to a common plane.
+            pool: describes the two of a pair at the same time.
+        """
+        self._described.clear()
+        needed_until = {index: position for position, pair in enumerate(pairs) for index in pair}
+        for position, (moving, fixed) in enumerate(pairs):
+            missing = [index for index in (moving, fixed) if index not in self._described]
+            for index, described in zip(missing, pool.map(lambda each: self._describe(each, keep=True), missing), strict=True):
+                self._described[index] = described
+            yield self._revisit(moving, fixed, inverse(homographies[fixed]) @ homographies[moving])
+            for index in [index for index in self._described if needed_until[index] <= position]:
+                del self._described[index]
+
+    def _revisit(self, moving: int, fixed: int, expected: Homography) -> Edge:
+        edge = self._register(moving, fixed, rescaled(expected, self._level.scale))
+        first, second = self._described[moving].exposure, self._described[fixed].exposure
+        if isinstance(edge.motion, NotLocated) or first is None or second is None:
+            return edge
+        with self._clock("locate"):
+            alike = agreement(first, second, edge.motion.homography)
+        evidence = {**edge.motion.evidence, "agreement": alike}
+        if alike < MIN_AGREEMENT:
+            reason = f"they may show one place, but agree by {alike:.2f} only (at least {MIN_AGREEMENT:g} is needed)"
+            return Edge(moving, fixed, NotLocated(reason, evidence))
+        return replace(edge, motion=replace(edge.motion, evidence=evidence))
+
+    def _bridge(self, moving: int, tried: Sequence[int]) -> Iterator[Edge]:
+        for fixed in range(moving - 1, max(moving - BRIDGE, 0) - 1, -1):
+            if fixed not in tried:
+                edge = self._register(moving, fixed, self._initial(moving, fixed))
+                yield edge
+                if isinstance(edge.motion, Located):
+                    return
+
+    def _describe(self, index: int, keep: bool = False) -> _Described:
+        exposure = self._exposures[index]
+        with self._clock("locate"):
+            contrast = contrast_of(exposure)
+        described = _Described(contrast, exposure=exposure if keep else None)
+        if not contrast.blank:
+            first = self._level.locators[0]
+            described.features[first.name] = self._described_by(first, exposure)
+        return described
+
+    def _described_by(self, locator: NamedLocator, exposure: VirtualExposure) -> Any:
+        with self._clock("locate"), self._level.blaming(locator):
+            return locator.component.describe(exposure)
+
+    def _features(self, locator: NamedLocator, index: int) -> Any:
+        """Return what a locator makes of an exposure; a fallback is shown only those of pairs that were lost."""
+        described = self._described[index]
+        with described.lock:
+            if locator.name not in described.features:
+                described.features[locator.name] = self._described_by(locator, self._exposures[index])
+            return described.features[locator.name]
+
+    def _register(self, moving: int, fixed: int, initial: Homography | None) -> Edge:
+        """Offer a pair to one locator after the other, until one finds a motion that a camera makes.
+
+        Args:
+            moving: number of the exposure that is mapped.
+            fixed: number of the exposure that it is mapped to.
+            initial: (3, 3) where to start, in px of exposures.
+        """
+        for index in (moving, fixed):
+            if blank := self.contrasts[index].blank:
+                return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
+        lost: dict[str, NotLocated] = {}
+        for locator in self._level.locators:
+            motion = self._registered_by(locator, moving, fixed, initial)
+            if isinstance(motion, Located):
+                return Edge(moving, fixed, motion, locator.name)
+            lost[locator.name] = motion
+        return Edge(moving, fixed, _lost_by_all(lost))
+
+    def _registered_by(
+        self, locator: NamedLocator, moving: int, fixed: int, initial: Homography | None
+    ) -> Located | NotLocated:
+        features = self._features(locator, moving), self._features(locator, fixed)
+        with self._clock("locate"):
+            with self._level.blaming(locator):
+                motion = locator.component.register(*features, initial)
+            if isinstance(motion, NotLocated):
+                return motion
+            if broken := broken_promise(motion):
+                raise PluginError(f"{locator.origin} broke its contract at level {self._level.number}: {broken}")
+            return self._checked(motion, moving, fixed)
+
+    def _initial(self, moving: int, fixed: int) -> Homography | None:
+        """Return the motion known so far, in px of exposures."""
+        if self._known is None:
+            return None
+        instants = [self._exposures.groups[index].reference for index in (moving, fixed)]
+        to_plane = self._known.at(instants)
+        return rescaled(inverse(to_plane[1]) @ to_plane[0], self._level.scale)
+
+    def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
+        """Convert a motion to px of frames, and refuse what no camera does."""
+        homography = rescaled(motion.homography, 1 / self._level.scale)
+        if reason := implausibility(homography, self._exposures.frame_shape):
+            return NotLocated(reason, motion.evidence)
+        groups = self._exposures.groups
+        new = max(1 - shared_share(groups[moving].span, groups[fixed].span), SHARED_PHOTONS)
+        information = motion.information
+        if information is not None:
+            # p1..p8 in px of exposures to px of frames: to first order only translation and perspective change.
+            units = np.array([1, 1, 1, 1, self._level.scale, self._level.scale, 1 / self._level.scale, 1 / self._level.scale])
+            information = information * np.outer(units, units) * new
+        residual_px = None if motion.residual_px is None else motion.residual_px / self._level.scale
+        return replace(motion, homography=homography, information=information, residual_px=residual_px)
+
+
+def _lost_by_all(lost: Mapping[str, NotLocated]) -> NotLocated:
+    """Join what several locators say of a pair, each under its name; what a single one says stays as it is."""
+    if len(lost) == 1:
+        return next(iter(lost.values()))
+    reason = "; ".join(f"{name}: {each.reason}" for name, each in lost.items())
+    return NotLocated(reason, {f"{name}.{key}": value for name, each in lost.items() for key, value in each.evidence.items()})
+
+
+def broken_promise(motion: object) -> str | None:
+    """Tell what is wrong with what a locator calls a located pair; None if nothing is."""
+    if not isinstance(motion, Located):
+        return f"expected Located or NotLocated, got {type(motion).__name__}"
+    matrix, information = np.asarray(motion.homography), motion.information
+    if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)) or matrix[2, 2] == 0:
+        return f"a homography is a finite (3, 3) matrix with h33 = 1, got {matrix.tolist()}; a failure is NotLocated"
+    if information is not None and not _is_positive_definite(np.asarray(information)):
+        return "information is an inverse covariance: an (8, 8) matrix, finite and positive definite; None if there is none"
+    return None
+
+
+def _is_positive_definite(matrix: FloatArray) -> bool:
+    if matrix.shape != (8, 8) or not np.all(np.isfinite(matrix)):
+        return False
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _in_order(pool: ThreadPoolExecutor, work: Callable[[int], Any], items: Iterable[int], ahead: int) -> Iterator[Any]:
+    """Yield `work(item)` in order, with a few items worked on ahead."""
+    running: deque[Future[Any]] = deque()
+    try:
+        for item in items:
+            running.append(pool.submit(work, item))
+            if len(running) > ahead:
+                yield running.popleft().result()
+        while running:
+            yield running.popleft().result()
+    finally:
+        for future in running:
+            future.cancel()
