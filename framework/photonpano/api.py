@@ -76,6 +76,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
             coverage=outcome.panorama.weight,
             homographies=outcome.homographies,
             located=outcome.located,
+            std_px=outcome.std_px,
             canvas=outcome.panorama.canvas,
             frame_shape=source.info.frame_shape,
             reference=outcome.reference,

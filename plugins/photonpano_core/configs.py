@@ -34,8 +34,8 @@ class PhotonMleConfig(Config):
     )
 
 
-class LucasKanadeConfig(Config):
-    """A spline through the eight parameters p1..p8."""
+class InterpolatorConfig(Config):
+    """What all interpolators share: how they go on beyond the knots."""
 
     hold_frames: float | None = Field(
         None,
@@ -43,3 +43,19 @@ class LucasKanadeConfig(Config):
         description="how many frames beyond the last located instant the velocity is held before the motion stops; "
         "by default the mean distance of located instants",
     )
+
+
+class LucasKanadeConfig(InterpolatorConfig):
+    """A spline through the eight parameters p1..p8."""
+
+
+class SmoothingSplineConfig(InterpolatorConfig):
+    """A spline of p1..p8 that passes the knots as closely as their noise deserves."""
+
+
+class GeodesicConfig(InterpolatorConfig):
+    """Constant velocity from each knot to the next."""
+
+
+class LieConfig(InterpolatorConfig):
+    """A smooth curve through the knots, in the group of the homographies."""

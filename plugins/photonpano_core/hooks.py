@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from photonpano import (
     InterpolatorContribution,
@@ -11,7 +11,14 @@ from photonpano import (
     SourceContribution,
     hookimpl,
 )
-from photonpano_core.configs import LucasKanadeConfig, MidpointConfig, PhotonMleConfig
+from photonpano_core.configs import (
+    GeodesicConfig,
+    LieConfig,
+    LucasKanadeConfig,
+    MidpointConfig,
+    PhotonMleConfig,
+    SmoothingSplineConfig,
+)
 from photonpano_core.midpoint import MidpointResampler, too_short
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 
@@ -51,13 +58,31 @@ def photonpano_mergers() -> Iterator[MergerContribution[PhotonMleConfig]]:
 
 
 @hookimpl
-def photonpano_interpolators() -> Iterator[InterpolatorContribution[LucasKanadeConfig]]:
-    """Offer the paper's interpolation."""
+def photonpano_interpolators() -> Iterator[InterpolatorContribution[Any]]:
+    """Offer the paper's interpolation, and others."""
     yield InterpolatorContribution(
         name="lucas-kanade",
         summary="Cubic spline of the eight parameters of the homography (paper, section 4)",
         config=LucasKanadeConfig,
         build=_build_lucas_kanade,
+    )
+    yield InterpolatorContribution(
+        name="smoothing-spline",
+        summary="Smoothing spline of the eight parameters, as smooth as the noise of the located instants asks for",
+        config=SmoothingSplineConfig,
+        build=_build_smoothing_spline,
+    )
+    yield InterpolatorContribution(
+        name="geodesic",
+        summary="Constant velocity from each located instant to the next, in the group of the homographies",
+        config=GeodesicConfig,
+        build=_build_geodesic,
+    )
+    yield InterpolatorContribution(
+        name="lie",
+        summary="Cubic spline in the group of the homographies",
+        config=LieConfig,
+        build=_build_lie,
     )
 
 
@@ -78,3 +103,22 @@ def _build_lucas_kanade(config: LucasKanadeConfig, context: StageContext) -> Int
 
     del context
     return LucasKanadeInterpolator(config)
+
+
+def _build_smoothing_spline(config: SmoothingSplineConfig, context: StageContext) -> Interpolator:
+    from photonpano_core.smoothing_spline import SmoothingSplineInterpolator
+
+    return SmoothingSplineInterpolator(config, context.stream.frame_shape)
+
+
+def _build_geodesic(config: GeodesicConfig, context: StageContext) -> Interpolator:
+    from photonpano_core.geodesic import GeodesicInterpolator
+
+    del context
+    return GeodesicInterpolator(config)
+
+
+def _build_lie(config: LieConfig, context: StageContext) -> Interpolator:
+    from photonpano_core.lie import LieInterpolator
+
+    return LieInterpolator(config, context.stream.frame_shape)

@@ -78,6 +78,7 @@ def test_the_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str,
         "frame_shape": (2,),
         "reference": (),
         "located": (N_FRAMES,),
+        "std_px": (N_FRAMES,),
     }
     assert homographies.dtype == trajectory["canvas"].dtype == np.float64
     assert trajectory["located"].dtype == np.bool_

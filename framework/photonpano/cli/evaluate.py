@@ -45,6 +45,7 @@ def _rows(evaluation: "Evaluation") -> list[list[str]]:
         ["corner error, 95 %", f"{motion.p95_px:.3f} px"],
         ["corner error, worst frame", f"{motion.max_px:.3f} px"],
         ["frames located", f"{100 * motion.located_share:.1f} %"],
+        ["frames within 3 std_px", f"{100 * evaluation.honest_share:.1f} %"],
     ]
     for name, score in (("panorama", evaluation.panorama), ("oracle", evaluation.oracle)):
         if score is not None:
@@ -64,6 +65,7 @@ def _data(evaluation: "Evaluation") -> dict[str, Any]:
             "max": motion.max_px,
         },
         "located_share": motion.located_share,
+        "within_three_std_share": evaluation.honest_share,
         "panorama": _scores(evaluation.panorama),
         "oracle": _scores(evaluation.oracle),
         "below_oracle_db": evaluation.below_oracle_db,

@@ -1,6 +1,6 @@
 """Scores of trajectories and panoramas against a known truth."""
 
-from photonpano.evaluation.alignment import align_planes
+from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import Truth, load_truth
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
@@ -13,12 +13,13 @@ __all__ = [
     "Renderer",
     "TrajectoryScore",
     "Truth",
-    "align_planes",
     "corner_errors",
     "covered",
     "evaluate",
+    "exposure_bound_px",
     "image_score",
     "load_truth",
+    "pair_bound_px",
     "true_panorama",
     "white_flux",
 ]

@@ -45,12 +45,14 @@ class RunTrajectory:
         canvas: (3, 3), reference pixels to panorama pixels.
         frame_shape: (height, width) of a frame.
         located: (T,), False where a frame lies outside what was located.
+        std_px: (T,) the expected corner error.
     """
 
     homographies: FloatArray
     canvas: Homography
     frame_shape: tuple[int, int]
     located: BoolArray
+    std_px: FloatArray
 
 
 def load_truth(path: Path) -> Truth:
@@ -84,14 +86,18 @@ def load_run_trajectory(folder: Path) -> RunTrajectory:
     path = folder / "trajectory.npz"
     if not path.exists():
         raise InputError(f"{folder} has no trajectory.npz, so no run finished in it; give the run folder of one that did")
-    arrays = _read_archive(path, "the trajectory of a run", ("homographies", "canvas", "frame_shape", "located"), ())
+    arrays = _read_archive(path, "the trajectory of a run", ("homographies", "canvas", "frame_shape", "located", "std_px"), ())
     homographies = _homographies(path, arrays)
-    canvas, located = arrays["canvas"], arrays["located"]
+    canvas, located, std_px = arrays["canvas"], arrays["located"], arrays["std_px"]
     if canvas.shape != (3, 3):
         raise InputError(f"{path}: canvas must have the shape (3, 3), got {canvas.shape}")
     if located.shape != (len(homographies),):
         raise InputError(f"{path}: located must have a flag for each of {len(homographies)} frames, got {located.shape}")
-    return RunTrajectory(homographies, canvas.astype(np.float64), _frame_shape(path, arrays), located.astype(bool))
+    if std_px.shape != (len(homographies),):
+        raise InputError(f"{path}: std_px must have a number for each of {len(homographies)} frames, got {std_px.shape}")
+    return RunTrajectory(
+        homographies, canvas.astype(np.float64), _frame_shape(path, arrays), located.astype(bool), std_px.astype(np.float64)
+    )
 
 
 def load_panorama(folder: Path) -> tuple[FluxImage, FluxImage]:

@@ -33,12 +33,14 @@ class Evaluation:
 
     Attributes:
         trajectory: corner errors.
+        honest_share: share of the located frames whose corner error is at most three times what the run expected, `std_px`.
         panorama: the panorama against the true scene; None if the truth has no scene.
         oracle: the panorama along the true motion, over the same pixels; None if it was not asked for.
         white_flux: the flux that is white when images are compared, in photons per pixel per frame; None without a scene.
     """
 
     trajectory: TrajectoryScore
+    honest_share: float
     panorama: ImageScore | None = None
     oracle: ImageScore | None = None
     white_flux: float | None = None
@@ -67,8 +69,9 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     truth = load_truth(truth_path)
     _check_same_capture(folder, run, truth_path, truth)
     motion = corner_errors(run.homographies, truth.homographies, run.frame_shape, run.located)
+    honest_share = float((motion.errors_px <= 3 * run.std_px)[run.located].mean())
     if truth.scene is None:
-        return Evaluation(motion)
+        return Evaluation(motion, honest_share)
 
     white = white_flux(truth.scene)
     if not white > 0:
@@ -86,6 +89,7 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
         raise InputError(f"{folder}: the panorama and the true scene have no pixel in common")
     return Evaluation(
         trajectory=motion,
+        honest_share=honest_share,
         panorama=image_score(flux, true_image, compared, white),
         oracle=None if oracle is None else image_score(oracle.flux, true_image, compared, white),
         white_flux=white,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano.evaluation.alignment import align_planes
-from photonpano.geometry import corner_displacements
+from photonpano.geometry import align_planes, corner_displacements
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -1,5 +1,6 @@
 """Pure functions on homographies and canvases: points are (x, y), integers are pixel centres, maps are float64."""
 
+from photonpano.geometry.alignment import align_planes
 from photonpano.geometry.canvas import Canvas, canvas_of
 from photonpano.geometry.homographies import (
     apply,
@@ -18,6 +19,7 @@ from photonpano.geometry.plausibility import implausibility
 
 __all__ = [
     "Canvas",
+    "align_planes",
     "apply",
     "canvas_of",
     "corner_displacements",

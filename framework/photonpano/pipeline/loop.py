@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from photonpano.errors import PluginError
-from photonpano.geometry import corner_displacements, inverse
 from photonpano.pipeline.locate import locate
 from photonpano.pipeline.merge import merge
 from photonpano.pipeline.stopwatch import Stopwatch
 from photonpano.pipeline.trajectory import ReferencedTrajectory
+from photonpano.pipeline.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +33,7 @@ class LevelResult:
         groups: what was merged.
         located: pairs, motions, and where the exposures lie.
         trajectory: the motion known after the level; the reference frame's homography is the identity.
-        change_px: how far the level moved the corners of the frames, on average, in px of a frame; None at the first.
+        uncertainty: how far it may be from the true one.
         seconds: time spent in each stage.
     """
 
@@ -43,12 +41,28 @@ class LevelResult:
     groups: tuple[Group, ...]
     located: LocatedLevel
     trajectory: Trajectory
-    change_px: float | None
+    uncertainty: Uncertainty
     seconds: dict[str, float]
+
+    @property
+    def change_px(self) -> float | None:
+        """How far the level moved the corners of the frames, on average, in px of a frame; None at the first."""
+        return self.uncertainty.change_px
+
+    @property
+    def converged(self) -> bool:
+        """Whether another level would change less than is known: the level changed the motion by less than its uncertainty."""
+        return self.change_px is not None and self.change_px <= self.uncertainty.mean_px
 
 
 def estimate_motion(
-    source: Source, levels: Sequence[Level], graph: GraphSettings, reference: int, threads: int, progress: Progress
+    source: Source,
+    levels: Sequence[Level],
+    graph: GraphSettings,
+    reference: int,
+    threads: int,
+    progress: Progress,
+    until_converged: bool = False,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level.
 
@@ -59,6 +73,7 @@ def estimate_motion(
         reference: the frame whose homography is the identity.
         threads: how many exposures are worked on at once; the result does not depend on it.
         progress: is told of the stages.
+        until_converged: stop as soon as a level changes the motion by less than its own uncertainty.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -72,10 +87,12 @@ def estimate_motion(
         exposures = merge(level, source, groups, known, clock)
         located = locate(level, exposures, known, graph, threads, clock, progress)
         trajectory = interpolate(level, located, reference, clock)
-        change_px = None if known is None else _change_px(known, trajectory, source)
-        results.append(LevelResult(level, groups, located, trajectory, change_px, clock.seconds))
+        uncertainty = Uncertainty(located, trajectory, known, source.info.n_frames)
+        results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds))
         progress.note(_summary(results[-1]))
         known = trajectory
+        if until_converged and results[-1].converged:
+            break
     return results
 
 
@@ -99,15 +116,8 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
 def interpolate(level: Level, located: LocatedLevel, reference: int, clock: Stopwatch) -> Trajectory:
     """Turn the located instants into a homography for every frame (paper, section 4, "Interpolate")."""
     with clock("interpolate"), level.blaming("interpolator"):
-        free = level.interpolator.fit(located.instants, located.homographies, None)
-        return ReferencedTrajectory(free, reference)
-
-
-def _change_px(before: Trajectory, after: Trajectory, source: Source) -> float:
-    """Return the mean distance between where two trajectories put the corners of the frames, in px of a frame."""
-    frames = np.unique(np.linspace(0, source.info.n_frames - 1, 1000).astype(int))
-    moved = inverse(before.at(frames)) @ after.at(frames)
-    return float(corner_displacements(moved, np.eye(3), source.info.frame_shape).mean())
+        free = level.interpolator.fit(located.instants, located.homographies, located.information)
+        return ReferencedTrajectory(free, reference, located.covered)
 
 
 def _summary(result: LevelResult) -> str:

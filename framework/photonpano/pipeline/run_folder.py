@@ -51,6 +51,7 @@ class RunFolder:
         self,
         homographies: FloatArray,
         located: BoolArray,
+        std_px: FloatArray,
         canvas: Homography,
         frame_shape: tuple[int, int],
         reference: int,
@@ -64,6 +65,7 @@ class RunFolder:
         Args:
             homographies: (T, 3, 3) float64.
             located: (T,), False where a frame lies outside what was located.
+            std_px: (T,) the expected corner error, infinite where a frame lies outside what was located.
             canvas: (3, 3) float64.
             frame_shape: (height, width) of a frame.
             reference: the frame whose homography is the identity.
@@ -76,6 +78,7 @@ class RunFolder:
                 frame_shape=np.array(frame_shape),
                 reference=np.array(reference),
                 located=located,
+                std_px=std_px,
             )
 
     def write_record(self, record: Mapping[str, Any]) -> None:

@@ -73,12 +73,12 @@ STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "i
 
 
 def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
-    """Draw where the centre of the frame is, and how fast it moves, over time."""
+    """Draw where the centre of the frame is, how fast it moves, and how far its corners may be off, over time."""
     instants = _instants(len(arrays.homographies))
     centre = _centre(arrays.frame_shape)
     path = apply(arrays.homographies[instants], centre)[:, 0] - centre[0]
-    with _figure(WIDTH_IN, 4.6) as figure:
-        position, speed = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    with _figure(WIDTH_IN, 6.0) as figure:
+        position, speed, error = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
         for values, name, colour in zip(path.T, ("x", "y"), SERIES, strict=False):
             position.plot(instants, values, color=colour)
             end = instants[-1], values[-1]
@@ -91,10 +91,15 @@ def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
             speed.plot((instants[:-1] + instants[1:]) / 2, steps, color=SERIES[2])
         speed.set_ylim(bottom=0)
         speed.set_ylabel("speed (px/frame)")
-        speed.set_xlabel("frame")
-        speed.set_xlim(-0.5, len(arrays.homographies) - 0.5)
-        speed.xaxis.set_major_formatter("{x:,.0f}")
-        for axes in (position, speed):
+        known = np.where(np.isfinite(arrays.std_px), arrays.std_px, np.nan)
+        error.plot(instants, known[instants], color=INK)
+        error.set_yscale("log")
+        error.yaxis.set_major_formatter("{x:g}")
+        error.set_ylabel("expected error (px)")
+        error.set_xlabel("frame")
+        error.set_xlim(-0.5, len(arrays.homographies) - 0.5)
+        error.xaxis.set_major_formatter("{x:,.0f}")
+        for axes in (position, speed, error):
             _shade_not_located(axes, arrays)
         if frame_rate_hz is not None and len(instants) > 1:
             _add_time_axis(position, len(arrays.homographies), frame_rate_hz)

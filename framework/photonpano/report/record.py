@@ -45,8 +45,9 @@ class LevelRecord(TypedDict):
     """One level.
 
     `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them; `located_by` counts pairs by locator.
-    `change_px` is how far the level moved the corners of the frames, None at the first level. `seconds` has an entry for each
-    stage.
+    `revisits` counts, as `pairs` and `located`, pairs that may see one place at different times; `contradictions` are located
+    pairs that were dropped because the others outvote them. `change_px` is how far the level moved the corners of the frames,
+    None at the first level; `std_px` is how far the photons leave them open. `seconds` has an entry for each stage.
     """
 
     level: int
@@ -57,9 +58,28 @@ class LevelRecord(TypedDict):
     located: int
     located_by: Mapping[str, int]
     failures: Sequence[FailureRecord]
+    revisits: Mapping[str, int]
+    contradictions: Sequence[Mapping[str, Sequence[int]]]
     change_px: float | None
+    std_px: float | None
     residual_px: float | None
     seconds: Mapping[str, float]
+
+
+class MotionRecord(TypedDict):
+    """The expected corner error of the located frames, in px: its mean, the largest, and the frame that has it."""
+
+    std_px: float
+    worst_std_px: float
+    worst_frame: int
+
+
+class DecisionRecord(TypedDict):
+    """Something that the spec left open, what was chosen, and why."""
+
+    what: str
+    value: bool | int | float | str
+    reason: str
 
 
 class PanoramaRecord(TypedDict):
@@ -74,7 +94,10 @@ class PanoramaRecord(TypedDict):
 
 
 class RunRecord(TypedDict):
-    """The content of `run.json`. `created` is an ISO 8601 time; `panorama` is None for a run that did not get so far."""
+    """The content of `run.json`.
+
+    `created` is an ISO 8601 time; `motion` and `panorama` are None for a run that did not get so far.
+    """
 
     photonpano: str
     status: str
@@ -85,7 +108,9 @@ class RunRecord(TypedDict):
     source: SourceRecord
     plugins: Sequence[PluginRecord]
     libraries: Mapping[str, str]
+    decisions: Sequence[DecisionRecord]
     levels: Sequence[LevelRecord]
+    motion: MotionRecord | None
     panorama: PanoramaRecord | None
     warnings: Sequence[str]
     seconds: float
@@ -104,6 +129,7 @@ class RunArrays:
         coverage: (H, W) float32, how many frames each pixel was seen in.
         homographies: (T, 3, 3) the trajectory.
         located: (T,) False where a frame lies outside what was located.
+        std_px: (T,) the expected corner error, infinite where a frame lies outside what was located.
         canvas: (3, 3), reference pixels to panorama pixels.
         frame_shape: (height, width) of a frame.
         reference: the frame whose homography is the identity.
@@ -113,6 +139,7 @@ class RunArrays:
     coverage: FluxImage
     homographies: FloatArray
     located: BoolArray
+    std_px: FloatArray
     canvas: Homography
     frame_shape: tuple[int, int]
     reference: int

@@ -77,6 +77,7 @@ def test_evaluate(finished: Path, invoke: Callable[..., Any]) -> None:
         "corner error, 95 %": f"{scores['corner_error_px']['p95']:.3f} px",
         "corner error, worst frame": f"{scores['corner_error_px']['max']:.3f} px",
         "frames located": f"{100 * scores['located_share']:.1f} %",
+        "frames within 3 std_px": f"{100 * scores['within_three_std_share']:.1f} %",
         "PSNR, panorama": f"{scores['panorama']['psnr_db']:.2f} dB",
         "SSIM, panorama": f"{scores['panorama']['ssim']:.4f}",
         "PSNR, oracle": f"{scores['oracle']['psnr_db']:.2f} dB",
@@ -111,6 +112,16 @@ def test_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> Non
         "# each further level: about twice the groups and pairs of the one before",
     ]
     assert parse_spec(printed).document == load_spec("capture.yaml", ["levels=until-converged"]).document
+
+
+def test_what_depends_on_the_frames_is_left_open(folder: Path, invoke: Callable[..., Any]) -> None:
+    arguments = ["capture.yaml", "--set", "resample.with.group_size=auto"]
+    check = invoke("check", *arguments).stdout.splitlines()
+    assert check[1:] == ["groups are chosen from flux and speed when the capture is read"]
+    printed = invoke("explain", *arguments).stdout
+    assert "  # level 1: groups are chosen from flux and speed when the capture is read\n" in printed
+    assert "    group_size: auto  # --set\n" in printed
+    assert parse_spec(printed).document == load_spec("capture.yaml", arguments[2:]).document
 
 
 def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) -> None:

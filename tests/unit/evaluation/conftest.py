@@ -74,6 +74,7 @@ def capture(tmp_path: Path, true_motion: np.ndarray) -> SimpleNamespace:
             "frame_shape": np.array(FRAME_SHAPE),
             "reference": np.array(60),
             "located": np.ones(len(estimated), dtype=bool),
+            "std_px": np.full(len(estimated), 0.5),
         },
         true={
             "homographies": true_motion,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, PluginError
+from photonpano.geometry import translation
 from photonpano.pipeline.loop import estimate_motion
 from photonpano.pipeline.progress import Quiet
 from photonpano.spec.settings import GraphSettings
@@ -59,13 +60,32 @@ def test_a_level_is_merged_along_the_motion_of_the_one_before(run: Callable, mak
     assert merged_along == [None] * 12 + [results[0].trajectory] * 23
 
 
-def test_it_tells_how_far_a_level_moved_the_frames(run: Callable, make_level: Callable, pan: Callable) -> None:
-    """From a pan of 0.3 to one of 0.4 px a frame: seen from frame 60, by 0.1 * |t - 60| px, where it is located."""
-    first, second = run(make_level(pan(0.3)), make_level(pan(0.4), number=2))
+def test_it_tells_how_far_a_level_moved_the_frames(run: Callable, make_level: Callable, known_motion: type) -> None:
+    """From a pan to one that also sways by 2 px, four times; another plane of reference would explain next to nothing."""
+
+    def swaying(by_px: float) -> Any:
+        return known_motion(lambda frame: translation(0.3 * frame, by_px * np.sin(2 * np.pi * frame / 30)))
+
+    first, second = run(make_level(swaying(0.0)), make_level(swaying(2.0), number=2))
     assert first.change_px is None
-    frames = np.clip(np.arange(N_FRAMES), 4.5, 114.5)
-    assert second.change_px == pytest.approx(0.1 * np.abs(frames - 60).mean(), rel=0.01)
+    assert second.change_px == pytest.approx(2 * 2 / np.pi, rel=0.15)
     assert set(second.seconds) == {"resample", "merge", "locate", "interpolate"}
+
+
+def test_a_level_that_finds_the_same_changes_nothing(run: Callable, make_level: Callable, pan: Callable) -> None:
+    _, second = run(make_level(pan(0.3)), make_level(pan(0.3), number=2), reference=100)
+    assert second.change_px == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("wanted", "levels"), [(True, 2), (False, 4)])
+def test_it_stops_when_a_level_changes_less_than_is_known(
+    source: Any, make_level: Callable, pan: Callable, wanted: bool, levels: int
+) -> None:
+    """Measured without information, a corner is known to a pixel; the second level changes nothing."""
+    chosen = [make_level(pan(0.3), number=number) for number in (1, 2, 3, 4)]
+    results = estimate_motion(source, chosen, GraphSettings(), 60, 2, Quiet(), until_converged=wanted)
+    assert len(results) == levels
+    assert [result.converged for result in results] == [False, *[True] * (levels - 1)]
 
 
 def test_it_notes_a_line_for_each_level(source: Any, make_level: Callable, pan: Callable) -> None:

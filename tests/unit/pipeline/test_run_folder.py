@@ -33,7 +33,7 @@ def write_panorama(folder: RunFolder) -> None:
 
 def write_trajectory(folder: RunFolder) -> None:
     homographies = np.random.default_rng(0).random((500, 3, 3))
-    folder.write_trajectory(homographies, np.ones(500, bool), PANORAMA.canvas, (48, 64), 250)
+    folder.write_trajectory(homographies, np.ones(500, bool), np.ones(500), PANORAMA.canvas, (48, 64), 250)
 
 
 def write_record(folder: RunFolder) -> None:
@@ -75,7 +75,7 @@ def test_the_files_hold_what_was_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tifffile.imread(directory / "coverage.tiff"), PANORAMA.weight)
     np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), PICTURE)
     with np.load(directory / "trajectory.npz") as archive:
-        assert set(archive.files) == {"homographies", "canvas", "frame_shape", "reference", "located"}
+        assert set(archive.files) == {"homographies", "canvas", "frame_shape", "reference", "located", "std_px"}
         assert tuple(archive["frame_shape"]) == (48, 64)
     assert json.loads((directory / "run.json").read_text()) == {"warnings": ["a line"] * 2000}
     assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")

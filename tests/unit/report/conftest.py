@@ -40,6 +40,7 @@ def make_arrays(n_frames: int = N_FRAMES) -> RunArrays:
         coverage=coverage.astype(np.float32),
         homographies=homographies,
         located=located,
+        std_px=np.where(located, 0.05 + 0.6 * (2 * time - 1) ** 8, np.inf),
         canvas=canvas.transform,
         frame_shape=FRAME_SHAPE,
         reference=reference,
@@ -71,7 +72,10 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             "located": groups - (number == 2),
             "located_by": {"opencv-sift": groups - 1 - (10 if number == 2 else 0)},
             "failures": failures if number == 2 else [],
+            "revisits": {"pairs": 12 * (number - 1), "located": 11 * (number - 1)},
+            "contradictions": [{"moving": [4000, 4250], "fixed": [1500, 1750]}] if number == 3 else [],
             "change_px": change,
+            "std_px": 0.21 / number,
             "residual_px": 0.42 / number,
             "seconds": {stage: value * groups / 40 for stage, value in seconds.items()},
         }
@@ -111,7 +115,9 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             for stage, choice in stages.items()
         ],
         "libraries": {"numpy": "2.4.6", "opencv-python-headless": "5.0.0.93", "scipy": "1.17.1", "python": "3.11.7"},
+        "decisions": [{"what": "group_size", "value": 250, "reason": "at 0.15 px a frame they are blurred by 38 px"}],
         "levels": levels,
+        "motion": {"std_px": 0.07, "worst_std_px": 0.61, "worst_frame": 9874},
         "panorama": {
             "height": height,
             "width": width,

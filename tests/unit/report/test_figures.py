@@ -61,7 +61,7 @@ def test_long_captures_are_drawn_at_a_bounded_number_of_instants(arrays):
 
 def test_frames_that_were_not_located_are_shaded(small):
     shaded = '<path d="[^"]*"[^>]*style="fill: var\\(--muted\\); opacity: 0.18'
-    assert len(re.findall(shaded, figures.path_over_time(small, None))) == 2
+    assert len(re.findall(shaded, figures.path_over_time(small, None))) == 3
     assert not re.findall(shaded, figures.path_over_time(replace(small, located=np.ones(200, bool)), None))
 
 
@@ -71,7 +71,7 @@ def test_time_has_the_unit_that_fits(small, rate, label):
 
 
 def test_a_single_frame_can_be_drawn(small):
-    single = replace(small, homographies=np.eye(3)[None], located=np.ones(1, bool), reference=0)
+    single = replace(small, homographies=np.eye(3)[None], located=np.ones(1, bool), std_px=np.ones(1), reference=0)
     for svg in (figures.path_over_time(single, 100.0), figures.path_on_panorama(single)):
         ElementTree.fromstring(svg)
 

@@ -64,6 +64,7 @@ def test_the_page_says_what_happened(record, arrays, no_figures):
         "change in the last level 0.063 px",
         "time 1 min 23 s",
         "peak memory 812 MiB",
+        "Chosen from what the capture shows group_size : 250 \N{EN DASH} at 0.15 px a frame they are blurred by 38 px",
         "250 frames of 10,000 were not located: 0 to 124; 9,875 to 9,999 (counted from 0; the trajectory is",
         "the images overlap by 4% (at least 10% is needed)",
         "9,000 to 9,249 against 9,125 to 9,374",
@@ -93,9 +94,9 @@ def test_each_level_is_a_row(record, arrays, no_figures):
     rows = [["".join(cell.itertext()) for cell in row] for row in table.find("tbody")]
     dash = "\N{EN DASH}"
     assert rows == [
-        ["1", "1", "40", "250", "40", "39", "0", dash, "0.42", "0.00", "2.41", "9.30", "0.02"],
-        ["2", "1", "79", "250", "78", "78", "10", "1.83", "0.21", "0.00", "4.76", "18.37", "0.04"],
-        ["3", "1", "157", "250", "157", "156", "0", "0.063", "0.14", "0.00", "9.46", "36.50", "0.08"],
+        ["1", "1", "40", "250", "40", "39", "0", "0", dash, "0.21", "0.42", "0.00", "2.41", "9.30", "0.02"],
+        ["2", "1", "79", "250", "78", "78", "10", "11 of 12", "1.83", "0.1", "0.21", "0.00", "4.76", "18.37", "0.04"],
+        ["3", "1", "157", "250", "157", "156", "0", "22 of 24", "0.063", "0.070", "0.14", "0.00", "9.46", "36.50", "0.08"],
     ]
 
 
@@ -111,6 +112,7 @@ def test_everything_from_outside_is_escaped(record, arrays, no_figures):
     record["spec_file"] = HOSTILE
     record["status"] = HOSTILE
     record["warnings"] = [HOSTILE]
+    record["decisions"][0]["reason"] = HOSTILE
     record["levels"][1]["failures"][0]["reason"] = HOSTILE
     record["spec"]["source"]["with"]["path"] = HOSTILE
     record["plugins"][0]["use"] = HOSTILE
@@ -118,7 +120,7 @@ def test_everything_from_outside_is_escaped(record, arrays, no_figures):
     page = render_report(record, arrays)
     check_self_contained(page)
     assert "<script>" not in page
-    assert text_of(page).count('<script>alert("1")</script>') == 8
+    assert text_of(page).count('<script>alert("1")</script>') == 9
 
 
 def test_all_frames_located(record, arrays, no_figures):

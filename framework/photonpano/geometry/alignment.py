@@ -1,4 +1,4 @@
-"""The map between the plane of an estimated trajectory and the plane of the truth."""
+"""The map between the planes of two trajectories, such as an estimate and the truth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano.geometry import apply, corners, from_parameters, normalised
+from photonpano.geometry.homographies import apply, corners, from_parameters, normalised
 
 if TYPE_CHECKING:
     from photonpano.values import FloatArray, Homography

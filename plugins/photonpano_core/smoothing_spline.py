@@ -1,0 +1,168 @@
+"""A smoothing spline of the eight parameters of the homography, as smooth as the noise of the knots asks for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import sparse
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_banded
+
+from photonpano.geometry import corners, jacobian, parameters
+from photonpano_core.lucas_kanade import ParameterTrajectory, interpolating_spline
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from photonpano_core.configs import SmoothingSplineConfig
+
+    FloatArray = NDArray[np.float64]
+
+ORDER = 3
+"""Of the derivative that is penalised. A parabola, which fits any three knots, goes free."""
+_SCALES = np.logspace(-10, 10, 41)
+"""From hardly any jerk, so that a parabola remains, to so much that all knots stay where they are. The number of knots that are
+averaged goes with the sixth root."""
+_NOISES = np.logspace(-16, 0, 129)
+"""Variances of the noise, as shares of how far the knots are from a parabola."""
+_TINY = 1e-200
+"""The noise of knots that lie on a parabola exactly."""
+_LEAST_KNOWN = 1e-8
+"""What a knot knows of nothing, as a share of the best known: its error is no more than 10,000 times as large."""
+
+
+class SmoothingSplineInterpolator:
+    """Moves the knots as far as their noise deserves, and puts the spline of `lucas-kanade` through them.
+
+    They move to the spline f of degree 5 that minimises, over the knots y with their information W,
+
+        sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale.
+
+    The modes are shift, stretch, shear, and so on, of the corners of the frame, in px. So each knot counts for what it
+    knows, direction by direction, and each mode is as smooth as it is found to be. The scales, and the factor by which the
+    noise of all differs from what W says, have the restricted maximum likelihood if the jerk is white noise. There is one such
+    factor, and not one a mode, since modes that no camera excites tell noise from motion that is too fast for the knots.
+    """
+
+    def __init__(self, config: SmoothingSplineConfig, frame_shape: tuple[int, int]) -> None:
+        """Take the (height, width) of a frame."""
+        self._config = config
+        to_corners = jacobian(np.eye(3), corners(frame_shape)).reshape(8, 8)
+        self._to_modes = np.kron(hadamard(4) / 2, np.eye(2)) @ to_corners
+
+    def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
+        """Smooth; without information all knots count alike, with equal and independent errors of the corners.
+
+        Up to three knots are interpolated.
+        """
+        from_modes = np.linalg.inv(self._to_modes)
+        knots = parameters(homographies) @ self._to_modes.T
+        if len(instants) > ORDER:
+            if information is None:
+                covariances = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
+            else:
+                covariances = _inverse(from_modes.T @ information @ from_modes)
+            knots = smoothed(instants, knots, covariances)
+        spline = interpolating_spline(instants, knots @ from_modes.T)
+        return ParameterTrajectory(instants, spline, self._config.hold_frames)
+
+
+def smoothed(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return where a smoothing spline passes the knots: (N, K).
+
+    Both the noise of the knots and a jerk that is white noise make their third differences normally distributed; what the jerk
+    does not explain of them is taken from the knots (Reinsch 1967, and de Hoog and Hutchinson 1987, for K = 1).
+
+    Args:
+        instants: (N,), more than three.
+        knots: (N, K) values of K modes.
+        covariances: (N, K, K) of the knots, up to a common factor.
+    """
+    n_knots, n_modes = knots.shape
+    times = instants * ((n_knots - 1) / (instants[-1] - instants[0]))
+    difference, jerk = _third_differences(times), _jerk_covariance(times)
+    observed = difference @ knots
+    modes = [
+        _Mode(observed[:, mode], difference @ sparse.diags_array(covariances[:, mode, mode]) @ difference.T, jerk)
+        for mode in range(n_modes)
+    ]
+    every = sparse.kron(difference, sparse.eye_array(n_modes))
+    noise = sparse.bsr_array((covariances, np.arange(n_knots), np.arange(n_knots + 1)))
+    expected = every @ noise @ every.T + sparse.kron(jerk, sparse.diags_array(_most_likely_scales(modes)))
+    pulls = solveh_banded(_banded(expected, (ORDER + 1) * n_modes - 1), observed.ravel())
+    return np.asarray(knots - (noise @ (every.T @ pulls)).reshape(n_knots, n_modes))
+
+
+class _Mode:
+    """How likely the third differences of one mode are, for each scale of its jerk.
+
+    With the noise variance s and the jerk's variance s l, they are normally distributed with the covariance s (V + l J). So
+    minus twice the logarithm of their likelihood is n log s + squares(l) / s + determinant(l), but for a constant.
+
+    Attributes:
+        n_observed: n.
+        scales: (L,) values of l.
+        squares: (L,) of the third differences, divided by V + l J.
+        determinants: (L,) logarithms of those of V + l J.
+    """
+
+    def __init__(self, observed: FloatArray, noise: sparse.csr_array, jerk: sparse.csr_array) -> None:
+        """Take the (N - 3,) third differences, and their covariances due to each."""
+        self.n_observed = len(observed)
+        self.scales = _SCALES * np.median(noise.diagonal() / jerk.diagonal())
+        self.squares, self.determinants = np.empty((2, len(self.scales)))
+        noise_bands, jerk_bands = _banded(noise, ORDER), _banded(jerk, ORDER)
+        for index, scale in enumerate(self.scales):
+            factor = cholesky_banded(noise_bands + scale * jerk_bands)
+            self.squares[index] = observed @ cho_solve_banded((factor, False), observed)
+            self.determinants[index] = 2 * np.log(factor[-1]).sum()
+
+
+def _most_likely_scales(modes: Sequence[_Mode]) -> list[float]:
+    """Return the scale of each mode that is most likely where all have the same noise."""
+    n_observed = modes[0].n_observed
+    largest = sum(mode.squares[0] for mode in modes) / (n_observed * len(modes))
+    noises = max(largest, _TINY) * _NOISES[:, None]
+    deviances = [n_observed * np.log(noises) + mode.squares / noises + mode.determinants for mode in modes]
+    best = np.argmin(sum(deviance.min(axis=1) for deviance in deviances))
+    return [mode.scales[deviance[best].argmin()] for mode, deviance in zip(modes, deviances, strict=True)]
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Return covariances, (N, K, K), also for knots that know nothing of a direction."""
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, _LEAST_KNOWN * values.max())
+    return np.asarray((vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+def _third_differences(times: FloatArray) -> sparse.csr_array:
+    """Return the (N - 3, N) map from N values to divided differences, which are the third derivatives of cubics."""
+    result = sparse.csr_array(sparse.eye_array(len(times)))
+    for order in range(1, ORDER + 1):
+        lengths = times[order:] - times[:-order]
+        result = sparse.csr_array(sparse.diags_array(order / lengths) @ (result[1:] - result[:-1]))
+    return result
+
+
+def _jerk_covariance(times: FloatArray) -> sparse.csr_array:
+    """Return the covariance of third differences of a motion whose jerk is white noise of unit density: (N - 3, N - 3).
+
+    Each is the jerk, averaged by a B-spline over four instants (Peano); so it is the integral of products of those.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(ORDER)
+    halves = np.diff(times)[:, None] / 2
+    points = times[:-1, None] + halves * (1 + nodes)
+    padded = np.pad(times, ORDER - 1, mode="edge")
+    # Those at the ends, with knots that coincide, average over fewer instants.
+    splines = BSpline.design_matrix(points.ravel(), padded, ORDER - 1)[:, ORDER - 1 : 1 - ORDER]
+    averages = splines @ sparse.diags_array(ORDER / (times[ORDER:] - times[:-ORDER]))
+    return sparse.csr_array(averages.T @ sparse.diags_array((halves * weights).ravel()) @ averages)
+
+
+def _banded(matrix: sparse.csr_array, width: int) -> FloatArray:
+    """Return the diagonals of a symmetric matrix as LAPACK's upper form wants them: (width + 1, N)."""
+    width = min(width, matrix.shape[0] - 1)
+    return np.stack([np.pad(matrix.diagonal(offset), (offset, 0)) for offset in range(width, -1, -1)])

@@ -1,0 +1,149 @@
+"""Which part of the method buys which part of the accuracy: the table and the plot of docs/explanation/ablation.md.
+
+    python tests/benchmarks/ablation.py docs/explanation/ablation.md
+
+Every locator, graph and resampler runs on the same captures: the built-in street, a path of 600 px in 4,000 frames, a hand that
+trembles. The last row of each flux is the bound of Cramer and Rao. It takes about half an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+
+from photonpano import api, parse_spec
+from photonpano.cli import main as photonpano
+from photonpano.evaluation import exposure_bound_px, load_truth
+from photonpano.photometry import BinaryResponse
+
+FLUXES = (0.5, 0.1, 0.02)
+GROUP_SIZE = 250
+LOCATORS: dict[str, dict[str, Any]] = {"opencv-sift": {"use": "opencv-sift"}, "direct": {"use": "direct"}}
+GRAPHS: dict[str, dict[str, Any]] = {"chain": {"skips": [], "closure_overlap": None}, "full": {}}
+RESAMPLERS: dict[str, dict[str, Any]] = {"constant": {"densify": False, "endpoints": False}, "midpoint": {}}
+CAPTURE: dict[str, Any] = {
+    "scene": {"kind": "street", "seed": 0},
+    "path": {"kind": "random-spline", "length_px": 600, "shake": {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]}},
+    "n_frames": 4000,
+    "frame_shape": [254, 496],
+}
+BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+HEADER = ("Flux", "Locator", "Graph", "Groups", "Mean", "Worst frame", "Below the oracle")
+
+
+def simulate(folder: Path, flux: float) -> Path:
+    """Write a capture with its truth beside it."""
+    cube = folder / f"flux-{flux:g}.npy"
+    spec = cube.with_suffix(".yaml")
+    spec.write_text(_yaml({"version": 1, "source": {"use": "simulator", "with": CAPTURE | {"flux": flux}}}))
+    try:
+        photonpano(["simulate", str(spec), "--output", str(cube)])
+    except SystemExit as done:
+        if done.code:
+            raise
+    return cube
+
+
+def measure(cube: Path, locator: str, graph: str, resampler: str) -> tuple[float, float, float]:
+    """Return the mean and the largest corner error, in px, and by how many dB the panorama falls short of the oracle."""
+    plan = parse_spec(
+        {
+            "version": 1,
+            "source": {"use": "packed-npy", "with": {"path": str(cube), "frame_rate_hz": 96_800}},
+            "resample": {"use": "midpoint", "with": {"group_size": GROUP_SIZE} | RESAMPLERS[resampler]},
+            "locate": LOCATORS[locator],
+            "graph": GRAPHS[graph] | {"disconnected": "largest"},
+            "output": {"directory": str(cube.with_suffix(".run"))},
+        }
+    )
+    result = api.run(plan)
+    scores = api.evaluate(result.directory, cube.with_suffix(".truth.npz"))
+    assert scores.below_oracle_db is not None
+    return scores.trajectory.mean_px, scores.trajectory.max_px, scores.below_oracle_db
+
+
+def bound_px(cube: Path) -> float:
+    """Return the mean, over the capture, of the least error of an exposure of a scene that is known without noise."""
+    truth = load_truth(cube.with_suffix(".truth.npz"))
+    assert truth.scene is not None
+    height, width = truth.frame_shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    views = (cv2.warpPerspective(truth.scene, to_scene, (width, height), flags=flags) for to_scene in truth.homographies[::200])
+    return float(np.mean([exposure_bound_px(view, BinaryResponse(), GROUP_SIZE) for view in views]))
+
+
+def table(results: dict[tuple[float, str, str, str], tuple[float, float, float] | str], bounds: dict[float, float]) -> str:
+    """Return the rows in Markdown."""
+    lines = [f"| {' | '.join(HEADER)} |", "| --- " * len(HEADER) + "|"]
+    for flux in bounds:
+        for (at, *names), found in results.items():
+            if at == flux:
+                figures = found if isinstance(found, str) else "{:.3f} px | {:.2f} px | {:.2f} dB".format(*found)
+                lines.append(f"| {flux:g} | {' | '.join(names)} | {figures} |")
+        lines.append(f"| {flux:g} | *Cramer-Rao bound* | | | {bounds[flux]:.3f} px | | |")
+    return "\n".join(lines)
+
+
+def plot(results: dict[tuple[float, str, str, str], tuple[float, float, float] | str], bounds: dict[float, float], file: Path) -> None:
+    """Draw the mean error of each variant over the flux."""
+    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    styles = {"chain": ":", "full": "-"}
+    colours = {("opencv-sift", "constant"): "#c8a26b", ("opencv-sift", "midpoint"): "#a8641e"}
+    colours |= {("direct", "constant"): "#8fb0cf", ("direct", "midpoint"): "#1f5a94"}
+    fluxes = list(bounds)
+    for locator, graph, resampler in itertools.product(LOCATORS, GRAPHS, RESAMPLERS):
+        found = [results[flux, locator, graph, resampler] for flux in fluxes]
+        errors = [np.nan if isinstance(each, str) else each[0] for each in found]
+        label = f"{locator}, {graph}, {resampler}"
+        axes.loglog(fluxes, errors, styles[graph], marker="o", markersize=4, color=colours[locator, resampler], label=label)
+    axes.loglog(fluxes, list(bounds.values()), color="black", linewidth=1, label="Cramer-Rao bound")
+    axes.set_xticks(fluxes, [f"{flux:g}" for flux in fluxes])
+    axes.set_xticks([], minor=True)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_xlabel("flux (photons per pixel and frame)")
+    axes.set_ylabel("mean corner error (px)")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside right upper", frameon=False, title="locator, graph, groups")
+    figure.savefig(file, dpi=110)
+
+
+def _yaml(document: dict[str, Any]) -> str:
+    import json
+
+    return json.dumps(document)  # JSON is YAML
+
+
+def main() -> None:
+    """Measure everything, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", type=Path, help="the page whose table is replaced")
+    page = parser.parse_args().page
+    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+    _, after = rest.split(END)
+    results: dict[tuple[float, str, str, str], tuple[float, float, float] | str] = {}
+    bounds: dict[float, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for flux in FLUXES:
+            cube = simulate(Path(folder), flux)
+            bounds[flux] = bound_px(cube)
+            for names in itertools.product(LOCATORS, GRAPHS, RESAMPLERS):
+                try:
+                    results[(flux, *names)] = measure(cube, *names)
+                except api.PhotonpanoError as error:
+                    results[(flux, *names)] = f"failed: {str(error).splitlines()[0]} | | "
+                print(flux, *names, results[(flux, *names)], file=sys.stderr, flush=True)
+            cube.unlink()
+    page.write_text(f"{before}{BEGIN}\n{table(results, bounds)}\n{END}{after}", encoding="utf-8")
+    plot(results, bounds, page.parent.parent / "images" / "ablation.png")
+
+
+if __name__ == "__main__":
+    main()

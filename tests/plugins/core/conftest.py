@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import StageContext, StreamInfo, discover
+from photonpano.geometry import normalised
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from photonpano import Trajectory
+
+FRAME_SHAPE = (254, 496)
+FOCAL_PX = 1500.0
+
+
+@pytest.fixture(scope="session")
+def fit() -> Callable[..., Trajectory]:
+    """Fit by name: `fit("lie", instants, homographies, information=None, **config)`."""
+    catalog = discover()
+    context = StageContext(StreamInfo(1000, *FRAME_SHAPE, None), response=None)
+
+    def fit(name: str, instants: Any, homographies: np.ndarray, information: np.ndarray | None = None, **config: float) -> Any:
+        contribution = catalog.find("interpolator", name).contribution
+        interpolator = contribution.build(contribution.config(**config), context)
+        return interpolator.fit(np.asarray(instants, dtype=float), homographies, information)
+
+    return fit
+
+
+@pytest.fixture(scope="session")
+def turning() -> Callable[[np.ndarray], np.ndarray]:
+    """Return the homographies of a camera with the lens of a phone that is turned by (T, 3) rotation vectors, in radians."""
+    from scipy.spatial.transform import Rotation
+
+    height, width = FRAME_SHAPE
+    lens = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
+
+    def turning(vectors: np.ndarray) -> np.ndarray:
+        return normalised(lens @ Rotation.from_rotvec(vectors).as_matrix() @ np.linalg.inv(lens))
+
+    return turning
+
+
+@pytest.fixture(scope="session")
+def motions() -> Callable[[int, int], np.ndarray]:
+    """Return (N, 3, 3) homographies by chance, of any kind and not only of a camera that turns: `motions(n, seed)`."""
+    from photonpano.geometry import from_parameters
+
+    def motions(n: int, seed: int) -> np.ndarray:
+        sizes = np.array([1e-2, 1e-2, 1e-2, 1e-2, 30, 30, 1e-5, 1e-5])
+        return from_parameters(np.random.default_rng(seed).normal(size=(n, 8)) * sizes)
+
+    return motions

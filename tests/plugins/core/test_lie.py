@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photonpano import LocationError
+from photonpano.geometry import corner_displacements, parameters, translation
+
+FRAME_SHAPE = (254, 496)
+
+
+def path(frames: np.ndarray) -> np.ndarray:
+    """Rotation vectors of a camera that looks around, and is rolled by much."""
+    t = np.asarray(frames) / 1000
+    return np.stack([0.1 * np.sin(5 * t), 0.15 * np.cos(4 * t), np.sin(3 * t)], axis=1)
+
+
+def test_a_turn_about_any_axis_is_exact(fit, turning):
+    """Also where the angle is a cubic of time, as it is for a cubic spline."""
+    instants, frames = np.array([0.0, 130, 200, 430, 500, 610]), np.linspace(0, 610, 40)
+    axis = np.array([-0.1, 0.3, 0.9])
+
+    def angles(t: np.ndarray) -> np.ndarray:
+        return (t / 1000 + (t / 600) ** 2 - (t / 700) ** 3)[:, None] * axis
+
+    found = fit("lie", instants, turning(angles(instants))).at(frames)
+    np.testing.assert_allclose(found, turning(angles(frames)), rtol=1e-8, atol=1e-10)
+
+
+def test_for_shifts_it_is_the_cubic_spline(fit):
+    rng = np.random.default_rng(0)
+    instants, frames = np.cumsum(rng.uniform(30, 100, 9)), np.linspace(0, 700, 80)
+    knots = np.stack([translation(x, y) for x, y in rng.normal(0, 30, (9, 2))])
+    np.testing.assert_allclose(
+        fit("lie", instants, knots).at(frames), fit("lucas-kanade", instants, knots).at(frames), rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("n_knots", [2, 3])
+def test_few_knots_give_a_geodesic_or_what_is_like_a_parabola(n_knots, fit, motions):
+    """With a parabola, the velocity in the frame changes at a constant rate: for shifts exactly so."""
+    instants, knots = np.array([0.0, 50, 130])[:n_knots], motions(3, 1)[:n_knots]
+    trajectory = fit("lie", instants, knots)
+    np.testing.assert_allclose(trajectory.at(instants), knots, rtol=1e-6, atol=1e-9)
+    if n_knots == 2:
+        frames = np.linspace(-20, 80, 30)
+        np.testing.assert_allclose(trajectory.at(frames), fit("geodesic", instants, knots).at(frames), rtol=1e-9, atol=1e-12)
+
+
+def test_velocity_and_acceleration_are_continuous_at_the_knots(fit, turning):
+    instants = np.arange(0, 1001, 100.0)
+    trajectories = {name: fit(name, instants, turning(path(instants))) for name in ("lie", "geodesic")}
+    h = 0.5
+
+    def jumps(name: str) -> tuple[float, float]:
+        """Return the largest jumps of velocity and acceleration of a corner, as shares of the largest such value."""
+        sides = []
+        for side in (-1, 1):
+            samples = instants[1:-1] + side * h * np.arange(3)[:, None]
+            x = parameters(trajectories[name].at(samples.ravel())).reshape(3, -1, 8)[..., 4]
+            sides.append((side * (-1.5 * x[0] + 2 * x[1] - 0.5 * x[2]) / h, (x[0] - 2 * x[1] + x[2]) / h**2))
+        (v0, a0), (v1, a1) = sides
+        return np.abs(v1 - v0).max() / np.abs(v0).max(), np.abs(a1 - a0).max() / np.abs(a0).max()
+
+    velocity, acceleration = jumps("lie")
+    assert velocity < 1e-3
+    assert acceleration < 0.05
+    assert jumps("geodesic")[0] > 0.05
+
+
+def test_it_is_nearer_to_a_smooth_motion_than_the_geodesic_and_where_the_camera_rolls_than_the_parameters(fit, turning):
+    instants, frames = np.linspace(0, 3000, 31), np.arange(0, 3001, 7.0)
+    truth = turning(path(frames))
+    errors = {
+        name: corner_displacements(fit(name, instants, turning(path(instants))).at(frames), truth, FRAME_SHAPE).max()
+        for name in ("lie", "geodesic", "lucas-kanade")
+    }
+    assert errors["lie"] < errors["geodesic"] / 20
+    assert errors["lie"] < errors["lucas-kanade"]
+
+
+def test_a_camera_may_roll_around_more_than_once(fit, turning):
+    instants, frames = np.linspace(0, 1000, 41), np.linspace(0, 1000, 300)
+    found = fit("lie", instants, turning(np.outer(instants / 1000, [0, 0, 20]))).at(frames)
+    np.testing.assert_allclose(found, turning(np.outer(frames / 1000, [0, 0, 20])), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("instants", [[0, 1, 2, 60, 61, 62], [0, 500, 501, 502, 503, 1000]])
+def test_it_says_so_when_no_smooth_curve_was_found(instants, fit, motions):
+    with pytest.raises(LocationError) as caught:
+        fit("lie", instants, motions(6, 2))
+    assert str(caught.value) == (
+        "the located exposures turn too fast, or lie too unevenly in time, for a smooth curve of homographies through all of "
+        "them; interpolate with geodesic, lucas-kanade or smoothing-spline"
+    )

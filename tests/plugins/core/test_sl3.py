@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from photonpano_core.sl3 import exponential, logarithm, unimodular
+
+PIXELS = np.array([[1, 1, 300], [1, 1, 300], [1 / 300, 1 / 300, 1]])
+"""Sizes of the entries of a matrix that maps pixels of an image of 300 px."""
+
+
+def matrices(size: float) -> np.ndarray:
+    """Random matrices of trace 0, in units of an image's size."""
+    drawn = np.random.default_rng(0).normal(size=(100, 3, 3)) * size
+    return drawn - np.trace(drawn, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
+
+
+@pytest.mark.parametrize("size", [0, 1e-9, 1e-3, 0.1, 1, 5])
+def test_the_exponential_is_that_of_scipy(size):
+    small = matrices(size)
+    found, expected = exponential(small * PIXELS) / PIXELS, expm(small)
+    error = np.abs(found - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
+    assert error.max() < 1e-11
+
+
+def test_the_exponential_of_a_trace_is_a_scale():
+    np.testing.assert_allclose(exponential(np.diag([1.0, 2, 3])[None])[0], np.diag(np.exp([1, 2, 3])), rtol=1e-14)
+
+
+@pytest.mark.parametrize("size", [0, 1e-9, 1e-3, 0.1, 0.5])
+def test_the_logarithm_undoes_the_exponential(size):
+    small = matrices(size)
+    inside = np.abs(np.linalg.eigvals(small)).max(axis=1) < 3
+    found = logarithm(unimodular(7 * exponential(small[inside] * PIXELS))) / PIXELS
+    assert inside.mean() > 0.9
+    np.testing.assert_allclose(found, small[inside], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [1e-6, 30, 120, 175])
+def test_the_logarithm_of_a_turn_is_its_axis(degrees):
+    axis = np.deg2rad(degrees) * np.array([2, 1, 2]) / 3
+    x, y, z = axis
+    found = logarithm(Rotation.from_rotvec(axis).as_matrix()[None])[0]
+    np.testing.assert_allclose(found, [[0, -z, y], [z, 0, -x], [-y, x, 0]], atol=1e-11)
+
+
+@pytest.mark.parametrize("diagonal", [(-1, -1, 1), (-1, 1, 1), (-2, -0.5, 1), (1e-4, 1, 1)])
+def test_what_has_no_real_logarithm_or_a_huge_one_is_nan_and_spoils_no_other(diagonal):
+    stack = unimodular(np.stack([np.diag(np.array(diagonal, dtype=float)), np.eye(3)]))
+    found = logarithm(stack)
+    assert np.isnan(found[0]).all()
+    np.testing.assert_array_equal(found[1], 0)
