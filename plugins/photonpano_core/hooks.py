@@ -68,13 +68,13 @@ def photonpano_interpolators() -> Iterator[InterpolatorContribution[Any]]:
     )
     yield InterpolatorContribution(
         name="smoothing-spline",
-        summary="Smoothing spline of the eight parameters, as smooth as the noise of the located instants asks for",
+        summary="Cubic spline of the eight parameters, as smooth as the noise asks for",
         config=SmoothingSplineConfig,
         build=_build_smoothing_spline,
     )
     yield InterpolatorContribution(
         name="geodesic",
-        summary="Constant velocity from each located instant to the next, in the group of the homographies",
+        summary="Constant velocity from each located instant to the next, along geodesics",
         config=GeodesicConfig,
         build=_build_geodesic,
     )

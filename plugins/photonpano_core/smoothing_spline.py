@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_banded
 
-from photonpano.geometry import corners, jacobian, parameters
+from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
 from photonpano_core.lucas_kanade import ParameterTrajectory, interpolating_spline
 
 if TYPE_CHECKING:
@@ -27,11 +27,17 @@ _SCALES = np.logspace(-10, 10, 41)
 """From hardly any jerk, so that a parabola remains, to so much that all knots stay where they are. The number of knots that are
 averaged goes with the sixth root."""
 _NOISES = np.logspace(-16, 0, 129)
-"""Variances of the noise, as shares of how far the knots are from a parabola."""
+"""Variances of the noise, as shares of how far the quiet modes are from a parabola."""
 _TINY = 1e-200
 """The noise of knots that lie on a parabola exactly."""
 _LEAST_KNOWN = 1e-8
 """What a knot knows of nothing, as a share of the best known: its error is no more than 10,000 times as large."""
+
+
+_TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
+"""From the coordinates of the corners to shift, stretch, shear, and so on: orthonormal, so that these too are in px."""
+_QUIET = [2, 3]
+"""The twists. A shaking camera shifts, rolls, perhaps stretches the image, but hardly changes its perspective."""
 
 
 class SmoothingSplineInterpolator:
@@ -39,42 +45,44 @@ class SmoothingSplineInterpolator:
 
     They move to the spline f of degree 5 that minimises, over the knots y with their information W,
 
-        sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale.
+        sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale,
 
-    The modes are shift, stretch, shear, and so on, of the corners of the frame, in px. So each knot counts for what it
-    knows, direction by direction, and each mode is as smooth as it is found to be. The scales, and the factor by which the
-    noise of all differs from what W says, have the restricted maximum likelihood if the jerk is white noise. There is one such
-    factor, and not one a mode, since modes that no camera excites tell noise from motion that is too fast for the knots.
+    where y are the modes of the motion of the frame's corners, in px. So each knot counts for what it knows, direction by
+    direction, and each mode is as smooth as it is found to be. The scales, and the factor by which the noise of all differs
+    from what W says, have the restricted maximum likelihood if the jerk is white noise. There is one such factor, and not one
+    a mode, since modes that no camera excites tell noise from motion that is too fast for the knots.
     """
 
     def __init__(self, config: SmoothingSplineConfig, frame_shape: tuple[int, int]) -> None:
         """Take the (height, width) of a frame."""
         self._config = config
-        to_corners = jacobian(np.eye(3), corners(frame_shape)).reshape(8, 8)
-        self._to_modes = np.kron(hadamard(4) / 2, np.eye(2)) @ to_corners
+        self._corners = corners(frame_shape)
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
         """Smooth; without information all knots count alike, with equal and independent errors of the corners.
 
         Up to three knots are interpolated.
         """
-        from_modes = np.linalg.inv(self._to_modes)
-        knots = parameters(homographies) @ self._to_modes.T
         if len(instants) > ORDER:
-            if information is None:
-                covariances = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
-            else:
-                covariances = _inverse(from_modes.T @ information @ from_modes)
-            knots = smoothed(instants, knots, covariances)
-        spline = interpolating_spline(instants, knots @ from_modes.T)
-        return ParameterTrajectory(instants, spline, self._config.hold_frames)
+            homographies = self._smoothed(instants, homographies, information)
+        return ParameterTrajectory(instants, interpolating_spline(instants, parameters(homographies)), self._config.hold_frames)
+
+    def _smoothed(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> FloatArray:
+        """Return the (N, 3, 3) homographies of knots after smoothing."""
+        covariances = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
+        if information is not None:
+            slopes = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
+            covariances = _covariances(information, _TO_MODES @ slopes)
+        paths = apply(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
+        moved = smoothed(instants, paths, covariances) @ _TO_MODES
+        return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
 
 def smoothed(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return where a smoothing spline passes the knots: (N, K).
+    """Return where a smoothing spline passes its knots: (N, K).
 
-    Both the noise of the knots and a jerk that is white noise make their third differences normally distributed; what the jerk
-    does not explain of them is taken from the knots (Reinsch 1967, and de Hoog and Hutchinson 1987, for K = 1).
+    Noise of the knots, and a jerk that is white noise, both make third differences that are normally distributed. What the jerk
+    does not explain of them is noise (Reinsch 1967; de Hoog and Hutchinson 1987).
 
     Args:
         instants: (N,), more than three.
@@ -85,15 +93,16 @@ def smoothed(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -
     times = instants * ((n_knots - 1) / (instants[-1] - instants[0]))
     difference, jerk = _third_differences(times), _jerk_covariance(times)
     observed = difference @ knots
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
     modes = [
-        _Mode(observed[:, mode], difference @ sparse.diags_array(covariances[:, mode, mode]) @ difference.T, jerk)
+        _Mode(observed[:, mode], difference @ sparse.diags_array(variances[:, mode]) @ difference.T, jerk)
         for mode in range(n_modes)
     ]
     every = sparse.kron(difference, sparse.eye_array(n_modes))
     noise = sparse.bsr_array((covariances, np.arange(n_knots), np.arange(n_knots + 1)))
     expected = every @ noise @ every.T + sparse.kron(jerk, sparse.diags_array(_most_likely_scales(modes)))
-    pulls = solveh_banded(_banded(expected, (ORDER + 1) * n_modes - 1), observed.ravel())
-    return np.asarray(knots - (noise @ (every.T @ pulls)).reshape(n_knots, n_modes))
+    explained = solveh_banded(_banded(expected, (ORDER + 1) * n_modes - 1), observed.ravel())
+    return np.asarray(knots - (noise @ (every.T @ explained)).reshape(n_knots, n_modes))
 
 
 class _Mode:
@@ -120,20 +129,37 @@ class _Mode:
             self.squares[index] = observed @ cho_solve_banded((factor, False), observed)
             self.determinants[index] = 2 * np.log(factor[-1]).sum()
 
+    def deviances(self, noises: FloatArray) -> FloatArray:
+        """Return minus twice the logarithms of the likelihoods with S variances of the noise: (S, L)."""
+        return self.n_observed * np.log(noises)[:, None] + self.squares / noises[:, None] + self.determinants
+
 
 def _most_likely_scales(modes: Sequence[_Mode]) -> list[float]:
-    """Return the scale of each mode that is most likely where all have the same noise."""
-    n_observed = modes[0].n_observed
-    largest = sum(mode.squares[0] for mode in modes) / (n_observed * len(modes))
-    noises = max(largest, _TINY) * _NOISES[:, None]
-    deviances = [n_observed * np.log(noises) + mode.squares / noises + mode.determinants for mode in modes]
-    best = np.argmin(sum(deviance.min(axis=1) for deviance in deviances))
-    return [mode.scales[deviance[best].argmin()] for mode, deviance in zip(modes, deviances, strict=True)]
+    """Return the scale of the jerk of each mode that is most likely, with the noise that is most likely for the quiet ones."""
+    quiet = [modes[index] for index in _QUIET]
+    largest = sum(mode.squares[0] for mode in quiet) / sum(mode.n_observed for mode in quiet)
+    noises = max(largest, _TINY) * _NOISES
+    noise = noises[np.argmin(sum(mode.deviances(noises).min(axis=1) for mode in quiet))]
+    return [mode.scales[mode.deviances(np.array([noise])).argmin()] for mode in modes]
 
 
-def _inverse(information: FloatArray) -> FloatArray:
-    """Return covariances, (N, K, K), also for knots that know nothing of a direction."""
-    values, vectors = np.linalg.eigh(information)
+def _from_corners(here: FloatArray, there: FloatArray) -> FloatArray:
+    """Return the homographies that send (4, 2) points to (N, 4, 2) ones: (N, 3, 3)."""
+    x, y = np.broadcast_to(here, there.shape)[..., None].transpose(2, 0, 1, 3)
+    u, v = there[..., None].transpose(2, 0, 1, 3)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows = [
+        np.concatenate([x, zero, y, zero, one, zero, -u * x, -u * y], axis=-1),
+        np.concatenate([zero, x, zero, y, zero, one, -v * x, -v * y], axis=-1),
+    ]
+    equations = np.stack(rows, axis=2).reshape(-1, 8, 8)
+    return from_parameters(np.linalg.solve(equations, (there - here).reshape(-1, 8, 1))[..., 0])
+
+
+def _covariances(information: FloatArray, slopes: FloatArray) -> FloatArray:
+    """Return (N, K, K) covariances of what has these slopes by p1..p8; a knot may know nothing of a direction."""
+    back = np.linalg.inv(slopes)
+    values, vectors = np.linalg.eigh(back.transpose(0, 2, 1) @ information @ back)
     values = np.maximum(values, _LEAST_KNOWN * values.max())
     return np.asarray((vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1))
 

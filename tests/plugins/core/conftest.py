@@ -4,17 +4,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from photonpano import StageContext, StreamInfo, discover
-from photonpano.geometry import normalised
+from photonpano.geometry import from_parameters, normalised
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from photonpano import Trajectory
 
 FRAME_SHAPE = (254, 496)
 FOCAL_PX = 1500.0
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> Iterator[None]:
+    """Keep BLAS from starting threads for small matrices, as a run does."""
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -34,8 +43,6 @@ def fit() -> Callable[..., Trajectory]:
 @pytest.fixture(scope="session")
 def turning() -> Callable[[np.ndarray], np.ndarray]:
     """Return the homographies of a camera with the lens of a phone that is turned by (T, 3) rotation vectors, in radians."""
-    from scipy.spatial.transform import Rotation
-
     height, width = FRAME_SHAPE
     lens = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
 
@@ -48,7 +55,6 @@ def turning() -> Callable[[np.ndarray], np.ndarray]:
 @pytest.fixture(scope="session")
 def motions() -> Callable[[int, int], np.ndarray]:
     """Return (N, 3, 3) homographies by chance, of any kind and not only of a camera that turns: `motions(n, seed)`."""
-    from photonpano.geometry import from_parameters
 
     def motions(n: int, seed: int) -> np.ndarray:
         sizes = np.array([1e-2, 1e-2, 1e-2, 1e-2, 30, 30, 1e-5, 1e-5])
