@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     )
     from photonpano.errors import (
         CanvasTooLargeError,
+        CaptureUnreadError,
         InputError,
         LocationError,
         OutputError,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from photonpano.registry import Catalog, discover
     from photonpano.spec import Plan, load_spec, parse_spec
     from photonpano.values import (
+        CaptureSummary,
         FrameSpan,
         Group,
         Located,
@@ -50,6 +52,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "CanvasTooLargeError",
+    "CaptureSummary",
+    "CaptureUnreadError",
     "Catalog",
     "Config",
     "FrameSpan",

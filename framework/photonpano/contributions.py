@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeAlias, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
+from photonpano.errors import CaptureUnreadError
 from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from photonpano.values import Response, StreamInfo
+    from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 
 class Config(BaseModel):
@@ -49,6 +50,14 @@ class SourceContext:
     threads: int = 1
 
 
+def _unread() -> CaptureSummary:
+    raise CaptureUnreadError("chosen from flux and speed when the capture is read")
+
+
+def _not_recorded(what: str, value: DecisionValue, reason: str) -> None:
+    """Forget a choice: nothing is recorded where nothing runs."""
+
+
 @dataclass(frozen=True, slots=True)
 class StageContext:
     """What the framework tells every other component when it is built.
@@ -58,12 +67,18 @@ class StageContext:
         response: the camera's response.
         seed: the seed of the run; all randomness derives from it.
         threads: how many threads the component may use.
+        capture: returns how bright the capture is and how fast it moves; measured when a run first asks. Raises
+            `CaptureUnreadError` where a spec is only explained: ask for it when the component works, not when it is built.
+        decide: records something that the spec leaves open and the component chose: what, its value (a number, a text, true
+            or false), and a clause with the reason. It ends up in `run.json` and in the report.
     """
 
     stream: StreamInfo
     response: Response
     seed: int = 0
     threads: int = 1
+    capture: Callable[[], CaptureSummary] = field(default=_unread, compare=False)
+    decide: Callable[[str, DecisionValue, str], None] = field(default=_not_recorded, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,10 @@ class OutputError(PhotonpanoError):
     """A result could not be written; nothing is left under its final name."""
 
 
+class CaptureUnreadError(PhotonpanoError):
+    """A component asked for what only the frames of a capture tell, where none are read."""
+
+
 class PluginError(PhotonpanoError):
     """A plugin is broken, missing a library, in conflict with another, or broke its contract."""
 

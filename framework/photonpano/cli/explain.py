@@ -26,7 +26,7 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
     """
     from photonpano.api import open_source
     from photonpano.cli.wording import capture_words
-    from photonpano.pipeline.components import build_levels
+    from photonpano.pipeline.components import foreseen_groups
     from photonpano.pipeline.pairs import pairs_of
     from photonpano.registry import discover
     from photonpano.spec import load_spec
@@ -36,14 +36,16 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
     predictions = []
     with open_source(plan) as source:
         capture = capture_words(source.info)
-        for level in build_levels(plan, source)[: FORETOLD if plan.until_converged else None]:
-            groups = level.resampler.groups(source.info.n_frames, level.number)
+        for number, groups in enumerate(foreseen_groups(plan, source), start=1):
+            if isinstance(groups, str):
+                predictions.append(f"level {number}: groups are {groups}")
+                continue
             sizes = sorted({len(group.span) for group in groups})
             frames = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
             pairs = len(pairs_of(groups, plan.graph.skips))
-            predictions.append(f"level {level.number}: {len(groups)} groups of {frames} frames, {pairs} pairs")
+            predictions.append(f"level {number}: {len(groups)} groups of {frames} frames, {pairs} pairs")
     if plan.until_converged:
-        predictions.insert(0, f"up to {len(plan.levels)} levels, until the motion has settled")
+        predictions = [f"up to {len(plan.levels)} levels, until the motion has settled", *predictions[:FORETOLD]]
         predictions.append("each further level: about twice the groups and pairs of the one before")
     typer.echo(f"# {spec} as it will run, on {capture}")
     typer.echo("\n".join(_Writer(plan, catalog, predictions).lines()))

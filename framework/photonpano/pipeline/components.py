@@ -6,19 +6,23 @@ import importlib.util
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
-from photonpano.errors import PhotonpanoError, PluginError
+from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError
+from photonpano.pipeline.probing import summarise
 from photonpano.pipeline.threads import thread_count
+from photonpano.values import Decision
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from contextlib import AbstractContextManager
 
     from photonpano.contributions import Contribution
     from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
     from photonpano.spec.plan import Choice, Plan
+    from photonpano.values import DecisionValue, Group
 
 ContextT = TypeVar("ContextT")
 ComponentT = TypeVar("ComponentT")
@@ -78,9 +82,17 @@ def build_source(plan: Plan) -> Source:
     return _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
 
 
-def build_levels(plan: Plan, source: Source) -> tuple[Level, ...]:
-    """Build the components of all levels; levels that choose alike share one component."""
-    context = StageContext(source.info, source.response, plan.run.seed, thread_count(plan.run))
+def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
+    """Build the components of all levels; levels that choose alike share one component.
+
+    Args:
+        plan: which components.
+        source: the capture.
+        decisions: what the components choose because of what the capture shows is added here, once they are at work.
+    """
+    threads = thread_count(plan.run)
+    capture = cache(lambda: summarise(source, threads))
+    context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
     made: list[tuple[Choice[Any], Any]] = []
 
     def component(choice: Choice[Contribution[Any, StageContext, ComponentT]]) -> ComponentT:
@@ -106,6 +118,29 @@ def build_levels(plan: Plan, source: Source) -> tuple[Level, ...]:
         )
         for number, level in enumerate(plan.levels, start=1)
     )
+
+
+def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]:
+    """Return the groups of each level; where they depend on what the frames show, a clause that says so. Reads no frames."""
+    context = StageContext(source.info, source.response, plan.run.seed)
+    foreseen: list[tuple[Group, ...] | str] = []
+    for number, level in enumerate(plan.levels, start=1):
+        resampler: Resampler = _built(level.resample, context)
+        try:
+            with _blaming(_origin(level.resample), number):
+                foreseen.append(resampler.groups(source.info.n_frames, number))
+        except CaptureUnreadError as error:
+            foreseen.append(str(error))
+    return foreseen
+
+
+def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], None]:
+    def decide(what: str, value: DecisionValue, reason: str) -> None:
+        if not isinstance(value, bool | int | float | str):
+            raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
+        decisions.append(Decision(what, value, reason))
+
+    return decide
 
 
 def _named(choices: Iterable[Choice[Any]]) -> Iterator[tuple[str, Choice[Any]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from photonpano.pipeline.record import (
 )
 from photonpano.pipeline.threads import one_thread_inside, thread_count
 from photonpano.spec.tree import Place
-from photonpano.values import FrameSpan
+from photonpano.values import Decision, FrameSpan
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,7 +80,8 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     except InputError as error:
         # The source knows its file, the spec knows where that is named.
         raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
-    levels = build_levels(plan, source)
+    decisions: list[Decision] = []
+    levels = build_levels(plan, source, decisions)
     with one_thread_inside():
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress)
     trajectory = results[-1].trajectory
@@ -110,6 +111,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
             "height": canvas.height,
             "width": canvas.width,
             "scale": plan.render.scale,
+        "decisions": [asdict(decision) for decision in decisions],
             "white_flux": white_flux,
             "coverage_share": float(seen.mean()),
             "seconds": round(now - rendering, 3),

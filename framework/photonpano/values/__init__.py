@@ -1,13 +1,17 @@
 """Frozen values that pass between the stages; they import numpy only."""
 
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Homography
+from photonpano.values.capture import CaptureSummary, Decision, DecisionValue
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, StreamInfo
 from photonpano.values.motion import Edge, Located, NotLocated
 
 __all__ = [
     "BoolArray",
+    "CaptureSummary",
     "Counts",
+    "Decision",
+    "DecisionValue",
     "Edge",
     "FloatArray",
     "FluxImage",

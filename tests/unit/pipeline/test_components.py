@@ -2,10 +2,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from photonpano import (
     Config,
+    FrameSpan,
+    Group,
     InputError,
     InterpolatorContribution,
     LocatorContribution,
@@ -19,10 +22,11 @@ from photonpano import (
     StageContext,
     StreamInfo,
 )
-from photonpano.pipeline.components import build_levels, build_source
+from photonpano.pipeline.components import build_levels, build_source, foreseen_groups
 from photonpano.registry import Catalog
 from photonpano.registry.catalog import make_entry
 from photonpano.spec import Plan, parse_spec
+from photonpano.values import Decision
 
 
 class Keys(Config):
@@ -61,7 +65,7 @@ def test_components_are_told_what_they_may_know() -> None:
     made = plan()
     source = build_source(made)
     assert source.context == SourceContext(seed=7, threads=3)
-    (level,) = build_levels(made, source)
+    (level,) = build_levels(made, source, [])
     assert level.locators[0].component.context == StageContext(source.info, source.response, seed=7, threads=3)
     assert level.locators[0].origin == "locator 'toy' of toys 1.0"
     assert level.origins == {
@@ -71,9 +75,48 @@ def test_components_are_told_what_they_may_know() -> None:
     }
 
 
+class Curious(Built):
+    """A resampler that looks at the capture, and chooses something because of it."""
+
+    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+        flux = self.context.capture().flux
+        self.context.decide("size", self.config.size, f"the flux is {flux:.1f}")
+        span = FrameSpan(0, n_frames)
+        return (Group(span, span.centre),)
+
+
+def test_the_capture_is_measured_once_when_first_asked_for_and_choices_are_recorded(memory_source: Any) -> None:
+    source = memory_source(np.random.default_rng(0).random((48, 16, 16)) < 0.5)
+    looked: list[FrameSpan] = []
+    source.counts = lambda span, counts=source.counts: looked.append(span) or counts(span)
+    made = plan(levels=[{}, {"resample": {"with": {"size": 2}}}], resampler={"build": Curious})
+    decisions: list[Decision] = []
+    levels = build_levels(made, source, decisions)
+    assert (looked, decisions) == ([], [])
+    levels[0].resampler.groups(48, 1)
+    once = len(looked)
+    levels[1].resampler.groups(48, 2)
+    assert len(looked) == once > 0
+    assert decisions == [Decision("size", 1, "the flux is 0.7"), Decision("size", 2, "the flux is 0.7")]
+
+
+def test_what_cannot_be_recorded_is_refused_at_once() -> None:
+    made = plan()
+    (level,) = build_levels(made, build_source(made), [])
+    with pytest.raises(TypeError, match="number, a text, true or false; size is a list"):
+        level.locators[0].component.context.decide("size", [1], "so")
+
+
+def test_groups_are_foreseen_without_reading_frames() -> None:
+    made = plan(levels=[{}, {"resample": {"with": {"size": 2}}}], resampler={"build": Curious})
+    assert foreseen_groups(made, build_source(made)) == ["chosen from flux and speed when the capture is read"] * 2
+    with pytest.raises(PluginError, match=r"^resampler 'toy' of toys 1\.0 failed at level 1: AttributeError: "):
+        foreseen_groups(plan(), build_source(made))
+
+
 def test_levels_that_choose_alike_share_a_component() -> None:
     made = plan(levels=[{"scale": 0.5}, {"locate": {"with": {"size": 2}}}, {}])
-    first, second, third = build_levels(made, build_source(made))
+    first, second, third = build_levels(made, build_source(made), [])
     locators = [level.locators[0].component for level in (first, second, third)]
     assert locators[0] is locators[2] is not locators[1]
     assert first.merger is second.merger is third.merger
@@ -90,7 +133,7 @@ def test_fallbacks_follow_the_locator_in_order_and_share_its_component() -> None
             {"locate": larger | {"fallback": ["toy", {"use": "toy", "with": {"size": 3}}]}},
         ]
     )
-    first, second = build_levels(made, build_source(made))
+    first, second = build_levels(made, build_source(made), [])
     assert [(each.name, each.component.config.size) for each in first.locators] == [("toy", 1), ("toy 2", 2)]
     assert [(each.name, each.component.config.size) for each in second.locators] == [("toy", 2), ("toy 2", 1), ("toy 3", 3)]
     assert {each.origin for each in second.locators} == {"locator 'toy' of toys 1.0"}
@@ -106,7 +149,7 @@ def broken(*_: Any) -> Any:
 def test_a_component_that_cannot_be_built_is_named(kind: str) -> None:
     made = plan(**{kind: {"build": broken}})
     with pytest.raises(PluginError) as caught:
-        build_levels(made, build_source(made))
+        build_levels(made, build_source(made), [])
     assert str(caught.value) == f"{kind} 'toy' of toys 1.0 could not be built: RuntimeError: no such device"
 
 
@@ -131,7 +174,7 @@ def test_a_library_that_went_missing_is_named_with_its_install_line() -> None:
 def test_the_response_reaches_every_stage() -> None:
     made = plan()
     source = build_source(made)
-    (level,) = build_levels(made, source)
+    (level,) = build_levels(made, source, [])
     stages: list[Any] = [level.resampler, level.merger, level.locators[0].component, level.interpolator]
     responses: set[Response] = {stage.context.response for stage in stages}
     assert responses == {source.response}
