@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 from pydantic import Field
 
 from photonpano import Config
@@ -10,11 +12,14 @@ from photonpano import Config
 class MidpointConfig(Config):
     """Groups of equal size, twice as dense at each level."""
 
-    group_size: int = Field(500, ge=1, description="frames of a group: more for the dark, fewer for fast motion")
+    group_size: Literal["auto"] | Annotated[int, Field(ge=1)] = Field(
+        "auto",
+        description="frames of a group: more for the dark, fewer for fast motion; auto chooses from flux and speed",
+    )
     endpoints: bool = Field(
         True,
-        description="from the second level on, also locate the first and the last frame, with off-centre windows "
-        "(supplement S2)",
+        description="from the second level on, also locate ever shorter groups at both ends, so that the motion there is "
+        "measured and not extrapolated (supplement S2)",
     )
     densify: bool = Field(
         True,

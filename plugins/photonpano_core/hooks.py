@@ -19,13 +19,14 @@ from photonpano_core.configs import (
     PhotonMleConfig,
     SmoothingSplineConfig,
 )
-from photonpano_core.midpoint import MidpointResampler, too_short
+from photonpano_core.group_size import AutoMidpointResampler
+from photonpano_core.midpoint import SHORTEST, MidpointResampler, too_short
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from photonpano import Interpolator, Merger, StageContext, StreamInfo
+    from photonpano import Interpolator, Merger, Resampler, StageContext, StreamInfo
 
 
 @hookimpl
@@ -41,7 +42,7 @@ def photonpano_resamplers() -> Iterator[ResamplerContribution[MidpointConfig]]:
         name="midpoint",
         summary="Groups of equal size; each level adds one between every two (paper, section 4)",
         config=MidpointConfig,
-        build=lambda config, _: MidpointResampler(config),
+        build=_build_midpoint,
         check=_check_midpoint,
     )
 
@@ -86,8 +87,12 @@ def photonpano_interpolators() -> Iterator[InterpolatorContribution[Any]]:
     )
 
 
+def _build_midpoint(config: MidpointConfig, context: StageContext) -> Resampler:
+    return AutoMidpointResampler(config, context) if config.group_size == "auto" else MidpointResampler(config)
+
+
 def _check_midpoint(config: MidpointConfig, stream: StreamInfo) -> list[str]:
-    problem = too_short(config.group_size, stream.n_frames)
+    problem = too_short(SHORTEST if config.group_size == "auto" else config.group_size, stream.n_frames)
     return [problem] if problem else []
 
 

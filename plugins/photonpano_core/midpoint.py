@@ -12,14 +12,21 @@ if TYPE_CHECKING:
     from photonpano_core.configs import MidpointConfig
 
 
-_SHORTEST = 16
-"""The groups at the ends get no shorter than this, in frames: too few photons tell nothing."""
+SHORTEST = 16
+"""Groups whose length is not given, as of those at the ends, get no shorter than this: too few photons tell nothing."""
 
 
 class MidpointResampler:
-    """floor(n / m) groups at the first level; each further level adds one centred between every two."""
+    """floor(n / m) groups at the first level; each further level adds one centred between every two.
+
+    Raises:
+        ValueError: the config leaves the group size open; `AutoMidpointResampler` chooses it.
+    """
 
     def __init__(self, config: MidpointConfig) -> None:
+        if config.group_size == "auto":
+            raise ValueError("group_size is a number of frames here, not auto")
+        self._size: int = config.group_size
         self._config = config
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
@@ -33,7 +40,7 @@ class MidpointResampler:
         Raises:
             InputError: the capture has fewer frames than a group.
         """
-        size = self._config.group_size
+        size = self._size
         if problem := too_short(size, n_frames):
             raise InputError(problem)
         count = n_frames // size
@@ -43,7 +50,7 @@ class MidpointResampler:
             starts = np.array([(n_frames - size) // 2])
         spans = [FrameSpan(int(start), int(start) + size) for start in starts]
         if self._config.endpoints:
-            halves = [size >> step for step in range(level - 1, 0, -1) if size >> step >= _SHORTEST]
+            halves = [size >> step for step in range(level - 1, 0, -1) if size >> step >= SHORTEST]
             spans = [
                 *(FrameSpan(0, half) for half in halves),
                 *spans,

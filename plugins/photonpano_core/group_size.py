@@ -1,0 +1,76 @@
+"""`group_size: auto`: as long as motion blur allows, and longer in the dark."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from photonpano_core.midpoint import SHORTEST, MidpointResampler
+
+if TYPE_CHECKING:
+    from photonpano import CaptureSummary, Group, StageContext
+    from photonpano_core.configs import MidpointConfig
+
+_BLUR = 0.15
+"""Groups of the first level may be blurred by this share of the shorter side of a frame; twice as much spoils the result."""
+_DARK = 3.0
+"""Below so many photons a pixel noise does more harm than blur does, and groups get longer."""
+_DARK_BLUR = 2.0
+"""In the dark, so many times the blur is allowed."""
+_GROUPS = 8
+"""The first level has at least so many groups, where the capture is long enough."""
+_LEAST = 1e-9
+"""Flux and speed are at least this, so that they can be divided by."""
+_UNKNOWN = 500
+"""The group size if nothing tells how fast the image moves."""
+
+
+class AutoMidpointResampler:
+    """Midpoint resampling that chooses its group size when it is first asked for groups."""
+
+    def __init__(self, config: MidpointConfig, context: StageContext) -> None:
+        self._config, self._context = config, context
+        self._chosen: MidpointResampler | None = None
+
+    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+        """Return the groups of a level: see `MidpointResampler.groups`.
+
+        Raises:
+            InputError: the capture is shorter than the shortest group.
+        """
+        if self._chosen is None:
+            shorter_side = min(self._context.stream.frame_shape)
+            size, reason = choose_group_size(self._context.capture(), n_frames, shorter_side)
+            self._context.decide("group_size", size, reason)
+            self._chosen = MidpointResampler(self._config.model_copy(update={"group_size": size}))
+        return self._chosen.groups(n_frames, level)
+
+
+def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int) -> tuple[int, str]:
+    """Return the group size for a capture, in frames, and a clause that gives the reason.
+
+    The blur of a group of m frames at v px a frame is m v px. It may be 0.15 of the shorter side of a frame, and up to twice
+    that as long as a pixel gets fewer than 3 photons. There are at least 16 frames in a group, and at least 8 groups.
+    """
+    if capture.speed_px is None:
+        size, bound = _bounded(_UNKNOWN, n_frames)
+        return size, f"{capture.how}, so {_UNKNOWN} frames are assumed{bound}"
+    allowed = _BLUR * shorter_side_px / max(capture.speed_px, _LEAST)
+    wanted = min(max(allowed, _DARK / max(capture.flux, _LEAST)), _DARK_BLUR * allowed)
+    size, bound = _bounded(wanted, n_frames)
+    blur_px = size * capture.speed_px
+    dark = ", for which more blur is allowed in the dark" if wanted > max(allowed, SHORTEST) else ""
+    return size, (
+        f"at {capture.speed_px:.2g} px a frame ({capture.how}) they are blurred by {blur_px:.3g} px, "
+        f"{blur_px / shorter_side_px:.2g} of the shorter side of a frame, and at a flux of {capture.flux:.2g} they hold "
+        f"{size * capture.flux:.3g} photons a pixel{dark}{bound}"
+    )
+
+
+def _bounded(wanted: float, n_frames: int) -> tuple[int, str]:
+    """Return the nearest size that suits the capture, and what to say if it is not the one that was wanted."""
+    most = max(SHORTEST, n_frames // _GROUPS)
+    if wanted > most:
+        return most, f"; longer ones would be fewer than {_GROUPS}"
+    if wanted < SHORTEST:
+        return SHORTEST, "; shorter ones would tell nothing"
+    return round(wanted), ""

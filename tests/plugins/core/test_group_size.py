@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano import CaptureSummary, CaptureUnreadError, StageContext, StreamInfo
+from photonpano_core.configs import MidpointConfig
+from photonpano_core.group_size import choose_group_size
+from photonpano_core.hooks import photonpano_resamplers
+from photonpano_core.midpoint import MidpointResampler
+
+HOW = "the second fastest of 12 places, from sums of 64 frames"
+
+
+def choice(flux: float, speed_px: float | None, n_frames: int = 10_000, how: str = HOW) -> tuple[int, str]:
+    return choose_group_size(CaptureSummary(flux, speed_px, how), n_frames, 254)
+
+
+def built(stream: StreamInfo, **context: Any) -> Any:
+    (contribution,) = photonpano_resamplers()
+    return contribution.build(MidpointConfig(group_size="auto"), StageContext(stream, response=None, **context))
+
+
+def test_in_the_light_motion_blur_decides() -> None:
+    assert choice(0.5, 0.15) == (
+        254,
+        f"at 0.15 px a frame ({HOW}) they are blurred by 38.1 px, 0.15 of the shorter side of a frame, and at a flux of 0.5 "
+        "they hold 127 photons a pixel",
+    )
+
+
+def test_in_the_dark_up_to_twice_the_blur_is_allowed() -> None:
+    size, reason = choice(0.02, 0.3)
+    assert size == 150
+    assert reason.endswith("hold 3 photons a pixel, for which more blur is allowed in the dark")
+    assert choice(0.001, 0.3)[0] == 254
+
+
+def test_a_slow_capture_has_eight_groups() -> None:
+    for speed_px in (0.0, 0.001):
+        size, reason = choice(0.5, speed_px)
+        assert size == 1250
+        assert reason.endswith("; longer ones would be fewer than 8")
+
+
+def test_fast_motion_leaves_sixteen_frames() -> None:
+    size, reason = choice(0.5, 10.0)
+    assert size == 16
+    assert reason.endswith(
+        "they are blurred by 160 px, 0.63 of the shorter side of a frame, and at a flux of 0.5 they hold 8 "
+        "photons a pixel; shorter ones would tell nothing"
+    )
+
+
+def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None:
+    how = "no motion can be told at any of 12 places"
+    assert choice(0.01, None, how=how) == (500, f"{how}, so 500 frames are assumed")
+    assert choice(0.01, None, 2000, how) == (
+        250,
+        f"{how}, so 500 frames are assumed; longer ones would be fewer than 8",
+    )
+
+
+@given(
+    flux=st.floats(0, 10),
+    speed_px=st.none() | st.floats(0, 100),
+    n_frames=st.integers(16, 100_000),
+    side=st.integers(8, 1024),
+)
+def test_any_capture_gets_a_size_within_bounds(flux: float, speed_px: float | None, n_frames: int, side: int) -> None:
+    size, reason = choose_group_size(CaptureSummary(flux, speed_px, HOW), n_frames, side)
+    assert 16 <= size <= max(16, n_frames // 8)
+    assert "\n" not in reason
+    if speed_px and size > 16:
+        assert (size - 1) * speed_px <= 0.3 * side
+
+
+def test_the_size_is_chosen_once_recorded_and_used_at_every_level() -> None:
+    looked, decided = [], []
+
+    def capture() -> CaptureSummary:
+        looked.append(1)
+        return CaptureSummary(0.5, 0.381, HOW)
+
+    resampler = built(StreamInfo(1000, 254, 496, None), capture=capture, decide=lambda *what: decided.append(what))
+    assert not looked
+    fixed = MidpointResampler(MidpointConfig(group_size=100))
+    assert [resampler.groups(1000, level) for level in (1, 2, 3)] == [fixed.groups(1000, level) for level in (1, 2, 3)]
+    assert looked == [1]
+    assert [what[:2] for what in decided] == [("group_size", 100)]
+
+
+def test_it_is_left_open_where_no_frames_are_read() -> None:
+    resampler = built(StreamInfo(1000, 254, 496, None))
+    with pytest.raises(CaptureUnreadError, match=r"^chosen from flux and speed when the capture is read$"):
+        resampler.groups(1000, 1)
+
+
+def test_a_capture_shorter_than_the_shortest_group_is_refused() -> None:
+    (contribution,) = photonpano_resamplers()
+    config = MidpointConfig(group_size="auto")
+    assert contribution.check(config, StreamInfo(16, 8, 8, None)) == []
+    assert contribution.check(config, StreamInfo(15, 8, 8, None)) == [
+        "the capture has 15 frames, fewer than one group of 16; set group_size to 3 or less, so that at least four groups fit"
+    ]
