@@ -9,7 +9,7 @@ from pydantic.json_schema import models_json_schema
 
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.wording import TolerantJsonSchema
-from photonpano.spec.resolution import DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
+from photonpano.spec.resolution import DEFAULT_FALLBACK, DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
 from photonpano.spec.settings import LevelSettings, OutputSettings
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 Schema: TypeAlias = dict[str, Any]
 SECTION = ["object", "null"]
 """A section may be left empty."""
+FALLBACK = "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}"
+"""What editors say of the fallback of a locator."""
 
 
 def json_schema(catalog: Catalog) -> Schema:
@@ -40,8 +42,9 @@ def json_schema(catalog: Catalog) -> Schema:
         overrides[kind.section] = _component(kind, own, schemas, None)
     locators = overrides["locate"] | {"type": "object", "required": ["use"]}
     definitions["fallback"] = _fallback(locators)
-    for section in (sections["locate"], overrides["locate"]):
-        section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback"}}
+    for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
+        described = f"{FALLBACK}; by default {default}, but none where `use` is given"
+        section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
     level["properties"] |= {name: schema for name, schema in overrides.items() if name in DEFAULTS}
     sections["source"]["required"] = ["use"]
     return {
@@ -103,7 +106,4 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
 def _fallback(locator: Schema) -> Schema:
     """Return the schema of the locators to which lost pairs are offered: one or a list, each a name or a mapping."""
     one = {"anyOf": [locator["properties"]["use"], locator]}
-    return {
-        "description": "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}",
-        "anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}],
-    }
+    return {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}

@@ -28,8 +28,10 @@ LEVELS = 3
 MAX_LEVELS = 8
 UNTIL_CONVERGED = "until-converged"
 """Instead of a number of levels: as many as it takes, `MAX_LEVELS` at most."""
-DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "opencv-sift", "interpolate": "lucas-kanade"}
+DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "direct", "interpolate": "lucas-kanade"}
 """The components of a spec that does not choose."""
+DEFAULT_FALLBACK = "opencv-sift"
+"""The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks."""
 KIND_OF = {kind.section: kind for kind in KINDS.values()}
 """The kind of component that a section chooses."""
 SETTINGS: dict[str, type[BaseModel]] = {
@@ -154,6 +156,8 @@ class _Resolver:
     ) -> tuple[Choice[Any], ...]:
         """Resolve the locators to which lost pairs are offered: one or a list, each a name or a mapping.
 
+        The default locator has a default fallback; one that is named has those that are named.
+
         Args:
             value: the section.
             content: its keys.
@@ -163,8 +167,10 @@ class _Resolver:
         again = "would lose the same pairs again"
         written = content.get("fallback")
         if written is None or written.content is None:
-            if base is None or "use" in content:
+            if "use" in content:
                 return ()
+            if base is None:
+                return self.default_fallbacks(value)
             if first is not None and first != base.choice and first in base.fallbacks:
                 name = first.contribution.name
                 self.problems.append(value.head.problem(f"the fallback {name!r} has the same keys, and {again}"))
@@ -181,6 +187,14 @@ class _Resolver:
                 tried.append(choice)
                 found.append(choice)
         return tuple(found)
+
+    def default_fallbacks(self, value: Value) -> tuple[Choice[Any], ...]:
+        """Resolve the fallback of a section that names neither a locator nor fallbacks."""
+        if DEFAULT_FALLBACK not in self.catalog.names(KIND_OF["locate"].name):
+            return ()
+        place = replace(value.head, where=joined(value.head.where, "fallback"))
+        choice = self.fallback(Value(DEFAULT_FALLBACK, place))
+        return () if choice is None else (choice,)
 
     def fallback(self, item: Value) -> Choice[Any] | None:
         """Resolve one locator to which lost pairs are offered."""

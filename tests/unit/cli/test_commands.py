@@ -125,7 +125,7 @@ def test_what_depends_on_the_frames_is_left_open(folder: Path, invoke: Callable[
 
 
 def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) -> None:
-    levels = "levels=[{scale: 0.5, locate: {with: {ratio: 0.7}}}, {}]"
+    levels = "levels=[{scale: 0.5, locate: {with: {max_iterations: 7}}}, {}]"
     arguments = ["capture.yaml", "--set", levels, "--set", "run.seed=3"]
     result = invoke("explain", *arguments)
     assert result.exit_code == 0, result.stderr
@@ -135,18 +135,18 @@ def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) 
 
 
 def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
-    spec = (
-        (folder / "capture.yaml").read_text().replace("levels: 1", "locate: {with: {ratio: 0.7}}\nlevels: [{locate: {}}, {}]")
-    )
+    changed = "locate: {with: {max_iterations: 7}}\nlevels: [{locate: {}}, {}]"
+    spec = (folder / "capture.yaml").read_text().replace("levels: 1", changed)
     (folder / "capture.yaml").write_text(spec)
     lines = [line.strip() for line in invoke("explain", "capture.yaml", "--set", "run.seed=3").stdout.splitlines()]
     assert lines[0] == "# capture.yaml as it will run, on 200 binary frames of 96x160 at 96,800 Hz"
     assert "use: simulator  # photonpano 0.1.0" in lines
-    assert "use: opencv-sift  # photonpano 0.1.0, default" in lines
+    assert "use: direct  # photonpano 0.1.0, default" in lines
+    assert "- use: opencv-sift  # photonpano 0.1.0, default" in lines
     assert "flux: 1" in lines
     assert "group_size: 50" in lines
     assert "endpoints: true  # default" in lines
-    assert "ratio: 0.7" in lines
+    assert "max_iterations: 7" in lines
     assert "seed: 3  # --set" in lines
     assert f"directory: {folder}/runs/capture  # default" in lines
     assert "# level 1: 4 groups of 50 frames, 5 pairs" in lines

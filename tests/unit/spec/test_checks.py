@@ -48,12 +48,13 @@ def test_fallbacks_are_checked_where_they_are_written(catalog):
     spec = (
         "version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 50}}\n"
         "locate: {fallback: {use: sized, with: {at_least: 101}}}\n"
-        "levels:\n  - {locate: {with: {ratio: 0.5}}}\n  - {locate: {fallback: [direct, {use: sized, with: {at_least: 102}}]}}\n"
+        "levels:\n  - {locate: {with: {max_steps: 5}}}\n"
+        "  - {locate: {fallback: [opencv-sift, {use: sized, with: {at_least: 102}}]}}\n"
     )
     plan = parse_spec(spec, catalog=Catalog(catalog.rows).including(sized))
     assert [str(problem) for problem in check_stream(plan, SHORT)] == [
         "4:10: locate.fallback: the capture has fewer than 101 frames",
-        "7:34: levels.1.locate.fallback.1: the capture has fewer than 102 frames",
+        "7:39: levels.1.locate.fallback.1: the capture has fewer than 102 frames",
     ]
 
 

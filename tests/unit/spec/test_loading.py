@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import SpecError
+from photonpano.registry import Catalog
 from photonpano.spec import load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
@@ -24,7 +25,8 @@ def test_minimal_spec_is_complete(catalog):
     assert len(plan.levels) == 3
     level = plan.levels[0]
     names = [choice.contribution.name for choice in (level.resample, level.merge, level.locate, level.interpolate)]
-    assert names == ["midpoint", "photon-mle", "opencv-sift", "lucas-kanade"]
+    assert names == ["midpoint", "photon-mle", "direct", "lucas-kanade"]
+    assert [choice.contribution.name for choice in level.fallbacks] == ["opencv-sift"]
     assert (plan.source.plugin, plan.source.version) == ("photonpano", "0.1.0")
     assert {level.scale for level in plan.levels} == {1.0}
 
@@ -53,6 +55,45 @@ def test_level_replaces_a_stage_with_use_and_updates_it_without(catalog):
     assert empty == base
 
 
+def tried_by(level):
+    return [(each.contribution.name, each.config.model_dump(exclude_unset=True)) for each in (level.locate, *level.fallbacks)]
+
+
+@pytest.mark.parametrize(
+    ("section", "tried"),
+    [
+        (None, ["direct", "opencv-sift"]),
+        ({"with": {"max_steps": 5}}, ["direct", "opencv-sift"]),
+        ({"fallback": None}, ["direct", "opencv-sift"]),
+        ({"fallback": []}, ["direct"]),
+        ({"fallback": {"use": "direct", "with": {"max_steps": 5}}}, ["direct", "direct"]),
+        ({"use": "direct"}, ["direct"]),
+        ({"use": "opencv-sift"}, ["opencv-sift"]),
+        ({"use": "opencv-sift", "fallback": "direct"}, ["opencv-sift", "direct"]),
+    ],
+)
+def test_only_the_default_locator_has_a_default_fallback(section, tried, catalog):
+    plan = parse_spec(MINIMAL | {"locate": section}, catalog=catalog)
+    assert [[name for name, _ in tried_by(level)] for level in plan.levels] == [tried] * 3
+    assert [each["use"] for each in plan.document["locate"]["fallback"]] == tried[1:]
+
+
+def test_level_that_overrides_keys_keeps_the_default_fallback_and_one_that_names_a_locator_has_none(catalog):
+    levels = [{"locate": {"with": {"max_steps": 5}}}, {"locate": {"use": "direct"}}, {"locate": {"fallback": []}}]
+    plan = parse_spec(MINIMAL | {"levels": levels}, catalog=catalog)
+    short = ("direct", {"max_steps": 5})
+    assert [tried_by(level) for level in plan.levels] == [[short, ("opencv-sift", {})], [("direct", {})], [("direct", {})]]
+
+
+def test_default_fallback_is_left_out_where_it_is_not_installed_and_an_error_where_it_is_ambiguous(catalog):
+    without = Catalog(tuple(entry for entry in catalog.rows if entry.name != "opencv-sift"))
+    assert parse_spec(MINIMAL, catalog=without).levels[0].fallbacks == ()
+    twice = Catalog((*catalog.rows, catalog.find("locator", "opencv-sift")))
+    (message,) = messages(MINIMAL, catalog=twice)
+    assert message.startswith("locate.fallback: the locator 'opencv-sift' is offered by ")
+    parse_spec(MINIMAL | {"locate": {"fallback": []}}, catalog=twice)
+
+
 def test_level_keeps_the_fallbacks_until_it_names_a_locator_or_fallbacks_of_its_own(catalog):
     steps = {"max_steps": 5}
     overrides = {
@@ -65,13 +106,8 @@ def test_level_keeps_the_fallbacks_until_it_names_a_locator_or_fallbacks_of_its_
         "none": {"fallback": []},
     }
     levels = [{"locate": override} for override in overrides.values()]
-    plan = parse_spec(MINIMAL | {"locate": {"fallback": "direct"}, "levels": levels}, catalog=catalog)
-    tried = {
-        name: [
-            (each.contribution.name, each.config.model_dump(exclude_unset=True)) for each in (level.locate, *level.fallbacks)
-        ]
-        for name, level in zip(overrides, plan.levels, strict=True)
-    }
+    plan = parse_spec(MINIMAL | {"locate": {"use": "opencv-sift", "fallback": "direct"}, "levels": levels}, catalog=catalog)
+    tried = {name: tried_by(level) for name, level in zip(overrides, plan.levels, strict=True)}
     sift, direct, short = ("opencv-sift", {}), ("direct", {}), ("direct", steps)
     assert tried == {
         "nothing": [sift, direct],
@@ -88,7 +124,10 @@ def test_level_keeps_the_fallbacks_until_it_names_a_locator_or_fallbacks_of_its_
 
 def test_places_of_fallbacks_are_found_by_their_paths_in_the_document(catalog):
     """Where a fallback is one name or one mapping, the document has a list of mappings."""
-    spec = "version: 1\nsource: {use: simulator}\nlocate: {fallback: direct}\nlevels: [{locate: {fallback: {use: direct}}}]"
+    spec = (
+        "version: 1\nsource: {use: simulator}\n"
+        "locate: {fallback: opencv-sift}\nlevels: [{locate: {fallback: {use: opencv-sift}}}]"
+    )
     places = parse_spec(spec, catalog=catalog).places
     found = {path: (places[path].where, places[path].column) for path in places if path.endswith(".0.use")}
     assert found == {

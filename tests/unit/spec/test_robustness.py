@@ -14,7 +14,7 @@ SPEC = {
     "version": 1,
     "source": {"use": "simulator", "with": {"frames": 10, "size": [3, 4], "flip": {"rows": True}}},
     "resample": {"use": "midpoint", "with": {"group_size": 5, "stride": 2}},
-    "locate": {"with": {"ratio": 0.7}, "fallback": ["direct", {"use": "opencv-sift", "with": {"ratio": 0.9}}]},
+    "locate": {"with": {"max_steps": 7}, "fallback": ["opencv-sift", {"use": "opencv-sift", "with": {"ratio": 0.9}}]},
     "levels": [{"scale": 0.5, "locate": {"use": "direct", "with": {"max_steps": 3}, "fallback": "opencv-sift"}}, {}],
     "graph": {"skips": [1.0, 2.0], "disconnected": "largest"},
     "render": {"scale": 2.0, "reference": "first"},
