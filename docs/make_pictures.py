@@ -19,14 +19,25 @@ import tifffile
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from photonpano import FrameSpan, Group, StageContext, evaluate, load_spec, open_source, parse_spec, run
+from photonpano import FrameSpan, Group, StageContext, StreamInfo, discover, evaluate, load_spec, open_source, parse_spec, run
 from photonpano.evaluation import FrameTrajectory
-from photonpano.photometry import tone_mapped
+from photonpano.geometry import (
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    jacobian,
+    normalised,
+    parameters,
+    translation,
+)
+from photonpano.photometry import BinaryResponse, tone_mapped
 from photonpano.pipeline.capture import truth_path, write_packed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from photonpano import Plan
@@ -63,6 +74,15 @@ WAYS = ("scan", "constant groups", "naive average")
 """Specs of examples/pipelines, on the capture that is beside them."""
 PLACE = (235, 85)
 """The middle of the place that is compared, in pixels of the reference frame, which all ways share."""
+INTERPOLATORS = {
+    "geodesic": ("tab:green", "-"),
+    "lucas-kanade": ("black", "-"),
+    "lie": ("tab:orange", "--"),
+    "smoothing-spline": ("tab:blue", "-"),
+}
+"""And the lines that stand for them."""
+SPACINGS = (125, 31)
+"""Frames between knots: those of the first level of `street_spec`, and those of the third."""
 
 
 def main() -> None:
@@ -77,6 +97,7 @@ def main() -> None:
         finish(parse_spec(street_spec(street), overrides=[f"levels={number}"], output=in_folder(folder, name)), name, street)
     save("readme.png", readme(folder, street))
     save("levels.png", levels(folder, street))
+    save("interpolation.png", interpolation(street))
 
     capture = written(load_spec(EXAMPLES / "capture.yaml"), folder / "capture.npy")
     for name in WAYS:
@@ -180,6 +201,71 @@ def baselines(folder: Path) -> Picture:
         crop = picture(flux[y - 54 : y + 54, x - 54 : x + 54], 0.67)
         pictures.append(labelled(cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8), file))
     return beside(pictures)
+
+
+def interpolation(cube: Path) -> Picture:
+    """Return the errors between knots on the true motion of a capture, and print what they are on average."""
+    with np.load(truth_path(cube)) as file:
+        truth, shape = file["homographies"], tuple(file["frame_shape"])
+    truth = normalised(inverse(truth[len(truth) // 2]) @ truth)
+    rolling = normalised(truth @ turned(np.linspace(0, 16 * np.pi, len(truth)), shape))
+    cases = {
+        f"{what}, {spacing} frames apart": (motion, spacing, error_px)
+        for what, motion, error_px in (("exact", truth, 0.0), ("off by 0.1 px", truth, 0.1), ("exact, rolled", rolling, 0.0))
+        for spacing in SPACINGS
+    }
+    figure = Figure(figsize=(10, 5.2), dpi=100, layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True, sharey=True).T.ravel()
+    for place, (label, case) in enumerate(cases.items()):
+        errors = {name: between_knots(name, *case, shape) for name in INTERPOLATORS}
+        print(f"{label:32}", *(f"{name} {error.mean():.4f} px, worst {error.max():.3f} px;" for name, error in errors.items()))
+        if place < len(panels):
+            draw_errors(panels[place], f"knots {label}", case[1], errors)
+    panels[0].legend(fontsize=8, ncols=2, loc="lower right")
+    figure.supxlabel("frame", fontsize=9)
+    figure.supylabel("corner error, px", fontsize=9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., 2::-1]
+
+
+def between_knots(
+    name: str, motion: NDArray[np.float64], spacing: int, error_px: float, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return the mean corner error of each frame, where each coordinate of the corners of a knot errs by so many px."""
+    instants = np.arange(spacing // 2, len(motion), spacing)
+    noise = np.random.default_rng(0).normal(0, error_px, (len(instants), 8))
+    to_corners = np.array([jacobian(knot, corners(shape)).reshape(8, 8) for knot in motion[instants]])
+    knots = from_parameters(parameters(motion[instants]) + np.linalg.solve(to_corners, noise[..., None])[..., 0])
+    contribution = discover().find("interpolator", name).contribution
+    context = StageContext(StreamInfo(len(motion), *shape, None), BinaryResponse())
+    trajectory = contribution.build(contribution.config(), context).fit(instants.astype(float), knots, None)
+    frames = np.arange(instants[0], instants[-1] + 1)
+    return corner_displacements(trajectory.at(frames), motion[frames], shape).mean(axis=1)
+
+
+def draw_errors(panel: Axes, title: str, spacing: int, errors: dict[str, NDArray[np.float64]]) -> None:
+    """Draw the errors of a thousand frames, and where the knots are."""
+    start = len(errors["lie"]) // 2
+    frames = np.arange(start, start + 1000)
+    for knot in frames[frames % spacing == 0]:
+        panel.axvline(knot + spacing // 2, color="0.9", linewidth=0.8)
+    for name, (colour, style) in INTERPOLATORS.items():
+        panel.semilogy(frames + spacing // 2, errors[name][frames], style, color=colour, linewidth=1.2, label=name)
+    panel.set_title(title, fontsize=9)
+    panel.set_ylim(1e-4, 5)
+    panel.tick_params(labelsize=8)
+
+
+def turned(angles: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the maps that turn a frame about its middle."""
+    height, width = shape
+    centred = translation((width - 1) / 2, (height - 1) / 2)
+    turns = np.tile(np.eye(3), (len(angles), 1, 1))
+    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
+    turns[:, 1, 0] = np.sin(angles)
+    turns[:, 0, 1] = -turns[:, 1, 0]
+    return centred @ turns @ inverse(centred)
 
 
 def motion(directory: Path) -> FrameTrajectory:

@@ -32,6 +32,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "super-resolution": GROUPS,
     "coarse-to-fine": GROUPS,
     "direct-alignment": GROUPS,
+    "smoothing-spline": GROUPS,
     "fallback": GROUPS,
     "demo": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
