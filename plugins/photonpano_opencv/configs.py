@@ -43,14 +43,17 @@ class DirectConfig(Config):
     max_iterations: int = Field(30, ge=1, le=1000, description="steps at each level of the pyramid")
     converged_px: float = Field(0.01, gt=0, le=1, description="the alignment is done when a step moves no corner further")
     min_overlap: float = Field(0.1, gt=0, le=1, description="the least share of the image that both exposures must see")
-    min_zncc: float = Field(
-        0.2, ge=-1, le=1, description="a pair that correlates less than this after alignment is not located"
+    min_agreement: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="a pair whose images, with photon noise taken out, correlate less than this after alignment is not located",
     )
     max_noise_ratio: float = Field(
         25.0, gt=1, description="a pair that differs by more than this many times its photon noise is not located"
     )
     max_std_px: float = Field(
-        15.0,
+        10.0,
         gt=0,
         description="a pair whose photons tell less well than this where the corners of the frame lie is not located",
     )

@@ -10,7 +10,7 @@ import numpy as np
 from photonpano import Located, NotLocated
 from photonpano.geometry import implausibility, inverse, normalised, rescaled, translation
 from photonpano_opencv.pyramid import pyramid_of
-from photonpano_opencv.template import ALL, Template
+from photonpano_opencv.template import ALL, Quality, Template
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 _COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
 """What moves at the coarsest level of the pyramid (translation) and at the next (affine); the others use all of p1..p8."""
 _DAMPING = 0.1
-"""Where a step leads astray, the next is shortened by this share of the template's curvature, and by more where that does too."""
+"""Where a step leads astray, the next is shortened by this share of the template's curvature, and by more if that does too."""
+_JUDGE = 2
+"""The layer of the pyramid on which images are compared at the end: coarse, so that noise is small and blur hardly counts."""
 _COARSE_TOLERANCE = 4
 """The coarser levels of the pyramid only start the finest, and may stop this much earlier."""
 
@@ -49,20 +51,25 @@ class DirectLocator:
         if not (moving[-1].weight.any() and fixed[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
         start = homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
-        best: tuple[float, Located | NotLocated] = np.inf, NotLocated("")
+        best: tuple[float, NDArray[np.float64], Quality] | None = None
+        judge = min(_JUDGE, len(moving) - 1)
         for depth in reversed(range(len(moving))):
             free, scale = _model(depth, len(moving)), 0.5**depth
             template = Template(moving[depth], rescaled(start, scale))
             found = self._aligned(template, rescaled(homography, scale), fixed[depth], free, depth == 0)
             if not isinstance(found, str):
                 homography = rescaled(found, 1 / scale)
-                if free == ALL:
-                    # Photons blurred by motion say nothing about details, whose noise a coarse layer averages out.
-                    best = min(best, self._judged(template, found, fixed[depth], scale), key=lambda judged: judged[0])
-            elif depth == 0 and best[0] == np.inf:
+                quality = template.quality(found, fixed[depth]) if free == ALL else None
+                # Photons blurred by motion say nothing about details, whose noise a coarse layer averages out.
+                if quality is not None and (best is None or quality.std_px / scale < best[2].std_px / best[0]):
+                    best = scale, homography, quality
+            elif depth == 0 and best is None:
                 # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
                 return NotLocated(found)
-        return best[1]
+        assert best is not None
+        scale, homography, quality = best
+        alike = Template(moving[judge], np.eye(3)).agreement(rescaled(homography, 0.5**judge), fixed[judge])
+        return self._judged(homography, quality, scale, alike)
 
     def _aligned(
         self, template: Template, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], finest: bool
@@ -88,20 +95,21 @@ class DirectLocator:
                 return homography
         return f"the alignment has not settled after {config.max_iterations} steps"
 
-    def _judged(
-        self, template: Template, homography: NDArray[np.float64], fixed: Layer, scale: float
-    ) -> tuple[float, Located | NotLocated]:
-        """Return the expected error of a corner, in px of the finest layer, and what is to be said of the pair."""
-        quality, config = template.quality(homography, fixed), self._config
+    def _judged(self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float) -> Located | NotLocated:
+        """Say what is to be said of an alignment, whose quality is that of a layer of this scale."""
+        config, std_px = self._config, quality.std_px / scale
         evidence = {
-            "zncc": quality.zncc,
+            "agreement": alike,
             "noise_ratio": quality.noise_ratio,
             "overlap": quality.overlap,
             "pixel": 1 / scale,
         }
-        std_px = quality.std_px / scale
-        if quality.zncc < config.min_zncc:
-            reason = f"after alignment the images correlate by {quality.zncc:.2f}, less than min_zncc = {config.min_zncc:g}"
+        if alike < config.min_agreement:
+            reason = (
+                f"after alignment the images agree by {alike:.2f}, less than min_agreement = {config.min_agreement:g}"
+                if alike
+                else "where the images overlap after alignment, nothing stands out from photon noise"
+            )
         elif quality.noise_ratio > config.max_noise_ratio:
             reason = (
                 f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, "
@@ -111,9 +119,8 @@ class DirectLocator:
             reason = f"the photons tell where corners lie to {std_px:.2g} px, worse than max_std_px = {config.max_std_px:g}"
         else:
             units = np.array([1, 1, 1, 1, scale, scale, 1 / scale, 1 / scale])
-            information = quality.information * np.outer(units, units)
-            return std_px, Located(rescaled(homography, 1 / scale), information, std_px, evidence)
-        return std_px, NotLocated(reason, evidence)
+            return Located(homography, quality.information * np.outer(units, units), std_px, evidence)
+        return NotLocated(reason, evidence)
 
 
 def _model(depth: int, layers: int) -> tuple[int, ...]:

@@ -21,14 +21,24 @@ ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 _BOLDEST = 5.0
 """The curvature common to both images is taken to be at least so many times what noise alone leaves in common by chance, which
 is the template's over the root of the number of independent pixels; so steps stay bounded."""
+_BY_CHANCE = 1.5
+"""The best alignment of noise has a curvature in common of up to so many times the same; that much tells nothing."""
 _UNKNOWN = 1e-3
-"""Where noise exceeds the scene, next to nothing is known: this share of the template's curvature."""
+"""Where no more than that is in common, next to nothing is known: this share of the template's curvature."""
 _PRIOR_STD = np.array([0.03, 0.03, 0.03, 0.03, np.inf, np.inf, 0.03, 0.03])
 """How much p1..p8, in coordinates of about unit size, may differ from the start where photons do not tell: a camera that turns
 between two exposures shifts the image by any amount, but rolls by a degree or two and changes the perspective by little."""
 _PRIOR = np.diag(_PRIOR_STD**-2.0)
 _NEGLIGIBLE = 0.02
 """Steps of this share of what photons leave open do not count: where they tell little, steps stay small for long."""
+_FEWEST = 50
+"""Fewer independent pixels than this agree by chance."""
+_INTERPOLATED = 4 / 9
+"""What linear interpolation leaves of the variance of white noise, on average over where between pixels it looks."""
+_SURROUNDINGS_PX = 4.0
+"""What counts as the surroundings of a pixel, as the standard deviation of a Gaussian in px of the layer."""
+_STANDS_OUT = 5.0
+"""The variance of a scene exceeds that of the noise by at least so many of its standard errors."""
 _RENEWED_PX = 0.25
 """The curvature is taken anew until steps are smaller than this."""
 
@@ -39,7 +49,6 @@ class Quality:
 
     Attributes:
         information: (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images.
-        zncc: correlation of the images where they overlap.
         noise_ratio: mean square of their difference over that which photon noise makes.
         overlap: share of the template that both see.
         std_px: expected distance of a corner from where it should be, in px of the layer.
@@ -47,7 +56,6 @@ class Quality:
 
     information: NDArray[np.float64]
     std_px: float
-    zncc: float
     noise_ratio: float
     overlap: float
 
@@ -98,7 +106,7 @@ class Template:
         if not seen:
             return None
         if self._hessian is None:
-            self._own, common = self._curvatures(residual, weight, self._boldest(seen))
+            self._own, common = self._curvatures(residual, weight, 0.0, min(0.5, _BOLDEST * self._chance(weight)))
             self._hessian = common + _PRIOR
             self._std_px = self._expected_px(free)
         weighted = residual * weight
@@ -131,16 +139,12 @@ class Template:
         """Return how well the images agree, and what their photons tell about p1..p8 of `homography`."""
         residual, weight = self._residual(homography, fixed)
         seen = weight > 0
-        here = self._layer.image[seen]
-        there = here + residual[seen]
-        here, there = here - here.mean(), there - there.mean()
-        spread = float(np.sqrt(np.mean(here**2) * np.mean(there**2)))
         # White noise, and what the blur leaves of it in a pixel.
         variance = float(np.median(1 / weight[seen]))
         noise_ratio = float(np.mean(residual[seen] ** 2)) * 4 * np.pi * self._layer.blur_px**2 / variance
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
-        _, hessian = self._curvatures(residual, weight, _UNKNOWN)
+        _, hessian = self._curvatures(residual, weight, _BY_CHANCE * self._chance(weight), _UNKNOWN)
         bx, by = (cv2.GaussianBlur(weight * gradient, (0, 0), self._layer.blur_px) for gradient in (self._gx, self._gy))
         scatter = self._quadratic(bx * bx, bx * by, by * by) * variance
         information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio) + _PRIOR
@@ -149,10 +153,35 @@ class Template:
         return Quality(
             information=in_parameters,
             std_px=float(np.sqrt(np.trace(to_corners @ np.linalg.inv(in_parameters) @ to_corners.T) / 4)),
-            zncc=float(np.mean(here * there)) / max(spread, 1e-12),
             noise_ratio=noise_ratio,
             overlap=float(seen.mean()),
         )
+
+    def agreement(self, homography: NDArray[np.float64], fixed: Layer) -> float:
+        """Return the correlation that the images would have without photon noise: 1 where they show the same.
+
+        Around 0 for different places, and 0 where the scene does not stand out from the noise, so that any two places look
+        alike.
+        """
+        height, width = self._layer.image.shape
+        there, there_weight = (
+            cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            for image in (fixed.image, fixed.weight)
+        )
+        seen = (self._layer.weight > 0) & (there_weight > 0)
+        gain = 1 / (4 * np.pi * self._layer.blur_px**2)
+        independent = np.count_nonzero(seen) * min(1.0, gain)
+        if independent < _FEWEST:
+            return 0.0
+        # Shadows and slopes that fill the image look alike wherever one looks.
+        first, second = (_details(image, seen)[seen] for image in (self._layer.image, np.asarray(there, np.float32)))
+        scenes = []
+        for image, weight, left in ((first, self._layer.weight, 1.0), (second, there_weight, _INTERPOLATED)):
+            spread, noise = float(np.var(image)), left * gain * float(np.mean(1 / weight[seen]))
+            if spread - noise < _STANDS_OUT * noise * float(np.sqrt(2 / independent)):
+                return 0.0
+            scenes.append(spread - noise)
+        return float(np.cov(first, second)[0, 1]) / float(np.sqrt(scenes[0] * scenes[1]))
 
     def _residual(self, homography: NDArray[np.float64], fixed: Layer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the fixed image seen from the template minus the template, and the inverse variance of the difference."""
@@ -167,7 +196,7 @@ class Template:
         return seen - self._layer.image, combined
 
     def _curvatures(
-        self, residual: NDArray[np.float32], weight: NDArray[np.float32], least: float
+        self, residual: NDArray[np.float32], weight: NDArray[np.float32], by_chance: float, least: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the (8, 8) curvature of the template, and that which both images have in common: that of the scene.
 
@@ -177,6 +206,7 @@ class Template:
         Args:
             residual: (H, W) the fixed image seen from the template minus the template.
             weight: (H, W) inverse variance of a pixel of the residual.
+            by_chance: the share of the template's curvature that noise may have in common, which is taken off.
             least: what is left of a direction in which there is nothing in common, as a share of the template's curvature.
         """
         gx, gy = self._gx, self._gy
@@ -191,7 +221,7 @@ class Template:
             return own, own
         whitening = np.linalg.inv(root)
         values, vectors = np.linalg.eigh(np.eye(8) + whitening @ difference @ whitening.T)
-        half = root @ (vectors * np.sqrt(np.maximum(values, least)))
+        half = root @ (vectors * np.sqrt(np.maximum(values - by_chance, least)))
         return own, np.asarray(half @ half.T)
 
     def _quadratic(self, xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -204,9 +234,10 @@ class Template:
         x, y = self._powers
         return np.asarray((image @ x[:, :count]).astype(np.float64).T @ y[:, :count])
 
-    def _boldest(self, seen: int) -> float:
-        independent = seen / max(1.0, 4 * np.pi * self._layer.blur_px**2)
-        return min(0.5, _BOLDEST / float(np.sqrt(independent)))
+    def _chance(self, weight: NDArray[np.float32]) -> float:
+        """Return the curvature that noise has in common by chance, as a share of the template's."""
+        independent = np.count_nonzero(weight) / max(1.0, 4 * np.pi * self._layer.blur_px**2)
+        return 1 / float(np.sqrt(independent))
 
     def _expected_px(self, free: tuple[int, ...]) -> float:
         """Return the expected distance of a corner from where it should be, in px of the layer, if noise were white."""
@@ -265,6 +296,13 @@ def _products() -> tuple[NDArray[np.float64], ...]:
         product(_ALONG_X, _ALONG_Y) + product(_ALONG_Y, _ALONG_X),
         product(_ALONG_Y, _ALONG_Y),
     )
+
+
+def _details(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return what differs from the surroundings."""
+    mask = seen.astype(np.float32)
+    around, norm = (cv2.GaussianBlur(each, (0, 0), _SURROUNDINGS_PX) for each in (image * mask, mask))
+    return np.asarray(image - around / np.maximum(norm, 1e-6), dtype=np.float32)
 
 
 def _powers(length: int, half: float) -> NDArray[np.float32]:
