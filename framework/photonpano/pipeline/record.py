@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from photonpano.values import NotLocated
+from photonpano.values import FrameSpan, Located, NotLocated
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from photonpano.pipeline.loop import LevelResult
     from photonpano.spec.plan import Plan
-    from photonpano.values import Group, StreamInfo
+    from photonpano.values import FloatArray, Group, StreamInfo
 
+UNCERTAIN_PX = 0.5
+"""Frames whose expected corner error exceeds this are named: theirs is likely to show."""
+SHOWN_SPANS = 4
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "pydantic", "pluggy", "tifffile")
 
 
@@ -66,10 +69,29 @@ def level_record(result: LevelResult) -> dict[str, Any]:
             locator.name: sum(edge.locator == locator.name for edge in located.edges) for locator in result.level.locators
         },
         "failures": list(_failures(result)),
+        "revisits": {
+            "pairs": located.n_revisits,
+            "located": sum(isinstance(edge.motion, Located) for edge in located.revisits),
+        },
+        "contradictions": list(_contradictions(result)),
         "change_px": result.change_px,
+        "std_px": mean_px if np.isfinite(mean_px := result.uncertainty.mean_px) else None,
         "residual_px": located.solution.residual_px,
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
+
+
+def motion_record(std_px: FloatArray) -> dict[str, Any] | None:
+    """Describe how well the motion is known; None if it is not, as with a single exposure.
+
+    Args:
+        std_px: (T,) expected corner error, infinite where nothing was located.
+    """
+    known = np.flatnonzero(np.isfinite(std_px))
+    if not len(known):
+        return None
+    worst = int(known[np.argmax(std_px[known])])
+    return {"std_px": float(std_px[known].mean()), "worst_std_px": float(std_px[worst]), "worst_frame": worst}
 
 
 def warnings_of(results: Sequence[LevelResult]) -> list[str]:
@@ -89,9 +111,29 @@ def warnings_of(results: Sequence[LevelResult]) -> list[str]:
             edge = located.edges[located.solution.contradictions[0]]
             warnings.append(
                 f"level {result.level.number}: {len(located.solution.contradictions)} of {len(located.edges)} pairs contradict "
-                f"the others and were outvoted ({_pair(result.groups, edge.moving, edge.fixed)} and others)"
+                f"the others and were dropped ({_pair(result.groups, edge.moving, edge.fixed)} and others)"
             )
     return warnings
+
+
+def uncertain_frames(std_px: FloatArray) -> list[str]:
+    """Warn of the frames whose corners may well be further than a pixel from where they should be.
+
+    Args:
+        std_px: (T,) expected corner error, infinite where nothing was located.
+    """
+    uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
+    if not uncertain.any():
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], uncertain, [False]]).astype(np.int8)))
+    spans = [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+    spans.sort(key=lambda span: -float(std_px[span[0] : span[1]].max()))
+    named = [f"{FrameSpan(*span)} (up to {std_px[span[0] : span[1]].max():.1f} px)" for span in spans[:SHOWN_SPANS]]
+    more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
+    return [
+        f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "
+        f"{UNCERTAIN_PX:g} px in {', '.join(named)}{more}"
+    ]
 
 
 def peak_memory_bytes() -> int | None:
@@ -114,6 +156,13 @@ def _failures(result: LevelResult) -> Iterator[dict[str, Any]]:
             "reason": edge.motion.reason,
             "evidence": dict(edge.motion.evidence),
         }
+
+
+def _contradictions(result: LevelResult) -> Iterator[dict[str, list[int]]]:
+    for position in result.located.solution.contradictions:
+        edge = result.located.edges[position]
+        moving, fixed = result.groups[edge.moving].span, result.groups[edge.fixed].span
+        yield {"moving": [moving.start, moving.stop], "fixed": [fixed.start, fixed.stop]}
 
 
 def _pair(groups: Sequence[Group], moving: int, fixed: int) -> str:

@@ -17,9 +17,11 @@ from photonpano.pipeline.panorama import plan_canvas, render
 from photonpano.pipeline.record import (
     level_record,
     library_versions,
+    motion_record,
     peak_memory_bytes,
     plugin_records,
     source_record,
+    uncertain_frames,
     warnings_of,
 )
 from photonpano.pipeline.threads import one_thread_inside, thread_count
@@ -47,6 +49,7 @@ class RunOutcome:
         panorama: flux and weight on the canvas.
         homographies: (T, 3, 3), frame pixels to reference pixels.
         located: (T,), False where a frame lies outside what was located.
+        std_px: (T,) expected corner error, infinite where a frame lies outside what was located.
         reference: the frame whose homography is the identity.
         record: the content of `run.json`.
     """
@@ -54,6 +57,7 @@ class RunOutcome:
     panorama: Panorama
     homographies: FloatArray
     located: BoolArray
+    std_px: FloatArray
     reference: int
     record: dict[str, Any]
 
@@ -83,7 +87,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     decisions: list[Decision] = []
     levels = build_levels(plan, source, decisions)
     with one_thread_inside():
-        results = estimate_motion(source, levels, plan.graph, reference, threads, progress)
+        results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged)
     trajectory = results[-1].trajectory
     rendering = time.perf_counter()
     canvas = plan_canvas(trajectory, stream, plan.render.scale, int(plan.run.memory))
@@ -92,7 +96,8 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     white_flux = float(np.quantile(panorama.flux[seen], plan.render.white_quantile)) or 1.0
     frames = np.arange(stream.n_frames)
     located = trajectory.located(frames)
-    warnings = warnings_of(results)
+    std_px = np.where(located, results[-1].uncertainty.at(frames), np.inf)
+    warnings = warnings_of(results) + uncertain_frames(std_px)
     if not located.all():
         warnings.append(f"{np.sum(~located)} of {stream.n_frames} frames lie outside what was located and are left out")
     now = time.perf_counter()
@@ -106,27 +111,30 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
         "source": source_record(stream),
         "plugins": plugin_records(plan),
         "libraries": library_versions(),
+        "decisions": [asdict(decision) for decision in decisions],
         "levels": [level_record(result) for result in results],
         "panorama": {
             "height": canvas.height,
             "width": canvas.width,
             "scale": plan.render.scale,
-        "decisions": [asdict(decision) for decision in decisions],
             "white_flux": white_flux,
             "coverage_share": float(seen.mean()),
             "seconds": round(now - rendering, 3),
         },
+        "motion": motion_record(std_px),
         "warnings": warnings,
         "seconds": round(now - start, 3),
         "peak_memory_bytes": peak_memory_bytes(),
     }
-    return RunOutcome(panorama, trajectory.at(frames), located, reference, record)
+    return RunOutcome(panorama, trajectory.at(frames), located, std_px, reference, record)
 
 
 def write_outcome(folder: RunFolder, outcome: RunOutcome, frame_shape: tuple[int, int]) -> None:
     """Write everything but the report into a run folder."""
     folder.write_panorama(outcome.panorama, outcome.picture)
-    folder.write_trajectory(outcome.homographies, outcome.located, outcome.panorama.canvas, frame_shape, outcome.reference)
+    folder.write_trajectory(
+        outcome.homographies, outcome.located, outcome.std_px, outcome.panorama.canvas, frame_shape, outcome.reference
+    )
     folder.write_record(outcome.record)
 
 
