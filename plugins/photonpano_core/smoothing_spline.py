@@ -32,10 +32,8 @@ _TINY = 1e-200
 """The noise of knots that lie on a parabola exactly."""
 _LEAST_KNOWN = 1e-8
 """What a knot knows of nothing, as a share of the best known: its error is no more than 10,000 times as large."""
-
-
 _TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
-"""From the coordinates of the corners to shift, stretch, shear, and so on: orthonormal, so that these too are in px."""
+"""From the coordinates of the corners to shift, twist, stretch and shear: orthonormal, so that these too are in px."""
 _QUIET = [2, 3]
 """The twists. A shaking camera shifts, rolls, perhaps stretches the image, but hardly changes its perspective."""
 
@@ -48,9 +46,9 @@ class SmoothingSplineInterpolator:
         sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale,
 
     where y are the modes of the motion of the frame's corners, in px. So each knot counts for what it knows, direction by
-    direction, and each mode is as smooth as it is found to be. The scales, and the factor by which the noise of all differs
-    from what W says, have the restricted maximum likelihood if the jerk is white noise. There is one such factor, and not one
-    a mode, since modes that no camera excites tell noise from motion that is too fast for the knots.
+    direction, and each mode is as smooth as it is found to be. The scales, and the factor by which all noise differs from what
+    W says, have the restricted maximum likelihood if the jerk is white noise. The factor is found from the modes that a
+    trembling camera hardly excites; in the others, motion that is too fast for the knots looks like noise.
     """
 
     def __init__(self, config: SmoothingSplineConfig, frame_shape: tuple[int, int]) -> None:
@@ -74,20 +72,20 @@ class SmoothingSplineInterpolator:
             slopes = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             covariances = _covariances(information, _TO_MODES @ slopes)
         paths = apply(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
-        moved = smoothed(instants, paths, covariances) @ _TO_MODES
+        moved = _smoothed_modes(instants, paths, covariances) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
 
-def smoothed(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return where a smoothing spline passes its knots: (N, K).
+def _smoothed_modes(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return where a smoothing spline passes its knots: (N, 8).
 
     Noise of the knots, and a jerk that is white noise, both make third differences that are normally distributed. What the jerk
     does not explain of them is noise (Reinsch 1967; de Hoog and Hutchinson 1987).
 
     Args:
         instants: (N,), more than three.
-        knots: (N, K) values of K modes.
-        covariances: (N, K, K) of the knots, up to a common factor.
+        knots: (N, 8) modes of the corners, in px.
+        covariances: (N, 8, 8) of the knots, up to a common factor.
     """
     n_knots, n_modes = knots.shape
     times = instants * ((n_knots - 1) / (instants[-1] - instants[0]))
@@ -157,7 +155,7 @@ def _from_corners(here: FloatArray, there: FloatArray) -> FloatArray:
 
 
 def _covariances(information: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Return (N, K, K) covariances of what has these slopes by p1..p8; a knot may know nothing of a direction."""
+    """Return (N, 8, 8) covariances of what has these slopes by p1..p8; a knot may know nothing of a direction."""
     back = np.linalg.inv(slopes)
     values, vectors = np.linalg.eigh(back.transpose(0, 2, 1) @ information @ back)
     values = np.maximum(values, _LEAST_KNOWN * values.max())
