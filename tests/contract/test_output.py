@@ -121,6 +121,7 @@ def test_the_record_tells_how_it_was_made(record: dict[str, Any], small_spec: di
         ("source", "packed-npy"),
         ("resample", "midpoint"),
         ("merge", "photon-mle"),
+        ("locate", "direct"),
         ("locate", "opencv-sift"),
         ("interpolate", "lucas-kanade"),
     ]
