@@ -31,7 +31,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "constant-groups": GROUPS,
     "super-resolution": GROUPS,
     "coarse-to-fine": GROUPS,
-    "direct-alignment": GROUPS,
+    "keypoints": GROUPS,
     "smoothing-spline": GROUPS,
     "fallback": GROUPS,
     "demo": GROUPS,
@@ -90,8 +90,8 @@ def test_specs_run(name, examples, tmp_path):
     assert groups[1] == 2 * groups[0] + 1 if name != "constant-groups" else groups[1] == groups[0] + 2
     assert ({level["scale"] for level in record["levels"]} == {0.5, 1}) == (name == "coarse-to-fine")
     assert record["panorama"]["scale"] == (2 if name == "super-resolution" else 1)
-    assert record["spec"]["merge"]["with"]["compensate"] == (name != "naive-average")
     assert ("group_size" in {decision["what"] for decision in record["decisions"]}) == (name == "photograph")
+    assert record["spec"]["merge"]["with"]["compensate"] == (name != "naive-average")
 
 
 def test_the_tutorial_uses_the_examples():
