@@ -32,7 +32,7 @@ class PhotonMleConfig(Config):
     """One maximum-likelihood estimate of all photons of a pixel."""
 
     tolerance_px: float = Field(
-        0.5, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
+        1.0, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
     )
     compensate: bool = Field(
         True, description="warp along the motion known so far; false averages naively, the paper's baseline"

@@ -99,8 +99,7 @@ def _check_midpoint(config: MidpointConfig, stream: StreamInfo) -> list[str]:
 def _build_photon_mle(config: PhotonMleConfig, context: StageContext) -> Merger:
     from photonpano_core.photon_mle import PhotonMleMerger
 
-    del context
-    return PhotonMleMerger(config)
+    return PhotonMleMerger(config, context.decide)
 
 
 def _build_lucas_kanade(config: LucasKanadeConfig, context: StageContext) -> Interpolator:

@@ -53,7 +53,7 @@ class DirectConfig(Config):
         25.0, gt=1, description="a pair that differs by more than this many times its photon noise is not located"
     )
     max_std_px: float = Field(
-        10.0,
+        15.0,
         gt=0,
         description="a pair whose photons tell less well than this where the corners of the frame lie is not located",
     )

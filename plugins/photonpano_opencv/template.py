@@ -21,7 +21,7 @@ ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 _BOLDEST = 5.0
 """The curvature common to both images is taken to be at least so many times what noise alone leaves in common by chance, which
 is the template's over the root of the number of independent pixels; so steps stay bounded."""
-_BY_CHANCE = 1.5
+_BY_CHANCE = 1.0
 """The best alignment of noise has a curvature in common of up to so many times the same; that much tells nothing."""
 _UNKNOWN = 1e-3
 """Where no more than that is in common, next to nothing is known: this share of the template's curvature."""

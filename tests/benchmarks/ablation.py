@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
-from photonpano import api, parse_spec
-from photonpano.cli import main as photonpano
+from photonpano import PhotonpanoError, api, parse_spec
 from photonpano.evaluation import exposure_bound_px, load_truth
 from photonpano.photometry import BinaryResponse
 
@@ -36,6 +37,8 @@ CAPTURE: dict[str, Any] = {
     "frame_shape": [254, 496],
 }
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+Results: TypeAlias = dict[tuple[float, str, str, str], tuple[float, float, float] | str]
+"""Mean and largest error and loss by flux, locator, graph and resampler; or why there are none."""
 HEADER = ("Flux", "Locator", "Graph", "Groups", "Mean", "Worst frame", "Below the oracle")
 
 
@@ -43,12 +46,10 @@ def simulate(folder: Path, flux: float) -> Path:
     """Write a capture with its truth beside it."""
     cube = folder / f"flux-{flux:g}.npy"
     spec = cube.with_suffix(".yaml")
-    spec.write_text(_yaml({"version": 1, "source": {"use": "simulator", "with": CAPTURE | {"flux": flux}}}))
-    try:
-        photonpano(["simulate", str(spec), "--output", str(cube)])
-    except SystemExit as done:
-        if done.code:
-            raise
+    # JSON is YAML.
+    spec.write_text(json.dumps({"version": 1, "source": {"use": "simulator", "with": CAPTURE | {"flux": flux}}}))
+    program = [sys.executable, "-c", "from photonpano.cli import main; main()"]
+    subprocess.run([*program, "simulate", str(spec), "--output", str(cube)], check=True, stdout=subprocess.DEVNULL)
     return cube
 
 
@@ -80,7 +81,7 @@ def bound_px(cube: Path) -> float:
     return float(np.mean([exposure_bound_px(view, BinaryResponse(), GROUP_SIZE) for view in views]))
 
 
-def table(results: dict[tuple[float, str, str, str], tuple[float, float, float] | str], bounds: dict[float, float]) -> str:
+def table(results: Results, bounds: dict[float, float]) -> str:
     """Return the rows in Markdown."""
     lines = [f"| {' | '.join(HEADER)} |", "| --- " * len(HEADER) + "|"]
     for flux in bounds:
@@ -92,7 +93,7 @@ def table(results: dict[tuple[float, str, str, str], tuple[float, float, float] 
     return "\n".join(lines)
 
 
-def plot(results: dict[tuple[float, str, str, str], tuple[float, float, float] | str], bounds: dict[float, float], file: Path) -> None:
+def plot(results: Results, bounds: dict[float, float], file: Path) -> None:
     """Draw the mean error of each variant over the flux."""
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
     styles = {"chain": ":", "full": "-"}
@@ -115,12 +116,6 @@ def plot(results: dict[tuple[float, str, str, str], tuple[float, float, float] |
     figure.savefig(file, dpi=110)
 
 
-def _yaml(document: dict[str, Any]) -> str:
-    import json
-
-    return json.dumps(document)  # JSON is YAML
-
-
 def main() -> None:
     """Measure everything, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -128,7 +123,7 @@ def main() -> None:
     page = parser.parse_args().page
     before, rest = page.read_text(encoding="utf-8").split(BEGIN)
     _, after = rest.split(END)
-    results: dict[tuple[float, str, str, str], tuple[float, float, float] | str] = {}
+    results: Results = {}
     bounds: dict[float, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         for flux in FLUXES:
@@ -137,7 +132,7 @@ def main() -> None:
             for names in itertools.product(LOCATORS, GRAPHS, RESAMPLERS):
                 try:
                     results[(flux, *names)] = measure(cube, *names)
-                except api.PhotonpanoError as error:
+                except PhotonpanoError as error:
                     results[(flux, *names)] = f"failed: {str(error).splitlines()[0]} | | "
                 print(flux, *names, results[(flux, *names)], file=sys.stderr, flush=True)
             cube.unlink()

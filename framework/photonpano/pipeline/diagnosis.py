@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 TOLERATED_RUN = 2
 """So many exposures in a row may be lost: the motion is interpolated across them."""
-_NOISY = 0.25
-"""Below this ratio of signal to noise, darkness may be to blame; above it, blur may. Either may be for want of texture."""
+_NOISY, _CLEAR = 0.25, 2.0
+"""Below the first ratio of signal to noise darkness is to blame, above the second blur is; between them either may be. Any of
+them may be for want of texture."""
 _SHOWN = 6
 
 
@@ -124,6 +125,11 @@ def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Co
         return [
             f"{seen}: either they are too dark (try larger groups, such as resample.with.group_size={2 * size}), "
             "or the scene has no texture there."
+        ]
+    if ratio < _CLEAR:
+        return [
+            f"{seen}: either motion blurs them (try smaller groups, such as resample.with.group_size={max(1, size // 2)}), "
+            f"or they are too dark for what texture there is (try larger ones, such as resample.with.group_size={2 * size})."
         ]
     return [
         f"{seen}, so darkness is not the cause: either motion blurs them (try smaller groups, such as "

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 from scipy.signal import find_peaks
+from scipy.sparse.csgraph import connected_components
 
 from photonpano.geometry import apply, corners, inverse
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from photonpano.values import BoolArray, FloatArray, FrameSpan, Group
 
@@ -28,14 +32,18 @@ _MOST_REVISITS = 3
 def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int, int]]:
     """Return the pairs (moving, fixed) of a level, moving later than fixed, ordered by the moving exposure.
 
+    A pair that shares photons shares their noise, which lies where the motion known so far puts it, and votes for that
+    motion. So neighbours that overlap in time are no pairs, unless there are no others.
+
     Args:
         groups: the groups of the level, in order of their instants.
-        skips: besides its neighbours, each exposure is paired with those whose instants lie closest to so many group lengths
-            before and after its own; between groups of different lengths, their mean counts. A pair a whole group length
-            apart shares no photons, so that its noise cannot vote for the motion known so far; a distant pair ties down drift.
+        skips: each exposure is paired with those whose instants lie closest to so many group lengths before and after its
+            own; between groups of different lengths, their mean counts. At the least of them, also with the one beyond, so
+            that the exposures between do not fall into chains that know nothing of each other. None of them leaves a chain of
+            neighbours.
     """
     instants, lengths = _instants(groups), _lengths(groups)
-    pairs = {(later, later - 1) for later in range(1, len(groups))}
+    pairs: set[tuple[int, int]] = set()
     for index, (instant, length) in enumerate(zip(instants, lengths, strict=True)):
         distances = (instants - instant) / ((lengths + length) / 2)
         for skip in skips:
@@ -43,8 +51,18 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
                 if not distances[0] - 0.5 / length <= target <= distances[-1] + 0.5 / length:
                     continue
                 partner = int(np.argmin(np.abs(distances - target)))
-                if partner != index:
-                    pairs.add((max(index, partner), min(index, partner)))
+                beyond = partner + (1 if target > 0 else -1)
+                partners = [partner, beyond] if skip == min(skips) else [partner]
+                pairs |= {
+                    (max(index, each), min(index, each)) for each in partners if each != index and 0 <= each < len(groups)
+                }
+    # Neighbours tie what falls apart without them, as in a capture that is hardly longer than a group.
+    parts = _parts(len(groups), pairs)
+    pairs |= {
+        (later, later - 1)
+        for later in range(1, len(groups))
+        if parts[later] != parts[later - 1] or not shared_share(groups[later].span, groups[later - 1].span)
+    }
     return sorted(pairs)
 
 
@@ -91,6 +109,24 @@ def shared_share(first: FrameSpan, second: FrameSpan) -> float:
     """Return which share of its frames the shorter of two spans has in common with the other."""
     common = min(first.stop, second.stop) - max(first.start, second.start)
     return max(0, common) / min(len(first), len(second))
+
+
+def independent_share(groups: Sequence[Group]) -> float:
+    """Return which share of the photons of a typical group no earlier group holds.
+
+    Groups that lie denser than their length hold the same photons several times, and so the same noise: pairs of them say the
+    same several times.
+    """
+    if len(groups) < 2:
+        return 1.0
+    return min(1.0, float(np.median(np.diff(_instants(groups))) / np.median(_lengths(groups))))
+
+
+def _parts(n_groups: int, pairs: set[tuple[int, int]]) -> NDArray[np.integer]:
+    """Number the sets of groups that pairs tie together: (N,)."""
+    moving, fixed = np.array(sorted(pairs), dtype=int).reshape(-1, 2).T
+    ties = sparse.csr_array((np.ones(len(moving)), (moving, fixed)), shape=(n_groups, n_groups))
+    return np.asarray(connected_components(ties, directed=False)[1])
 
 
 def _instants(groups: Sequence[Group]) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from photonpano.values import FrameSpan, Located, NotLocated
+from photonpano.values import Decision, FrameSpan, Located, NotLocated
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -92,6 +92,20 @@ def motion_record(std_px: FloatArray) -> dict[str, Any] | None:
         return None
     worst = int(known[np.argmax(std_px[known])])
     return {"std_px": float(std_px[known].mean()), "worst_std_px": float(std_px[worst]), "worst_frame": worst}
+
+
+def levels_decision(results: Sequence[LevelResult]) -> Decision:
+    """Say after how many levels the motion was taken to have settled, and why."""
+    last = results[-1]
+    if last.change_px is None or not np.isfinite(last.uncertainty.mean_px):
+        reason = "a single exposure tells of no motion"
+    else:
+        compared = "less" if last.converged else "and still more"
+        reason = (
+            f"the last level changed the motion by {last.change_px:.2g} px, {compared} than the "
+            f"{last.uncertainty.mean_px:.2g} px that photons leave open"
+        )
+    return Decision("levels", len(results), reason)
 
 
 def warnings_of(results: Sequence[LevelResult]) -> list[str]:

@@ -13,7 +13,7 @@ from photonpano.errors import PluginError
 from photonpano.geometry import implausibility, inverse, rescaled
 from photonpano.pipeline.agreement import agreement
 from photonpano.pipeline.diagnosis import Contrast, contrast_of
-from photonpano.pipeline.pairs import shared_share
+from photonpano.pipeline.pairs import independent_share, shared_share
 from photonpano.values import Edge, Located, NotLocated
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ class Registrar:
         self._exposures = exposures
         self._known = known
         self._clock = clock
+        self._independent = independent_share(exposures.groups)
         self._described: dict[int, _Described] = {}
         self.contrasts: dict[int, Contrast] = {}
 
@@ -79,7 +80,7 @@ class Registrar:
                     lambda fixed, moving=moving: self._register(moving, fixed, self._initial(moving, fixed)), partners[moving]
                 )
             )
-            if not any(isinstance(edge.motion, Located) for edge in found):
+            if found and not any(isinstance(edge.motion, Located) for edge in found):
                 found += self._bridge(moving, partners[moving])
             yield from found
             for index in [index for index in self._described if needed_until[index] <= moving]:
@@ -195,7 +196,7 @@ class Registrar:
         if reason := implausibility(homography, self._exposures.frame_shape):
             return NotLocated(reason, motion.evidence)
         groups = self._exposures.groups
-        new = max(1 - shared_share(groups[moving].span, groups[fixed].span), SHARED_PHOTONS)
+        new = self._independent * max(1 - shared_share(groups[moving].span, groups[fixed].span), SHARED_PHOTONS)
         information = motion.information
         if information is not None:
             # p1..p8 in px of exposures to px of frames: to first order only translation and perspective change.

@@ -16,6 +16,7 @@ from photonpano.pipeline.loop import estimate_motion
 from photonpano.pipeline.panorama import plan_canvas, render
 from photonpano.pipeline.record import (
     level_record,
+    levels_decision,
     library_versions,
     motion_record,
     peak_memory_bytes,
@@ -88,6 +89,8 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     levels = build_levels(plan, source, decisions)
     with one_thread_inside():
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged)
+    if plan.until_converged:
+        decisions.append(levels_decision(results))
     trajectory = results[-1].trajectory
     rendering = time.perf_counter()
     canvas = plan_canvas(trajectory, stream, plan.render.scale, int(plan.run.memory))

@@ -20,8 +20,8 @@ class GraphSettings(Config):
 
     skips: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         (1.0, 2.0),
-        description="besides its neighbour, each exposure is registered with the ones so many group lengths away; "
-        "an empty list leaves a chain of neighbours",
+        description="each exposure is registered with those so many group lengths away; an empty list leaves a chain of "
+        "neighbours",
     )
     closure_overlap: Annotated[float, Field(gt=0, lt=1)] | None = Field(
         0.5,

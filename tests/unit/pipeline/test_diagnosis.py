@@ -120,6 +120,15 @@ def test_darkness_is_told_from_blur() -> None:
     ]
 
 
+def test_where_either_may_be_the_cause_it_says_so() -> None:
+    faint = Contrast(0.8)
+    assert refusal((4, 5, 6), faint).splitlines()[-2] == (
+        "In these exposures of 100 frames the scene varies 0.8 times as much as a pixel's photon noise: either motion blurs "
+        "them (try smaller groups, such as resample.with.group_size=50), or they are too dark for what texture there is (try "
+        "larger ones, such as resample.with.group_size=200)."
+    )
+
+
 def test_several_spans_are_listed() -> None:
     assert refusal((0, 1, 2, 7, 8, 9)).splitlines()[0] == (
         "level 2: 6 of 9 pairs of exposures could not be located, "
