@@ -36,6 +36,9 @@ RUNS: dict[str, dict[str, Any]] = {
     "fallback": GROUPS,
     "demo": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
+    "revisits": SMALL_STREET
+    | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}
+    | {"source.with.flux": 0.5, "resample.with.group_size": 50},
     "photograph": SMALL
     | {"source.with.n_frames": 300, "source.with.scene.width": 640}
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
@@ -92,6 +95,8 @@ def test_specs_run(name, examples, tmp_path):
     assert record["panorama"]["scale"] == (2 if name == "super-resolution" else 1)
     assert ("group_size" in {decision["what"] for decision in record["decisions"]}) == (name == "photograph")
     assert record["spec"]["merge"]["with"]["compensate"] == (name != "naive-average")
+    assert any(level["revisits"]["located"] for level in record["levels"]) == (name == "revisits")
+    assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
 
 
 def test_the_tutorial_uses_the_examples():
