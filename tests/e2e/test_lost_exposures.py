@@ -114,7 +114,7 @@ def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
         pair("100 to 199", "0 to 99"),
         pair("200 to 299", "0 to 99"),
         pair("200 to 299", "100 to 199"),
-        "In these exposures of 100 frames the scene varies # times as much as a pixel's photon noise, so darkness is not the "
-        "cause: either motion blurs them (try smaller groups, such as resample.with.group_size=50), or the scene has no "
-        "texture there.",
+        "In these exposures of 100 frames the scene varies # times as much as a pixel's photon noise: either motion blurs them "
+        "(try smaller groups, such as resample.with.group_size=50), or they are too dark for what texture there is (try larger "
+        "ones, such as resample.with.group_size=200).",
     ]
