@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _SMALLEST_SIDE = 24
 """The pyramid ends before an image gets smaller than this, in px."""
 _BORDER = 3
-"""Pixels this near to unseen ones, in units of the blur, are left out: theirs is one-sided, and pulls by a few 0.01 px."""
+"""Pixels this near to an edge, in units of the blur, are left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,12 +49,19 @@ def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[
     variance = np.zeros(known.shape, dtype=np.float32)
     variance[known] = exposure.response.stabilised_std(exposure.weight[known]) ** 2
     # Blurred alike everywhere: more weight for pixels that more frames saw would shift what lies between them.
-    image, blurred_variance = (cv2.GaussianBlur(each, (0, 0), blur_px) for each in (stabilised, variance))
-    border = int(np.ceil(_BORDER * blur_px))
+    mask = known.astype(np.float32)
+    image, blurred_variance, norm = (
+        np.asarray(cv2.GaussianBlur(each, (0, 0), blur_px), np.float32) for each in (stabilised, variance, mask)
+    )
+    # Single pixels that are masked are bridged by their neighbours; near an edge the blur
+    # is one-sided, and pulls by a few 0.01 px.
+    bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    border = math.ceil(_BORDER * blur_px)
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
-    inside = cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    weight = np.divide(1, blurred_variance, out=np.zeros_like(variance), where=inside)
-    layers = [Layer(np.asarray(image, dtype=np.float32), weight, _equivalent_blur_px(blur_px, 1))]
+    seen = (cv2.erode(bridged, square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0) & (blurred_variance > 0)
+    image = np.divide(image, norm, out=np.zeros_like(image), where=norm > 0)
+    weight = np.divide(norm, blurred_variance, out=np.zeros_like(norm), where=seen)
+    layers = [Layer(image, weight, _equivalent_blur_px(blur_px, 1))]
     while len(layers) < levels and min(layers[-1].image.shape) >= 2 * _SMALLEST_SIDE:
         layers.append(_halved(layers[-1], _equivalent_blur_px(blur_px, 2 ** len(layers))))
     return tuple(layers)

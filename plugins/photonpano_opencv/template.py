@@ -177,7 +177,7 @@ class Template:
         first, second = (_details(image, seen)[seen] for image in (self._layer.image, np.asarray(there, np.float32)))
         scenes = []
         for image, weight, left in ((first, self._layer.weight, 1.0), (second, there_weight, _INTERPOLATED)):
-            spread, noise = float(np.var(image)), left * gain * float(np.mean(1 / weight[seen]))
+            spread, noise = float(np.var(image)), left * gain * float(np.median(1 / weight[seen]))
             if spread - noise < _STANDS_OUT * noise * float(np.sqrt(2 / independent)):
                 return 0.0
             scenes.append(spread - noise)

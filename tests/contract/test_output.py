@@ -123,7 +123,7 @@ def test_the_record_tells_how_it_was_made(record: dict[str, Any], small_spec: di
         ("merge", "photon-mle"),
         ("locate", "direct"),
         ("locate", "opencv-sift"),
-        ("interpolate", "lucas-kanade"),
+        ("interpolate", "smoothing-spline"),
     ]
     assert all(plugin["plugin"] == "photonpano" and plugin["version"] for plugin in record["plugins"])
     assert {"python", "numpy", "opencv-python-headless", "scipy"} <= set(record["libraries"])

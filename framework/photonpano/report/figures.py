@@ -74,6 +74,8 @@ STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "i
 
 def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
     """Draw where the centre of the frame is, how fast it moves, and how far its corners may be off, over time."""
+    from matplotlib.ticker import LogFormatter
+
     instants = _instants(len(arrays.homographies))
     centre = _centre(arrays.frame_shape)
     path = apply(arrays.homographies[instants], centre)[:, 0] - centre[0]
@@ -95,6 +97,7 @@ def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
         error.plot(instants, known[instants], color=INK)
         error.set_yscale("log")
         error.yaxis.set_major_formatter("{x:g}")
+        error.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
         error.set_ylabel("expected error (px)")
         error.set_xlabel("frame")
         error.set_xlim(-0.5, len(arrays.homographies) - 0.5)

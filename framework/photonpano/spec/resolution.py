@@ -28,7 +28,7 @@ LEVELS = 3
 MAX_LEVELS = 8
 UNTIL_CONVERGED = "until-converged"
 """Instead of a number of levels: as many as it takes, `MAX_LEVELS` at most."""
-DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "direct", "interpolate": "lucas-kanade"}
+DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "direct", "interpolate": "smoothing-spline"}
 """The components of a spec that does not choose."""
 DEFAULT_FALLBACK = "opencv-sift"
 """The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks."""

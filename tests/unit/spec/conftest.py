@@ -116,6 +116,7 @@ CONTRIBUTIONS = [
         requires=(Requirement("no_such_library", "photonpano[kornia]"),),
     ),
     LocatorContribution(name="moody", summary="Toy", config=MoodyConfig, build=unbuilt),
+    InterpolatorContribution(name="smoothing-spline", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
     InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
 ]
 TWICE = LocatorContribution(name="twice", summary="Toy", config=DirectConfig, build=unbuilt)

@@ -25,7 +25,7 @@ def test_minimal_spec_is_complete(catalog):
     assert len(plan.levels) == 3
     level = plan.levels[0]
     names = [choice.contribution.name for choice in (level.resample, level.merge, level.locate, level.interpolate)]
-    assert names == ["midpoint", "photon-mle", "direct", "lucas-kanade"]
+    assert names == ["midpoint", "photon-mle", "direct", "smoothing-spline"]
     assert [choice.contribution.name for choice in level.fallbacks] == ["opencv-sift"]
     assert (plan.source.plugin, plan.source.version) == ("photonpano", "0.1.0")
     assert {level.scale for level in plan.levels} == {1.0}
