@@ -46,7 +46,7 @@ class InterpolatorConfig(Config):
         None,
         ge=0,
         description="how many frames beyond the last located instant the velocity is held before the motion stops; "
-        "by default the mean distance of located instants",
+        "by default twice the mean distance of located instants",
     )
 
 

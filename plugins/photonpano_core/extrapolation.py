@@ -18,10 +18,10 @@ class HeldTrajectory(ABC):
     """
 
     def __init__(self, instants: NDArray[np.float64], hold_frames: float | None) -> None:
-        """Take the (N,) increasing instants of the knots; by default the velocity is held for their mean distance."""
+        """Take the (N,) increasing instants of the knots; by default the velocity is held for twice their mean distance."""
         self._first, self._last = float(instants[0]), float(instants[-1])
         spacing = (self._last - self._first) / max(1, len(instants) - 1)
-        self._hold = spacing if hold_frames is None else hold_frames
+        self._hold = 2 * spacing if hold_frames is None else hold_frames
 
     def at(self, frame_indices: ArrayLike) -> NDArray[np.float64]:
         """Return the homographies of N instants: (N, 3, 3)."""

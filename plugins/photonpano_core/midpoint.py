@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 
 SHORTEST = 16
-"""Groups whose length is not given, as of those at the ends, get no shorter than this: too few photons tell nothing."""
+"""Groups whose length is chosen by us get no shorter than this: too few photons tell nothing."""
+_SHORTEST_END = 4
+"""Those at the ends may: otherwise the motion there is not measured at all."""
 
 
 class MidpointResampler:
@@ -50,7 +52,7 @@ class MidpointResampler:
             starts = np.array([(n_frames - size) // 2])
         spans = [FrameSpan(int(start), int(start) + size) for start in starts]
         if self._config.endpoints:
-            halves = [size >> step for step in range(level - 1, 0, -1) if size >> step >= SHORTEST]
+            halves = [size >> step for step in range(level - 1, 0, -1) if size >> step >= _SHORTEST_END]
             spans = [
                 *(FrameSpan(0, half) for half in halves),
                 *spans,

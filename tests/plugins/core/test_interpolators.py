@@ -62,12 +62,12 @@ def test_one_knot_is_a_still_camera(name, fit):
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("n_knots", [2, 3, 4, 5, 12])
 def test_a_constant_shift_is_kept_up_and_then_the_camera_stands_still(name, n_knots, fit):
-    """By default for the mean distance of the knots: 100 frames, here at half a pixel a frame."""
+    """By default for twice the mean distance of the knots: 200 frames, here at half a pixel a frame."""
     instants = 100.0 * np.arange(1, n_knots + 1)
     trajectory = fit(name, instants, np.stack([translation(0.5 * frame, 0) for frame in instants]))
     end = instants[-1]
-    frames = np.array([-5000, 0, 50, 100, 133, end, end + 50, end + 100, end + 101, 5000])
-    expected = 0.5 * np.clip(frames, 0, end + 100)
+    frames = np.array([-5000, -100, 50, 100, 133, end, end + 50, end + 200, end + 201, 5000])
+    expected = 0.5 * np.clip(frames, -100, end + 200)
     moved = trajectory.at(frames)
     np.testing.assert_allclose(moved, [translation(x, 0) for x in expected], rtol=0, atol=1e-7)
     np.testing.assert_array_equal(trajectory.located(frames), (frames >= 100) & (frames <= end))
