@@ -2,8 +2,8 @@
 
     python tests/benchmarks/ablation.py docs/explanation/ablation.md
 
-Every locator, graph and resampler runs on the same captures: the built-in street, a path of 600 px in 4,000 frames, a hand that
-trembles. The last row of each flux is the bound of Cramer and Rao. It takes about half an hour.
+Every locator, graph and resampler runs on the same captures: the built-in street, a path of 360 px in 2,400 frames, a hand that
+trembles. The last row of each flux is the bound of Cramer and Rao. It takes about a quarter of an hour.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ GRAPHS: dict[str, dict[str, Any]] = {"chain": {"skips": [], "closure_overlap": N
 RESAMPLERS: dict[str, dict[str, Any]] = {"constant": {"densify": False, "endpoints": False}, "midpoint": {}}
 CAPTURE: dict[str, Any] = {
     "scene": {"kind": "street", "seed": 0},
-    "path": {"kind": "random-spline", "length_px": 600, "shake": {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]}},
-    "n_frames": 4000,
+    "path": {"kind": "random-spline", "length_px": 360, "shake": {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]}},
+    "n_frames": 2400,
     "frame_shape": [254, 496],
 }
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
