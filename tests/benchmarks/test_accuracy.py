@@ -44,7 +44,7 @@ class Case:
     shake: bool = False
     path_px: int = 1500
     n_frames: int = 10_000
-    group_size: int = 250
+    group_size: int | str = "auto"
     kind: str = "random-spline"
 
     def __str__(self) -> str:
@@ -57,7 +57,7 @@ CASES = [
     for shake in (False, True)
     for flux, mean_px, worst_px, below_oracle_db in ((0.5, 0.08, 0.8, 0.1), (0.1, 0.12, 1.0, 0.1), (0.02, 0.25, 2.0, 0.15))
 ]
-FAST = Case(0.5, 0.5, below_oracle_db=1.0, path_px=3000, n_frames=4000, group_size=50)
+FAST = Case(0.5, 0.5, below_oracle_db=1.0, path_px=3000, n_frames=4000)
 REVISITS = Case(0.5, 0.08, path_px=3000, n_frames=20_000, kind="scan")
 TREMBLING = Case(0.5, 0.08, shake=True, path_px=750)
 STRETCHES = 10
