@@ -141,7 +141,7 @@ def test_the_recorded_spec_is_a_spec_of_the_same_run(record: dict[str, Any], sma
 def test_the_record_tells_of_every_level(record: dict[str, Any]) -> None:
     levels = record["levels"]
     assert [level["level"] for level in levels] == [1, 2, 3]
-    assert [level["groups"] for level in levels] == [6, 13, 23]
+    assert [level["groups"] for level in levels] == [6, 13, 25]
     assert levels[0]["change_px"] is None
     assert levels[1]["change_px"] > levels[2]["change_px"] > 0
     for level in levels:

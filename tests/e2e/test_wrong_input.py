@@ -148,13 +148,6 @@ CASES = {
         "so that no flux can be told; "
         "check the layout of the file, or expose less\n",
     ),
-    "one group at one level": Case(
-        saved(PACKED),
-        1,
-        "error: no frame lies between two located exposures, so that no motion is known to merge frames along; "
-        "use smaller groups or more levels\n",
-        ("group_size: 10}}", "group_size: 40}}\nlevels: 1"),
-    ),
     "a file in the way": Case(
         with_a_file_in_the_way,
         1,
@@ -164,12 +157,18 @@ CASES = {
         saved(BLANK_WALL),
         1,
         "error: level 1: none of the 6 pairs of exposures could be located\n"
-        "  frames 10 to 19 onto frames 0 to 9: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
-        "  frames 20 to 29 onto frames 0 to 9: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
-        "  frames 20 to 29 onto frames 10 to 19: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
-        "  frames 30 to 39 onto frames 10 to 19: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
-        "  frames 30 to 39 onto frames 20 to 29: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
-        "  frames 30 to 39 onto frames 0 to 9: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
+        "  frames 10 to 19 onto frames 0 to 9: direct: where the images overlap after alignment, nothing stands out from "
+        "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
+        "  frames 20 to 29 onto frames 0 to 9: direct: where the images overlap after alignment, nothing stands out from "
+        "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
+        "  frames 20 to 29 onto frames 10 to 19: direct: where the images overlap after alignment, nothing stands out from "
+        "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
+        "  frames 30 to 39 onto frames 10 to 19: direct: where the images overlap after alignment, nothing stands out from "
+        "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
+        "  frames 30 to 39 onto frames 20 to 29: direct: where the images overlap after alignment, nothing stands out from "
+        "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
+        "  frames 30 to 39 onto frames 0 to 9: direct: where the images overlap after alignment, nothing stands out from "
+        "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
         "In these exposures of 10 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
         "(try larger groups, such as resample.with.group_size=20), or the scene has no texture there.\n",
     ),

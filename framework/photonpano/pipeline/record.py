@@ -136,6 +136,8 @@ def uncertain_frames(std_px: FloatArray) -> list[str]:
     Args:
         std_px: (T,) expected corner error, infinite where nothing was located.
     """
+    if not np.isfinite(std_px).any():
+        return ["a single exposure was located, so that no motion is known: its frames are summed as they lie"]
     uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
     if not uncertain.any():
         return []

@@ -19,7 +19,7 @@ class GraphSettings(Config):
     """Which pairs of exposures are registered, and what happens when too few are located."""
 
     skips: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        (1.0, 2.0),
+        (1.0, 2.0, 4.0),
         description="each exposure is registered with those so many group lengths away; an empty list leaves a chain of "
         "neighbours",
     )

@@ -107,8 +107,8 @@ def test_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> Non
     assert comments == [
         "# up to 8 levels, until the motion has settled",
         "# level 1: 4 groups of 50 frames, 5 pairs",
-        "# level 2: 9 groups of 25 to 50 frames, 18 pairs",
-        "# level 3: 15 groups of 25 to 50 frames, 36 pairs",
+        "# level 2: 9 groups of 25 to 50 frames, 20 pairs",
+        "# level 3: 17 groups of 12 to 50 frames, 54 pairs",
         "# each further level: about twice the groups and pairs of the one before",
     ]
     assert parse_spec(printed).document == load_spec("capture.yaml", ["levels=until-converged"]).document
@@ -150,7 +150,7 @@ def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[...,
     assert "seed: 3  # --set" in lines
     assert f"directory: {folder}/runs/capture  # default" in lines
     assert "# level 1: 4 groups of 50 frames, 5 pairs" in lines
-    assert "# level 2: 9 groups of 25 to 50 frames, 18 pairs" in lines
+    assert "# level 2: 9 groups of 25 to 50 frames, 20 pairs" in lines
 
 
 def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
