@@ -100,7 +100,7 @@ def test_the_largest_part_is_shown_if_the_spec_asks_for_it(with_a_wall: Callable
 def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
     lines = refusal(simulated(flux=0.001), "resample.with.group_size=50")
     assert lines[:3] == [
-        "level 1: none of the 12 pairs of exposures could be located",
+        "level 1: none of the 14 pairs of exposures could be located",
         pair("50 to 99", "0 to 49"),
         pair("100 to 149", "0 to 49"),
     ]

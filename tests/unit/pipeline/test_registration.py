@@ -87,7 +87,7 @@ def run(memory_source: type) -> Callable[..., LocatedLevel]:
 
     def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
         groups, clock = level.resampler.groups(10 * N, level.number), Stopwatch(threads)
-        graph = GraphSettings(closure_overlap=closure_overlap)
+        graph = GraphSettings(skips=(1.0, 2.0), closure_overlap=closure_overlap)
         return locate(level, VirtualExposures(level, source, groups, None, clock), None, graph, threads, clock, Quiet())
 
     return run
