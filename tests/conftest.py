@@ -48,15 +48,11 @@ class MemorySource:
 class KnownMotion:
     """A `photonpano.Trajectory` that a function of one instant gives."""
 
-    def __init__(self, at: Callable[[float], np.ndarray], first: float = -np.inf, last: float = np.inf) -> None:
-        self._at, self._first, self._last = at, first, last
+    def __init__(self, at: Callable[[float], np.ndarray]) -> None:
+        self._at = at
 
     def at(self, frame_indices: ArrayLike) -> np.ndarray:
         return np.array([self._at(frame) for frame in np.atleast_1d(frame_indices)]).reshape(-1, 3, 3)
-
-    def located(self, frame_indices: ArrayLike) -> np.ndarray:
-        frames = np.atleast_1d(frame_indices)
-        return (self._first <= frames) & (frames <= self._last)
 
 
 @pytest.fixture(scope="session")
@@ -73,8 +69,8 @@ def known_motion() -> type[KnownMotion]:
 def pan() -> Callable[..., KnownMotion]:
     """Make a motion of so many pixels a frame."""
 
-    def make(x_px: float, y_px: float = 0.0, first: float = -np.inf, last: float = np.inf) -> KnownMotion:
-        return KnownMotion(lambda frame: translation(x_px * frame, y_px * frame), first, last)
+    def make(x_px: float, y_px: float = 0.0) -> KnownMotion:
+        return KnownMotion(lambda frame: translation(x_px * frame, y_px * frame))
 
     return make
 

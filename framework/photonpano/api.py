@@ -115,7 +115,7 @@ def evaluate(
     with open_source(plan) as source:
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
-            return render(source, trajectory, canvas, plan.render.tolerance_px, progress or Quiet())
+            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, progress or Quiet())
 
         return evaluate_folder(run_folder, truth, along_truth)
 

@@ -178,10 +178,6 @@ def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: i
                 frames = np.atleast_1d(np.asarray(frame_indices, dtype=float))
                 return self.homographies[np.abs(frames[:, None] - self.instants).argmin(axis=1)]
 
-            def located(self, frame_indices):
-                frames = np.atleast_1d(np.asarray(frame_indices, dtype=float))
-                return (self.instants[0] <= frames) & (frames <= self.instants[-1])
-
 
         class Nearest:
             def fit(self, instants, homographies, information):

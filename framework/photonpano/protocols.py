@@ -87,10 +87,6 @@ class Trajectory(Protocol):
         """Return the homographies of N instants (in frames, fractions allowed): (N, 3, 3). Defined for every instant."""
         ...
 
-    def located(self, frame_indices: ArrayLike) -> BoolArray:
-        """Tell which of N instants lie within what was located: (N,). Outside, `at` is an extrapolation."""
-        ...
-
 
 class Merger(Protocol):
     """Merges a group into a virtual exposure along the motion known so far (paper, section 4, "Merge")."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class HeldTrajectory(ABC):
     """A trajectory that holds its velocity beyond the first and last knot for a bounded distance, and then stands still.
 
-    A polynomial would run away. Frames out there are not located.
+    A polynomial would run away.
     """
 
     def __init__(self, instants: NDArray[np.float64], hold_frames: float | None) -> None:
@@ -28,11 +28,6 @@ class HeldTrajectory(ABC):
         frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
         inside = np.clip(frames, self._first, self._last)
         return self._moved_on(inside, np.clip(frames - inside, -self._hold, self._hold))
-
-    def located(self, frame_indices: ArrayLike) -> NDArray[np.bool_]:
-        """Tell which of N instants lie between the first and the last knot: (N,)."""
-        frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
-        return (self._first <= frames) & (frames <= self._last)
 
     @abstractmethod
     def _moved_on(self, inside: NDArray[np.float64], beyond: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from photonpano.geometry import corners, from_parameters, jacobian, normalised, parameters
+from photonpano.geometry import (
+    corner_displacements,
+    corners,
+    from_parameters,
+    generators,
+    jacobian,
+    normalised,
+    parameters,
+    slopes,
+    unit_coordinates,
+)
+from photonpano.photometry import noise_free_correlation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,14 +42,8 @@ between two exposures shifts the image by any amount, but rolls by a degree or t
 _PRIOR = np.diag(_PRIOR_STD**-2.0)
 _NEGLIGIBLE = 0.02
 """Steps of this share of what photons leave open do not count: where they tell little, steps stay small for long."""
-_FEWEST = 50
-"""Fewer independent pixels than this agree by chance."""
-_INTERPOLATED = 4 / 9
-"""What linear interpolation leaves of the variance of white noise, on average over where between pixels it looks."""
 _SURROUNDINGS_PX = 4.0
 """What counts as the surroundings of a pixel, as the standard deviation of a Gaussian in px of the layer."""
-_STANDS_OUT = 5.0
-"""The variance of a scene exceeds that of the noise by at least so many of its standard errors."""
 _RENEWED_PX = 0.25
 """The curvature is taken anew until steps are smaller than this."""
 
@@ -79,8 +84,10 @@ class Template:
         self._to_start = np.linalg.inv(start)
         height, width = layer.image.shape
         self._half = half = max(height, width) / 2
-        self._unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+        self._unit = unit_coordinates(layer.image.shape)
         self._from_unit = np.linalg.inv(self._unit)
+        self._frame = corners(layer.image.shape)
+        self._rows = np.concatenate([self._frame, np.ones((4, 1))], axis=1).T
         self._gx, self._gy = (np.float32(half) * gradient for gradient in _gradients(layer.image))
         self._powers = _powers(width, half), _powers(height, half)
         self._hessian: NDArray[np.float64] | None = None
@@ -131,9 +138,7 @@ class Template:
 
     def size_px(self, step: NDArray[np.float64]) -> float:
         """Return how far a step moves the corners of the template at most, in px of its layer."""
-        frame = corners(self._layer.image.shape)
-        moved = np.concatenate([frame, np.ones((4, 1))], axis=1) @ step.T
-        return float(np.abs(moved[:, :2] / moved[:, 2:] - frame).max())
+        return float(corner_displacements(step, np.eye(3), self._layer.image.shape).max())
 
     def quality(self, homography: NDArray[np.float64], fixed: Layer) -> Quality:
         """Return how well the images agree, and what their photons tell about p1..p8 of `homography`."""
@@ -149,7 +154,7 @@ class Template:
         scatter = self._quadratic(bx * bx, bx * by, by * by) * variance
         information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio) + _PRIOR
         in_parameters = self._in_parameters(homography, information)
-        to_corners = jacobian(homography, corners(self._layer.image.shape)).reshape(8, 8)
+        to_corners = jacobian(homography, self._frame).reshape(8, 8)
         return Quality(
             information=in_parameters,
             std_px=float(np.sqrt(np.trace(to_corners @ np.linalg.inv(in_parameters) @ to_corners.T) / 4)),
@@ -171,17 +176,16 @@ class Template:
         seen = (self._layer.weight > 0) & (there_weight > 0)
         gain = 1 / (4 * np.pi * self._layer.blur_px**2)
         independent = np.count_nonzero(seen) * min(1.0, gain)
-        if independent < _FEWEST:
+        if not independent:
             return 0.0
         # Shadows and slopes that fill the image look alike wherever one looks.
         first, second = (_details(image, seen)[seen] for image in (self._layer.image, np.asarray(there, np.float32)))
-        scenes = []
-        for image, weight, left in ((first, self._layer.weight, 1.0), (second, there_weight, _INTERPOLATED)):
-            spread, noise = float(np.var(image)), left * gain * float(np.median(1 / weight[seen]))
-            if spread - noise < _STANDS_OUT * noise * float(np.sqrt(2 / independent)):
-                return 0.0
-            scenes.append(spread - noise)
-        return float(np.cov(first, second)[0, 1]) / float(np.sqrt(scenes[0] * scenes[1]))
+        # Interpolation leaves 4/9 of the variance of white noise, on average over where between pixels it looks.
+        noise = [
+            left * gain * float(np.median(1 / weight[seen]))
+            for weight, left in ((self._layer.weight, 1), (there_weight, 4 / 9))
+        ]
+        return noise_free_correlation(first, second, (noise[0], noise[1]), independent)
 
     def _residual(self, homography: NDArray[np.float64], fixed: Layer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the fixed image seen from the template minus the template, and the inverse variance of the difference."""
@@ -241,11 +245,7 @@ class Template:
 
     def _expected_px(self, free: tuple[int, ...]) -> float:
         """Return the expected distance of a corner from where it should be, in px of the layer, if noise were white."""
-        frame = corners(self._layer.image.shape)
-        rows = np.concatenate([frame, np.ones((4, 1))], axis=1).T
-        generators = self._from_unit @ (from_parameters(np.eye(8)) - np.eye(3)) @ self._unit
-        moved = (generators @ rows)[list(free)]
-        to_corners = (moved[:, :2] - rows[:2] * moved[:, 2:]).transpose(2, 1, 0).reshape(8, -1)
+        to_corners = slopes(self._rows, generators(self._layer.image.shape) @ self._rows)[:, list(free)]
         assert self._hessian is not None
         try:
             covariance = to_corners @ np.linalg.solve(self._hessian[np.ix_(free, free)], to_corners.T)
@@ -255,14 +255,9 @@ class Template:
 
     def _in_parameters(self, homography: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert the information on a step to that on p1..p8 of the homography it changes."""
-        frame = corners(self._layer.image.shape)
-        generators = self._from_unit @ (from_parameters(np.eye(8)) - np.eye(3)) @ self._unit
-        rows = np.concatenate([frame, np.ones((4, 1))], axis=1).T
-        mapped = homography @ rows
-        changed = homography @ generators @ rows
-        d = (changed[:, :2] - mapped[:2] / mapped[2] * changed[:, 2:]) / mapped[2]
-        to_corners = d.transpose(2, 1, 0).reshape(8, 8)
-        to_step = np.linalg.solve(to_corners, jacobian(homography, frame).reshape(8, 8))
+        changed = homography @ generators(self._layer.image.shape) @ self._rows
+        to_corners = slopes(homography @ self._rows, changed)
+        to_step = np.linalg.solve(to_corners, jacobian(homography, self._frame).reshape(8, 8))
         return np.asarray(to_step.T @ information @ to_step)
 
 

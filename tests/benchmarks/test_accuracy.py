@@ -140,6 +140,7 @@ def test_three_levels_come_as_close_to_the_truth_as_photons_allow(tmp_path, case
         rows.append(measure(cube, scene, case))
         cube.unlink()
     assert max(row["peak_mib"] for row in rows) < 1024
+    assert min(row["within_std"] for row in rows) >= 0.95
     assert mean(rows, "error_px") < case.mean_px
     if case.worst_px is not None:
         assert mean(rows, "max_px") < case.worst_px

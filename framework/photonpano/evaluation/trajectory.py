@@ -97,8 +97,3 @@ class FrameTrajectory:
         share = (instants - before)[..., None, None]
         after = np.minimum(before + 1, last)
         return np.asarray((1 - share) * self._homographies[before] + share * self._homographies[after])
-
-    def located(self, frame_indices: ArrayLike) -> BoolArray:
-        """Tell which of N instants lie between the first and the last frame: (N,)."""
-        instants = np.asarray(frame_indices, dtype=np.float64)
-        return np.asarray((instants >= 0) & (instants <= len(self._homographies) - 1))

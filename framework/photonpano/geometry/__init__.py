@@ -16,6 +16,7 @@ from photonpano.geometry.homographies import (
     translation,
 )
 from photonpano.geometry.plausibility import implausibility
+from photonpano.geometry.steps import generators, slopes, unit_coordinates
 
 __all__ = [
     "Canvas",
@@ -25,6 +26,7 @@ __all__ = [
     "corner_displacements",
     "corners",
     "from_parameters",
+    "generators",
     "implausibility",
     "inverse",
     "jacobian",
@@ -32,5 +34,7 @@ __all__ = [
     "parameters",
     "rescaled",
     "rescaling",
+    "slopes",
     "translation",
+    "unit_coordinates",
 ]

@@ -1,8 +1,17 @@
 """The detection model, flux estimation, tone curves and packed-bit sums."""
 
 from photonpano.photometry.contrast import signal_to_noise
+from photonpano.photometry.likeness import noise_free_correlation
 from photonpano.photometry.packed import packed_counts
 from photonpano.photometry.responses import BinaryResponse
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
-__all__ = ["BinaryResponse", "linear_to_srgb", "packed_counts", "signal_to_noise", "srgb_to_linear", "tone_mapped"]
+__all__ = [
+    "BinaryResponse",
+    "linear_to_srgb",
+    "noise_free_correlation",
+    "packed_counts",
+    "signal_to_noise",
+    "srgb_to_linear",
+    "tone_mapped",
+]

@@ -8,7 +8,18 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from photonpano.geometry import apply, corners, from_parameters, inverse, jacobian, normalised, parameters
+from photonpano.geometry import (
+    apply,
+    corners,
+    from_parameters,
+    generators,
+    inverse,
+    jacobian,
+    normalised,
+    parameters,
+    slopes,
+    unit_coordinates,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,10 +70,9 @@ class Adjustment:
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
         self._targets = apply(observed, self._corners)
         self._whitening = np.array([_whitening(motion, self._corners) for motion in motions])
-        height, width = frame_shape
-        self._half = half = max(height, width) / 2
-        self._unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
-        self._generators = np.linalg.inv(self._unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ self._unit
+        self._half = max(frame_shape) / 2
+        self._unit = unit_coordinates(frame_shape)
+        self._generators = generators(frame_shape)
 
     def minimise(self, homographies: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the (N, 3, 3) homographies that agree best, and the whitened residual of each edge, (E,).
@@ -122,10 +132,10 @@ class Adjustment:
     def _corner_std_px(self, homographies: FloatArray, changes: FloatArray) -> FloatArray:
         """Return the root mean square distance of corners that (8 N, S) changes cause, after the best alignment: (N,)."""
         here = np.broadcast_to(self._rows, (self._n_nodes, 3, 4))
-        to_corners = _perspective(here, np.broadcast_to(self._generators @ self._rows, (self._n_nodes, 8, 3, 4)))
+        to_corners = slopes(here, np.broadcast_to(self._generators @ self._rows, (self._n_nodes, 8, 3, 4)))
         # What a change of the plane does to the corners of each frame.
         seen = inverse(homographies)[:, None] @ self._generators @ homographies[:, None] @ self._rows
-        of_plane = _perspective(here, seen).reshape(-1, 8)
+        of_plane = slopes(here, seen).reshape(-1, 8)
         errors = (to_corners @ changes.reshape(self._n_nodes, 8, -1)).reshape(len(of_plane), -1)
         scale = np.linalg.norm(of_plane, axis=0)
         best = np.linalg.lstsq(of_plane / scale, errors, rcond=None)[0]
@@ -174,21 +184,13 @@ class Adjustment:
         edge_rows = np.arange(8 * n_edges).reshape(n_edges, 8, 1)
         data, row, column = [], [], []
         for nodes, d in ((self._moving, d_moving), (self._fixed, d_fixed)):
-            block = root @ _perspective(mapped, d)
+            block = root @ slopes(mapped, d)
             data.append(block.ravel())
             row.append(np.broadcast_to(edge_rows, block.shape).ravel())
             column.append(np.broadcast_to(8 * nodes[:, None, None] + np.arange(8), block.shape).ravel())
         entries = (np.concatenate(data), (np.concatenate(row), np.concatenate(column)))
         residuals = np.einsum("eij,ej->ei", root, self._residuals(homographies).reshape(-1, 8))
         return sparse.csr_array(entries, shape=(8 * n_edges, 8 * self._n_nodes)), residuals.ravel()
-
-
-def _perspective(mapped: FloatArray, derivatives: FloatArray) -> FloatArray:
-    """Return d(x/z, y/z) of (E, 3, 4) mapped corners for (E, 8, 3, 4) derivatives: (E, 8 coordinates, 8 parameters)."""
-    z = mapped[:, None, 2:]
-    points = mapped[:, None, :2] / z
-    d = (derivatives[:, :, :2] - points * derivatives[:, :, 2:]) / z
-    return d.transpose(0, 3, 2, 1).reshape(len(mapped), 8, 8)
 
 
 def _whitening(motion: Located, frame: FloatArray) -> FloatArray:

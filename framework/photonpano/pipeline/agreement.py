@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 
 from photonpano.geometry import rescaled, rescaling, translation
+from photonpano.photometry import noise_free_correlation
 
 if TYPE_CHECKING:
     from photonpano.values import FluxImage, Homography, VirtualExposure
 
 _BLOCK = 4
 """Averages of so many pixels squared are compared: what motion blurs differently does not count, and noise counts less."""
-_MIN_BLOCKS = 50
-"""Fewer blocks than this correlate by chance."""
-_SIGNIFICANT = 5.0
-"""A scene is told from noise when it varies by so many times more than the variance of noise is known to."""
 
 
 def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homography) -> float:
@@ -32,7 +29,7 @@ def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homog
         1 for the same place, around 0 for different ones; 0 where little is seen by both, or only noise is.
     """
     height, width = (side // _BLOCK for side in moving.flux.shape)
-    if height * width < _MIN_BLOCKS:
+    if not height * width:
         return 0.0
     # From numbers of blocks to the top left pixels of the averages in the other exposure that lie closest: interpolation
     # between averages would change their noise.
@@ -45,14 +42,10 @@ def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homog
         for image in _averages(fixed)
     )
     both = np.isfinite(first) & np.isfinite(second)
-    if both.sum() < _MIN_BLOCKS:
+    if not both.any():
         return 0.0
-    covariance = np.cov(first[both], second[both])
-    noise = np.array([first_variance[both].mean(), second_variance[both].mean()])
-    scene = np.diag(covariance) - noise
-    if np.any(scene < _SIGNIFICANT * np.sqrt(2 / both.sum()) * noise):
-        return 0.0
-    return float(covariance[0, 1] / np.sqrt(scene.prod()))
+    noise = float(first_variance[both].mean()), float(second_variance[both].mean())
+    return noise_free_correlation(first[both], second[both].astype(np.float32), noise, float(both.sum()))
 
 
 def _averages(exposure: VirtualExposure) -> tuple[FluxImage, FluxImage]:

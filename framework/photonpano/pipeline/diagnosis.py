@@ -9,7 +9,7 @@ import numpy as np
 
 from photonpano.errors import LocationError
 from photonpano.photometry import signal_to_noise
-from photonpano.values import FrameSpan, NotLocated
+from photonpano.values import FrameSpan, NotLocated, true_spans
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -81,12 +81,12 @@ def require_tied(
     tied = parts == 0
     if len(groups) == 1:
         return
-    runs = _runs(~tied)
-    longest = max((stop - start for start, stop in runs), default=0)
+    runs = _runs(groups, ~tied)
+    longest = max(map(len, runs), default=0)
     if tied.sum() >= 2 and (longest <= TOLERATED_RUN or disconnected == "largest"):
         return
     failures = [edge for edge in edges if isinstance(edge.motion, NotLocated)]
-    lost = [_frames(groups, start, stop) for start, stop in runs]
+    lost = [_frames(run) for run in runs]
     lines = [
         f"level {level}: {len(failures)} of {len(edges)} pairs of exposures could not be located, "
         f"so that {_listed(lost)} cannot be tied to the rest"
@@ -108,8 +108,7 @@ def _tied_together(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
     """List the parts of at least two exposures by the frames that they hold, the largest first."""
     sizes = np.bincount(parts)
     held = [
-        " with ".join(_frames(groups, start, stop) for start, stop in _runs(parts == part))
-        for part in np.flatnonzero(sizes >= 2)[: _SHOWN + 1]
+        " with ".join(_frames(run) for run in _runs(groups, parts == part)) for part in np.flatnonzero(sizes >= 2)[: _SHOWN + 1]
     ]
     return "; ".join(held[:_SHOWN]) + ("; and others" if len(held) > _SHOWN else "")
 
@@ -142,14 +141,13 @@ def _pair(edge: Edge, groups: Sequence[Group]) -> str:
     return f"  {groups[edge.moving]} onto {groups[edge.fixed]}: {edge.motion.reason}"
 
 
-def _runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Return the half-open runs of True."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(start), int(stop)) for start, stop in zip(steps[::2], steps[1::2], strict=True)]
+def _runs(groups: Sequence[Group], flags: BoolArray) -> list[Sequence[Group]]:
+    """Return the runs of groups whose flag is set."""
+    return [groups[run.start : run.stop] for run in true_spans(flags)]
 
 
-def _frames(groups: Sequence[Group], start: int, stop: int) -> str:
-    return str(FrameSpan(groups[start].span.start, groups[stop - 1].span.stop))
+def _frames(groups: Sequence[Group]) -> str:
+    return str(FrameSpan(groups[0].span.start, groups[-1].span.stop))
 
 
 def _listed(parts: Sequence[str]) -> str:

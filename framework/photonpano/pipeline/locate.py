@@ -70,7 +70,10 @@ class LocatedLevel:
 
     @property
     def covered(self) -> FrameSpan:
-        """The frames from the first to the last that located exposures hold."""
+        """The frames from the first to the last that located exposures hold.
+
+        Their motion is known: an exposure tells of all its frames, also of those beyond the last instant that was located.
+        """
         spans = [group.span for group, located in zip(self.groups, self.solution.located, strict=True) if located]
         return FrameSpan(min(span.start for span in spans), max(span.stop for span in spans))
 

@@ -117,7 +117,7 @@ def interpolate(level: Level, located: LocatedLevel, reference: int, clock: Stop
     """Turn the located instants into a homography for every frame (paper, section 4, "Interpolate")."""
     with clock("interpolate"), level.blaming("interpolator"):
         free = level.interpolator.fit(located.instants, located.homographies, located.information)
-        return ReferencedTrajectory(free, reference, located.covered)
+        return ReferencedTrajectory(free, reference)
 
 
 def _summary(result: LevelResult) -> str:

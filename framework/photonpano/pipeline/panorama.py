@@ -1,4 +1,4 @@
-"""The panorama: every located frame warped onto one canvas and estimated once."""
+"""The panorama: every frame whose motion is known, warped onto one canvas and estimated once."""
 
 from __future__ import annotations
 
@@ -9,42 +9,35 @@ import numpy as np
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import canvas_of
 from photonpano.merging import accumulate, chunks_of
-from photonpano.values import FrameSpan, Panorama
+from photonpano.values import Panorama
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from photonpano.geometry import Canvas
     from photonpano.pipeline.progress import Progress
     from photonpano.protocols import Source, Trajectory
-    from photonpano.values import StreamInfo
+    from photonpano.values import FrameSpan
 
 BYTES_PER_PIXEL = 40
 """Peak memory for each pixel of the canvas: sums, estimate and what is written, as measured in the tests."""
 
 
-def plan_canvas(trajectory: Trajectory, stream: StreamInfo, scale: float, memory: int) -> Canvas:
-    """Choose the canvas that holds every located frame, before anything of its size is allocated.
+def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int, int], scale: float, memory: int) -> Canvas:
+    """Choose the canvas that holds every frame of a span, before anything of its size is allocated.
 
     Args:
         trajectory: the motion, frame pixels to reference pixels.
-        stream: number and size of the frames.
+        span: the frames that are to be seen.
+        frame_shape: (height, width) of a frame.
         scale: pixels of the canvas per pixel of the reference frame.
         memory: bytes that a panorama may take.
 
     Raises:
         CanvasTooLargeError: it would take more; the message says how much.
-        LocationError: frames reach the horizon of the reference plane, or none is located.
+        LocationError: frames reach the horizon of the reference plane.
     """
-    frames = np.flatnonzero(trajectory.located(np.arange(stream.n_frames)))
-    if not len(frames):
-        raise LocationError(
-            "no frame lies between two located exposures, so that no motion is known to merge frames along; "
-            "use smaller groups or more levels"
-        )
-    homographies = trajectory.at(frames)
+    homographies = trajectory.at(np.arange(span.start, span.stop))
     try:
-        canvas = canvas_of(homographies, stream.frame_shape, scale)
+        canvas = canvas_of(homographies, frame_shape, scale)
     except ValueError as error:
         raise LocationError(
             f"the motion turns so far away from the reference frame that a flat panorama cannot show it ({error}); "
@@ -61,30 +54,24 @@ def plan_canvas(trajectory: Trajectory, stream: StreamInfo, scale: float, memory
     return canvas
 
 
-def render(source: Source, trajectory: Trajectory, canvas: Canvas, tolerance_px: float, progress: Progress) -> Panorama:
-    """Merge the located frames on a canvas: warped, summed, and one maximum-likelihood estimate for each pixel.
+def render(
+    source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas, tolerance_px: float, progress: Progress
+) -> Panorama:
+    """Merge the frames of a span on a canvas: warped, summed, and one maximum-likelihood estimate for each pixel.
 
     Args:
         source: the capture.
         trajectory: frame pixels to reference pixels.
+        span: the frames that are merged.
         canvas: the pixel grid.
         tolerance_px: frames that move less than this are summed before they are warped.
         progress: is told of the frames.
     """
-    located = trajectory.located(np.arange(source.info.n_frames))
-    with progress.stage("panorama", int(located.sum()), "frames") as advance:
-        chunks = (
-            chunk for span in _spans(located) for chunk in chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        )
+    with progress.stage("panorama", len(span), "frames") as advance:
+        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
         photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance)
     flux, weight = photons.estimate(source.response)
     return Panorama(flux, weight, canvas.transform)
-
-
-def _spans(located: np.ndarray) -> Iterator[FrameSpan]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], located.astype(np.int8), [0]])))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        yield FrameSpan(int(start), int(stop))
 
 
 def _gib(size: float) -> str:

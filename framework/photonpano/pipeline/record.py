@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from photonpano.values import Decision, FrameSpan, Located, NotLocated
+from photonpano.values import Decision, Located, NotLocated, true_spans
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -122,16 +122,17 @@ def warnings_of(results: Sequence[LevelResult]) -> list[str]:
                 f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
             )
         if located.solution.contradictions:
-            edge = located.edges[located.solution.contradictions[0]]
+            dropped = [located.edges[index] for index in located.solution.contradictions]
+            first = _pair(result.groups, dropped[0].moving, dropped[0].fixed)
             warnings.append(
-                f"level {result.level.number}: {len(located.solution.contradictions)} of {len(located.edges)} pairs contradict "
-                f"the others and were dropped ({_pair(result.groups, edge.moving, edge.fixed)} and others)"
+                f"level {result.level.number}: {len(dropped)} of {len(located.edges)} pairs contradict the others and were "
+                f"dropped ({first}{' and others' if len(dropped) > 1 else ''})"
             )
     return warnings
 
 
 def uncertain_frames(std_px: FloatArray) -> list[str]:
-    """Warn of the frames whose corners may well be further than a pixel from where they should be.
+    """Warn of the frames whose expected error is more than merging would hide.
 
     Args:
         std_px: (T,) expected corner error, infinite where nothing was located.
@@ -141,10 +142,9 @@ def uncertain_frames(std_px: FloatArray) -> list[str]:
     uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
     if not uncertain.any():
         return []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], uncertain, [False]]).astype(np.int8)))
-    spans = [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
-    spans.sort(key=lambda span: -float(std_px[span[0] : span[1]].max()))
-    named = [f"{FrameSpan(*span)} (up to {std_px[span[0] : span[1]].max():.1f} px)" for span in spans[:SHOWN_SPANS]]
+    worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
+    spans = sorted(worst_px, key=lambda span: -worst_px[span])
+    named = [f"{span} (up to {worst_px[span]:.1f} px)" for span in spans[:SHOWN_SPANS]]
     more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
     return [
         f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "

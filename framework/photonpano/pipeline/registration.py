@@ -114,7 +114,7 @@ class Registrar:
             return edge
         with self._clock("locate"):
             alike = agreement(first, second, edge.motion.homography)
-        evidence = {**edge.motion.evidence, "agreement": alike}
+        evidence = {**edge.motion.evidence, "revisit_agreement": alike}
         if alike < MIN_AGREEMENT:
             reason = f"they may show one place, but agree by {alike:.2f} only (at least {MIN_AGREEMENT:g} is needed)"
             return Edge(moving, fixed, NotLocated(reason, evidence))

@@ -93,12 +93,13 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
         decisions.append(levels_decision(results))
     trajectory = results[-1].trajectory
     rendering = time.perf_counter()
-    canvas = plan_canvas(trajectory, stream, plan.render.scale, int(plan.run.memory))
-    panorama = render(source, trajectory, canvas, plan.render.tolerance_px, progress)
+    covered = results[-1].located.covered
+    canvas = plan_canvas(trajectory, covered, stream.frame_shape, plan.render.scale, int(plan.run.memory))
+    panorama = render(source, trajectory, covered, canvas, plan.render.tolerance_px, progress)
     seen = panorama.weight > 0
     white_flux = float(np.quantile(panorama.flux[seen], plan.render.white_quantile)) or 1.0
     frames = np.arange(stream.n_frames)
-    located = trajectory.located(frames)
+    located = (covered.start <= frames) & (frames < covered.stop)
     std_px = np.where(located, results[-1].uncertainty.at(frames), np.inf)
     warnings = warnings_of(results) + uncertain_frames(std_px)
     if not located.all():

@@ -11,8 +11,8 @@ import numpy as np
 
 from photonpano.geometry import apply, corners
 from photonpano.report.pictures import shrunk
-from photonpano.report.spans import true_spans
 from photonpano.report.wording import duration
+from photonpano.values import true_spans
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -74,7 +74,7 @@ STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "i
 
 def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
     """Draw where the centre of the frame is, how fast it moves, and how far its corners may be off, over time."""
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import LogLocator
 
     instants = _instants(len(arrays.homographies))
     centre = _centre(arrays.frame_shape)
@@ -97,7 +97,8 @@ def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
         error.plot(instants, known[instants], color=INK)
         error.set_yscale("log")
         error.yaxis.set_major_formatter("{x:g}")
-        error.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+        error.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        error.yaxis.set_minor_formatter("{x:g}")
         error.set_ylabel("expected error (px)")
         error.set_xlabel("frame")
         error.set_xlim(-0.5, len(arrays.homographies) - 0.5)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from photonpano.report import figures, wording
 from photonpano.report.failures import failure_groups
 from photonpano.report.pictures import jpeg_uri, shrunk
-from photonpano.report.spans import true_spans
+from photonpano.values import true_spans
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -3,7 +3,7 @@
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Homography
 from photonpano.values.capture import CaptureSummary, Decision, DecisionValue
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
-from photonpano.values.frames import FrameSpan, Group, StreamInfo
+from photonpano.values.frames import FrameSpan, Group, StreamInfo, true_spans
 from photonpano.values.motion import Edge, Located, NotLocated
 
 __all__ = [
@@ -24,4 +24,5 @@ __all__ = [
     "Response",
     "StreamInfo",
     "VirtualExposure",
+    "true_spans",
 ]

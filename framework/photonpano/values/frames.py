@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
 
 from photonpano.errors import InputError
+
+if TYPE_CHECKING:
+    from photonpano.values.arrays import BoolArray
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -29,6 +34,12 @@ class FrameSpan:
     def centre(self) -> float:
         """The mean instant of the span, in frames: `(start + stop - 1) / 2`."""
         return (self.start + self.stop - 1) / 2
+
+
+def true_spans(flags: BoolArray) -> list[FrameSpan]:
+    """Return the runs of frames whose flag is set, in order."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [FrameSpan(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
 @dataclass(frozen=True, slots=True)

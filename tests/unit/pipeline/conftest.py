@@ -66,10 +66,6 @@ class Knots:
         frames = np.atleast_1d(frame_indices)
         return np.stack([np.interp(frames, self._instants, row) for row in self._rows], axis=-1).reshape(-1, 3, 3)
 
-    def located(self, frame_indices: Any) -> np.ndarray:
-        frames = np.atleast_1d(frame_indices)
-        return (self._instants[0] <= frames) & (frames <= self._instants[-1])
-
 
 class Linear:
     def fit(self, instants: np.ndarray, homographies: np.ndarray, information: np.ndarray | None) -> Knots:

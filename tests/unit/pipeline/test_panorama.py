@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import CanvasTooLargeError, LocationError, StreamInfo
+from photonpano import CanvasTooLargeError, FrameSpan, LocationError
 from photonpano.geometry import from_parameters, translation
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.panorama import BYTES_PER_PIXEL, plan_canvas, render
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 SHAPE = (30, 40)
 N = 60
-STREAM = StreamInfo(N, *SHAPE, None)
+ALL = FrameSpan(0, N)
 GIB = 1024**3
 
 
-def test_the_canvas_holds_the_located_frames_only(pan: Callable) -> None:
+def test_the_canvas_holds_the_frames_of_the_span_only(pan: Callable) -> None:
     """At 2 px a frame, frames 10 to 19 span 18 px and a frame."""
-    canvas = plan_canvas(pan(2, first=10, last=19), STREAM, 1.0, GIB)
+    canvas = plan_canvas(pan(2), FrameSpan(10, 20), SHAPE, 1.0, GIB)
     assert canvas.shape == (30, 40 + 18)
     np.testing.assert_array_equal(canvas.transform, translation(-20, 0))
 
@@ -34,7 +34,7 @@ def test_the_canvas_holds_the_located_frames_only(pan: Callable) -> None:
 def test_a_canvas_beyond_the_memory_is_refused_before_it_is_made(pan: Callable) -> None:
     """40,000 px wide and 50,000 high at scale 10."""
     with pytest.raises(CanvasTooLargeError) as caught:
-        plan_canvas(pan(3960 / (N - 1), 4970 / (N - 1)), STREAM, 10.0, 2 * GIB)
+        plan_canvas(pan(3960 / (N - 1), 4970 / (N - 1)), ALL, SHAPE, 10.0, 2 * GIB)
     assert str(caught.value) == (
         "the panorama would have 40000 x 50000 pixels and take 75 GiB, more than the 2 GiB of run.memory. "
         "Raise run.memory, lower render.scale from 10 to 1.6, "
@@ -44,32 +44,22 @@ def test_a_canvas_beyond_the_memory_is_refused_before_it_is_made(pan: Callable) 
 
 @pytest.mark.parametrize(("scale", "memory"), [(8.0, 2 * GIB), (1.0, GIB // 16), (0.9, GIB // 16)])
 def test_the_scale_that_it_suggests_fits_and_is_not_much_too_small(pan: Callable, scale: float, memory: int) -> None:
-    stream = StreamInfo(N, 1000, 2000, None)
     with pytest.raises(CanvasTooLargeError) as caught:
-        plan_canvas(pan(5), stream, scale, memory)
+        plan_canvas(pan(5), ALL, (1000, 2000), scale, memory)
     suggested = float(str(caught.value).split(f"render.scale from {scale:g} to ")[1].split(",")[0])
-    plan_canvas(pan(5), stream, suggested, memory)
+    plan_canvas(pan(5), ALL, (1000, 2000), suggested, memory)
     with pytest.raises(CanvasTooLargeError):
-        plan_canvas(pan(5), stream, 1.1 * suggested, memory)
+        plan_canvas(pan(5), ALL, (1000, 2000), 1.1 * suggested, memory)
 
 
 def test_a_turn_to_the_horizon_is_told(known_motion: type) -> None:
     motion = known_motion(lambda frame: from_parameters([0, 0, 0, 0, 0, 0, -frame / N / 20, 0]))
     with pytest.raises(LocationError) as caught:
-        plan_canvas(motion, STREAM, 1.0, GIB)
+        plan_canvas(motion, ALL, SHAPE, 1.0, GIB)
     assert str(caught.value) == (
         "the motion turns so far away from the reference frame that a flat panorama cannot show it "
         "(homography 59 of 60 sends part of its frame behind the reference plane); "
         "choose a render.reference in the middle of the motion, or fewer frames"
-    )
-
-
-def test_without_a_located_frame_there_is_nothing_to_show(pan: Callable) -> None:
-    with pytest.raises(LocationError) as caught:
-        plan_canvas(pan(1, first=29.5, last=29.5), STREAM, 1.0, GIB)
-    assert str(caught.value) == (
-        "no frame lies between two located exposures, so that no motion is known to merge frames along; "
-        "use smaller groups or more levels"
     )
 
 
@@ -85,9 +75,9 @@ def panning(memory_source: type) -> Any:
     return memory_source(np.array([rng.random(SHAPE) < wide[:, start : start + SHAPE[1]] for start in range(N)]))
 
 
-def rendered(source: Any, motion: Any, scale: float = 1.0) -> tuple[Panorama, Canvas]:
-    canvas = plan_canvas(motion, source.info, scale, GIB)
-    return render(source, motion, canvas, 0.25, Quiet()), canvas
+def rendered(source: Any, motion: Any, scale: float = 1.0, span: FrameSpan = ALL) -> tuple[Panorama, Canvas]:
+    canvas = plan_canvas(motion, span, SHAPE, scale, GIB)
+    return render(source, motion, span, canvas, 0.25, Quiet()), canvas
 
 
 def test_the_panorama_shows_the_scene(panning: Any, pan: Callable) -> None:
@@ -102,8 +92,8 @@ def test_the_panorama_shows_the_scene(panning: Any, pan: Callable) -> None:
     assert (error * np.sqrt(weight)).std() == pytest.approx(np.sqrt(0.16), rel=0.1)
 
 
-def test_frames_that_are_not_located_are_left_out(panning: Any, pan: Callable) -> None:
-    panorama, _ = rendered(panning, pan(1, first=10, last=19))
+def test_frames_beyond_the_span_are_left_out(panning: Any, pan: Callable) -> None:
+    panorama, _ = rendered(panning, pan(1), span=FrameSpan(10, 20))
     assert panorama.weight.max() == pytest.approx(10)
     assert panorama.weight.sum() == pytest.approx(10 * 30 * 40)
 
@@ -119,7 +109,7 @@ def test_at_twice_the_scale_every_pixel_is_four(panning: Any, pan: Callable) -> 
     np.testing.assert_allclose(dark, 0.2, atol=0.03)
 
 
-def test_it_tells_of_every_located_frame(panning: Any, pan: Callable) -> None:
+def test_it_tells_of_every_frame(panning: Any, pan: Callable) -> None:
     class Counting(Quiet):
         def __init__(self) -> None:
             self.frames: list[int] = []
@@ -134,8 +124,8 @@ def test_it_tells_of_every_located_frame(panning: Any, pan: Callable) -> None:
         def __exit__(self, *_: object) -> None: ...
 
     progress = Counting()
-    motion = pan(1, first=10, last=39)
-    render(panning, motion, plan_canvas(motion, panning.info, 1.0, GIB), 2.0, progress)
+    motion, span = pan(1), FrameSpan(10, 40)
+    render(panning, motion, span, plan_canvas(motion, span, SHAPE, 1.0, GIB), 2.0, progress)
     assert progress.title == ("panorama", 30, "frames")
     assert sum(progress.frames) == 30
     assert len(progress.frames) == 15
@@ -144,10 +134,10 @@ def test_it_tells_of_every_located_frame(panning: Any, pan: Callable) -> None:
 def test_the_memory_of_a_pixel_is_no_more_than_is_predicted(memory_source: type, pan: Callable) -> None:
     """A still camera at a scale that makes 2.4 megapixels of every frame: what is held at the same time at most."""
     source = memory_source(np.random.default_rng(0).random((4, 60, 100)) < 0.5)
-    canvas = plan_canvas(pan(0), source.info, 20.0, GIB)
+    canvas = plan_canvas(pan(0), source.info.span, source.info.frame_shape, 20.0, GIB)
     tracemalloc.start()
     try:
-        panorama = render(source, pan(0), canvas, 0.25, Quiet())
+        panorama = render(source, pan(0), source.info.span, canvas, 0.25, Quiet())
         white = np.quantile(panorama.flux[panorama.weight > 0], 0.995)
         tone_mapped(panorama.flux, float(white))
         peak = tracemalloc.get_traced_memory()[1]

@@ -132,7 +132,7 @@ def test_what_was_accepted_tells_how_alike_the_two_are(run: Callable, level: Cal
     for edge in run(level()).revisits:
         assert edge.locator == "toy"
         assert edge.motion.evidence["inliers"] == 30
-        assert 0.9 < edge.motion.evidence["agreement"] < 1.05
+        assert 0.9 < edge.motion.evidence["revisit_agreement"] < 1.05
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
@@ -154,7 +154,7 @@ def test_pairs_that_show_another_place_are_refused(run: Callable, level: Callabl
     for edge in found.failures:
         assert edge.locator == ""
         assert edge.motion.evidence["inliers"] == 12
-        alike = edge.motion.evidence["agreement"]
+        alike = edge.motion.evidence["revisit_agreement"]
         assert alike < MIN_AGREEMENT
         assert edge.motion.reason == f"they may show one place, but agree by {alike:.2f} only (at least 0.7 is needed)"
     np.testing.assert_array_equal(found.homographies, run(level(wrong, scale=scale), closure_overlap=None).homographies)
@@ -207,7 +207,7 @@ def test_a_contradiction_that_looks_right_is_outvoted_and_found_among_all_pairs(
     (position,) = found.solution.contradictions
     edge = found.edges[position]
     assert (edge.moving, edge.fixed) == PAIRS[5]
-    assert edge.motion.evidence["agreement"] > 0.9
+    assert edge.motion.evidence["revisit_agreement"] > 0.9
     assert found.failures == ()
     assert drift_px(found) < 0.15
 

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano import FrameSpan
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.pipeline.trajectory import ReferencedTrajectory
 
@@ -13,14 +12,8 @@ if TYPE_CHECKING:
 
 
 def test_it_is_seen_from_the_reference_frame(pan: Callable) -> None:
-    trajectory = ReferencedTrajectory(pan(0.5), 40, FrameSpan(0, 100))
+    trajectory = ReferencedTrajectory(pan(0.5), 40)
     np.testing.assert_allclose(trajectory.at([40, 50, 20.5]), [np.eye(3), translation(5, 0), translation(-9.75, 0)])
-
-
-def test_all_frames_of_located_exposures_are_located(pan: Callable) -> None:
-    """The first instant that was located is 19.5, but the photons of its exposure tell of frame 10, too."""
-    trajectory = ReferencedTrajectory(pan(0.5, first=19.5, last=80.5), 40, FrameSpan(10, 91))
-    np.testing.assert_array_equal(trajectory.located([9, 9.9, 10, 90, 90.1, 91]), [False, False, True, True, False, False])
 
 
 def test_pairwise_motions_do_not_depend_on_the_reference(known_motion: type) -> None:
@@ -29,9 +22,7 @@ def test_pairwise_motions_do_not_depend_on_the_reference(known_motion: type) -> 
     free = known_motion(lambda frame: translation(*speed * frame) @ from_parameters(zoom * frame))
     pairs = []
     for reference in (0, 25, 100):
-        first, second = ReferencedTrajectory(free, reference, FrameSpan(0, 101)).at([20, 70])
+        first, second = ReferencedTrajectory(free, reference).at([20, 70])
         pairs.append(normalised(inverse(first) @ second))
-        np.testing.assert_allclose(
-            ReferencedTrajectory(free, reference, FrameSpan(0, 101)).at([reference]), [np.eye(3)], atol=1e-12
-        )
+        np.testing.assert_allclose(ReferencedTrajectory(free, reference).at([reference]), [np.eye(3)], atol=1e-12)
     np.testing.assert_allclose(pairs[1:], [pairs[0]] * 2, atol=1e-9)

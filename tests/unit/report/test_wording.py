@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from photonpano.report import wording
 from photonpano.report.failures import failure_groups
-from photonpano.report.spans import true_spans
 
 
 @pytest.mark.parametrize(
@@ -59,12 +57,6 @@ def test_counts_and_spans():
     assert wording.counted(12_000, "frame") == "12,000 frames"
     assert wording.span(1000, 2000) == "1,000 to 1,999"
     assert wording.span(7, 8) == "7"
-
-
-def test_runs_of_set_flags():
-    flags = np.array([True, False, False, True, True, True, False, True])
-    assert [(span.start, span.stop) for span in true_spans(flags)] == [(0, 1), (3, 6), (7, 8)]
-    assert true_spans(np.zeros(5, bool)) == []
 
 
 def failure(start: int, reason: str) -> dict:

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, StreamInfo
+from photonpano.values import true_spans
 
 
 def test_a_span_counts_its_frames_and_knows_its_middle() -> None:
@@ -17,6 +19,12 @@ def test_a_span_counts_its_frames_and_knows_its_middle() -> None:
 def test_a_span_is_never_empty(start: int, stop: int) -> None:
     with pytest.raises(ValueError, match=rf"0 <= start < stop, got \[{start}, {stop}\)"):
         FrameSpan(start, stop)
+
+
+def test_runs_of_set_flags() -> None:
+    flags = np.array([True, False, False, True, True, True, False, True])
+    assert true_spans(flags) == [FrameSpan(0, 1), FrameSpan(3, 6), FrameSpan(7, 8)]
+    assert true_spans(np.zeros(5, bool)) == []
 
 
 def test_a_group_is_seen_from_one_of_its_instants() -> None:

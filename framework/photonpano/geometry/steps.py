@@ -1,0 +1,41 @@
+"""Small changes of a homography, in coordinates in which all eight parameters mean about as much."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry.homographies import from_parameters
+
+if TYPE_CHECKING:
+    from photonpano.values import FloatArray, Homography
+
+
+def unit_coordinates(shape: tuple[int, int]) -> Homography:
+    """Return the map from pixels of a (height, width) image to coordinates with -1 and 1 at the ends of its longer side."""
+    height, width = shape
+    half = max(height, width) / 2
+    return np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+
+
+def generators(shape: tuple[int, int]) -> FloatArray:
+    """Return what small changes of p1..p8 in unit coordinates are in pixels: (8, 3, 3).
+
+    To first order the change by p is the homography I + p1 G1 + ... + p8 G8 of pixels.
+    """
+    unit = unit_coordinates(shape)
+    return np.asarray(np.linalg.inv(unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ unit)
+
+
+def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:
+    """Return the derivatives of mapped points: (..., 2 N, 8), coordinates of a point next to each other.
+
+    Args:
+        mapped: (..., 3, N) points in homogeneous coordinates.
+        changes: (..., 8, 3, N) their derivatives with respect to eight parameters.
+    """
+    depth = mapped[..., None, 2:, :]
+    points = mapped[..., None, :2, :] / depth
+    d = (changes[..., :2, :] - points * changes[..., 2:, :]) / depth
+    return np.asarray(np.moveaxis(d, -3, -1).swapaxes(-3, -2).reshape(*d.shape[:-3], -1, d.shape[-3]))

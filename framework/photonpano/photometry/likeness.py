@@ -1,0 +1,39 @@
+"""How alike two noisy images are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_FEWEST = 50
+"""Fewer independent pixels than this correlate by chance."""
+_STANDS_OUT = 5.0
+"""The variance of a scene exceeds that of the noise by at least so many of its standard errors."""
+
+
+def noise_free_correlation(
+    first: NDArray[np.float32], second: NDArray[np.float32], noise: tuple[float, float], independent: float
+) -> float:
+    """Return the correlation that two images would have without their noise.
+
+    Args:
+        first: (N,) pixels of one image.
+        second: (N,) what the other one shows there.
+        noise: the variance of the noise of a pixel of each.
+        independent: how many of the N pixels have noise of their own; fewer where images were blurred.
+
+    Returns:
+        1 where they show the same; around 0 where they do not, and 0 where there are hardly any pixels, or nothing stands out
+        from the noise, so that any two places look alike.
+    """
+    if independent < _FEWEST:
+        return 0.0
+    covariance = np.cov(first, second)
+    scene = np.diag(covariance) - noise
+    if np.any(scene < _STANDS_OUT * np.sqrt(2 / independent) * np.asarray(noise)):
+        return 0.0
+    return float(covariance[0, 1] / np.sqrt(scene.prod()))
