@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 _BLUR = 0.15
 """Groups of the first level may be blurred by this share of the shorter side of a frame; twice as much spoils the result."""
-_DARK = 8.0
+_DARK = 12.0
 """Below so many photons a pixel noise does more harm than blur does, and groups get longer."""
 _DARK_BLUR = 2.0
 """In the dark, so many times the blur is allowed."""
@@ -49,7 +49,7 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
     """Return the group size for a capture, in frames, and a clause that gives the reason.
 
     The blur of a group of m frames at v px a frame is m v px. It may be 0.15 of the shorter side of a frame, and up to twice
-    that as long as a pixel gets fewer than 8 photons. There are at least 16 frames in a group, and at least 8 groups.
+    that as long as a pixel gets fewer than 12 photons. There are at least 16 frames in a group, and at least 8 groups.
     """
     if capture.speed_px is None:
         size, bound = _bounded(_UNKNOWN, n_frames)

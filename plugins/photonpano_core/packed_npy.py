@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
+from threading import local
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from photonpano import Config, InputError, SourceContribution, SpecPath, StreamInfo
+from photonpano import Config, FrameSpan, InputError, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinaryResponse, packed_counts
 
 if TYPE_CHECKING:
@@ -18,7 +20,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from photonpano import FrameSpan
+
+_READ_BYTES = 1024**2
+"""So much is read at a time: a core's cache holds it until it is summed."""
 
 
 class PackedNpyConfig(Config):
@@ -35,7 +39,7 @@ class PackedNpyConfig(Config):
 
 
 class PackedNpySource:
-    """Binary frames of a memory-mapped .npy file.
+    """Binary frames of a .npy file, read a few at a time: a mapped file would fill the memory of the process.
 
     Raises:
         InputError: a file is missing or is not what the config says.
@@ -47,21 +51,48 @@ class PackedNpySource:
         self.info = StreamInfo(n_frames, height, width, config.frame_rate_hz)
         self.response = BinaryResponse()
         self.valid = _valid(config.bad_pixels, self.info.frame_shape)
-        self._packed: NDArray[np.uint8] = np.memmap(config.path, np.uint8, "r", header.offset, header.shape)
+        self._frame = header.shape[1:]
+        self._offset = header.offset
+        self._path = config.path
+        self._file = config.path.open("rb", buffering=0)
+        self._buffers = local()
 
     def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
         """Sum the frames of a span: (H, W) uint32."""
         self.info.require(span)
-        return packed_counts(self._packed[span.start : span.stop], self.info.width)
+        step = max(1, _READ_BYTES // math.prod(self._frame))
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        for start in range(span.start, span.stop, step):
+            packed_counts(self._read(FrameSpan(start, min(start + step, span.stop))), self.info.width, counts)
+        return counts
 
     def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
         """Return the frames of a span: (n, H, W) of zeros and ones."""
         self.info.require(span)
-        return np.unpackbits(self._packed[span.start : span.stop], axis=-1, count=self.info.width)
+        return np.unpackbits(self._read(span), axis=-1, count=self.info.width)
 
     def close(self) -> None:
         """Let go of the file."""
-        self._packed = np.empty((0, 0, 0), np.uint8)
+        self._file.close()
+
+    def _read(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return packed frames, in a buffer of the thread that the next call overwrites."""
+        frame_bytes = math.prod(self._frame)
+        size = len(span) * frame_bytes
+        buffer: NDArray[np.uint8] | None = getattr(self._buffers, "bytes", None)
+        if buffer is None or len(buffer) < size:
+            buffer = self._buffers.bytes = np.empty(size, np.uint8)
+        target = buffer[:size].data
+        position = self._offset + span.start * frame_bytes
+        while target:
+            try:
+                done = os.preadv(self._file.fileno(), [target], position)
+            except OSError as error:
+                raise InputError(f"cannot read {span} of {self._path}: {error.strerror}") from error
+            if not done:
+                raise InputError(f"{self._path} has become shorter: {span} are no longer in it; copy or record it again")
+            target, position = target[done:], position + done
+        return buffer[:size].reshape(len(span), *self._frame)
 
     def __enter__(self) -> PackedNpySource:
         return self

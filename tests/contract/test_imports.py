@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-HEAVY = ("cv2", "scipy", "skimage", "matplotlib", "tifffile")
+HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile")
 
 
 def imported_by(statement: str) -> set[str]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from photonpano.geometry import apply, corners, rescaling, translation
+from photonpano.geometry import apply, corners, inverse, rescaling, translation
+from photonpano.merging.warping import add_footprint, add_warped, run_px
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from photonpano.protocols import Source
     from photonpano.values import FluxImage, Homography, Response
 
+_LONG_RUN_PX = 48
+"""Shorter runs of neighbours are warped faster pixel by pixel."""
 MIN_WEIGHT = 1.0
 """A pixel that was seen in less than one whole frame is unknown."""
 
@@ -69,32 +72,47 @@ def accumulate(
     """
     counts = np.zeros(shape, dtype=np.float32)
     weight = np.zeros(shape, dtype=np.float32)
-    valid = source.valid
+    steps = np.zeros((shape[0], shape[1] + 1), dtype=np.float32)
+    masked = None if source.valid.all() else source.valid.astype(np.float32)
+    frame = np.empty(source.info.frame_shape, dtype=np.float32)
     for chunk in chunks:
-        summed = np.where(valid, source.counts(chunk.span), 0).astype(np.float32)
-        seen = valid.astype(np.float32) * len(chunk.span)
+        frame[...] = source.counts(chunk.span)
+        if masked is not None:
+            frame *= masked
+        summed = frame
         to_grid = onto @ chunk.homography
         shrink = _shrink_factor(to_grid, summed.shape)
+        n_frames = float(len(chunk.span))
         if shrink > 1:
+            seen = np.ones_like(summed) if masked is None else masked
             summed, seen = _shrunk(summed, shrink), _shrunk(seen, shrink)
             to_grid = to_grid @ rescaling(shrink)
-        box = _bounding_box(to_grid, summed.shape, shape)
-        if box is not None:
-            rows, columns = box
-            size = (columns.stop - columns.start, rows.stop - rows.start)
-            to_box = translation(-columns.start, -rows.start) @ to_grid
-            counts[box] += _warped(summed, to_box, size)
-            weight[box] += _warped(seen, to_box, size)
+            _add(seen * np.float32(n_frames), to_grid, weight)
+        elif masked is not None:
+            _add(masked * np.float32(n_frames), to_grid, weight)
+        else:
+            add_footprint(summed.shape, inverse(to_grid), n_frames, steps, weight)
+        _add(summed, to_grid, counts)
         if advance is not None:
             advance(len(chunk.span))
+    weight += np.cumsum(steps, axis=1, dtype=np.float64)[:, :-1].astype(np.float32)
     return PhotonSum(counts, weight)
 
 
-def _warped(image: FluxImage, to_box: Homography, size: tuple[int, int]) -> FluxImage:
+def _add(image: FluxImage, to_grid: Homography, total: FluxImage) -> None:
+    """Add an image to a grid, interpolated linearly."""
+    box = _bounding_box(to_grid, image.shape, total.shape)
+    if box is None:
+        return
+    rows, columns = box
+    to_image = inverse(to_grid)
+    if run_px(to_image, rows, columns) >= _LONG_RUN_PX:
+        add_warped(np.ascontiguousarray(image), to_image, total)
+        return
     # The inverse is taken here, in float64, because OpenCV would normalise it in its own way.
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(image, np.linalg.inv(to_box), size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(warped, dtype=np.float32)
+    flags, size = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, (columns.stop - columns.start, rows.stop - rows.start)
+    to_image = to_image @ translation(columns.start, rows.start)
+    total[box] += cv2.warpPerspective(image, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
 
 
 def _bounding_box(to_grid: Homography, frame: tuple[int, int], grid: tuple[int, int]) -> tuple[slice, slice] | None:

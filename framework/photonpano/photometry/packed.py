@@ -12,33 +12,41 @@ if TYPE_CHECKING:
     from photonpano.values import Counts
 
 _BLOCK_BYTES = 1024**2
-"""Unpacked bytes held at a time: about what a core's cache holds."""
-_MAX_FRAMES = 255
-"""More frames than this could overflow the 8-bit sum of a block."""
+"""Bytes of frames that are summed at a time: about what a core's cache holds."""
 
 
-def packed_counts(packed: NDArray[np.uint8], width: int) -> Counts:
-    """Sum bit-packed frames, pixel by pixel, in a few megabytes beyond the result.
+def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None = None) -> Counts:
+    """Sum bit-packed frames, pixel by pixel, as fast as memory gives them, and in little memory beyond the result.
 
     Args:
         packed: (n, H, ceil(width / 8)) uint8, packed along the width as `numpy.packbits` does: the first pixel is the highest
             bit. A memory-mapped array is read in blocks.
         width: W, columns of a frame; the bits beyond it are ignored.
+        counts: (H, W) uint32, what the sum is added to; None for zeros.
 
     Returns:
-        (H, W) uint32; zeros for no frames.
+        (H, W) uint32, `counts` where it was given; zeros for no frames.
 
     Raises:
-        ValueError: the array is not of that type or shape.
+        ValueError: an array is not of that type or shape.
     """
     if packed.dtype != np.uint8 or packed.ndim != 3 or packed.shape[2] != -(-width // 8):
         raise ValueError(
             f"packed frames of width {width} are uint8 (n, H, {-(-width // 8)}), got {packed.dtype} {packed.shape}"
         )
-    n_frames, height, _ = packed.shape
-    counts = np.zeros((height, width), dtype=np.uint32)
-    step = min(_MAX_FRAMES, max(1, _BLOCK_BYTES // max(1, height * width)))
+    from photonpano.photometry.carry_save import MOST_FRAMES, add_counts
+
+    n_frames, height, row_bytes = packed.shape
+    if counts is None:
+        counts = np.zeros((height, width), dtype=np.uint32)
+    elif counts.dtype != np.uint32 or counts.shape != (height, width) or not counts.flags.c_contiguous:
+        raise ValueError(f"counts to add to are contiguous uint32 {(height, width)}, got {counts.dtype} {counts.shape}")
+    whole = width == 8 * row_bytes
+    padded = counts if whole else np.zeros((height, 8 * row_bytes), dtype=np.uint32)
+    step = min(MOST_FRAMES, max(8, _BLOCK_BYTES // max(1, height * row_bytes)))
     for start in range(0, n_frames, step):
-        frames = np.unpackbits(packed[start : start + step], axis=-1, count=width)
-        counts += np.add.reduce(frames, axis=0, dtype=np.uint8)
+        block = np.ascontiguousarray(packed[start : start + step])
+        add_counts(block.reshape(-1), len(block), padded.reshape(-1))
+    if not whole:
+        counts += padded[:, :width]
     return counts

@@ -51,3 +51,17 @@ def test_memory_does_not_grow_with_the_frames() -> None:
 def test_other_arrays_are_refused(packed: np.ndarray, width: int) -> None:
     with pytest.raises(ValueError, match="packed frames of width"):
         packed_counts(packed, width)
+
+
+def test_sums_are_added_to_counts_that_are_given() -> None:
+    packed = np.full((300, 3, 2), 0b10100000, np.uint8)
+    for width in (16, 11):
+        counts = np.full((3, width), 5, np.uint32)
+        assert packed_counts(packed, width, counts) is counts
+        np.testing.assert_array_equal(counts[:, :4], np.tile([305, 5, 305, 5], (3, 1)))
+
+
+@pytest.mark.parametrize("counts", [np.zeros((3, 16), np.int64), np.zeros((2, 16), np.uint32), np.zeros((16, 3), np.uint32).T])
+def test_counts_of_another_kind_are_refused(counts: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="counts to add to are contiguous uint32"):
+        packed_counts(np.zeros((2, 3, 2), np.uint8), 16, counts)
