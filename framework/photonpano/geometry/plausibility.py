@@ -9,8 +9,11 @@ import numpy as np
 from photonpano.geometry.homographies import apply, corners
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from photonpano.values import Homography
 
+_NEXT = [1, 2, 3, 0]
 MAX_AREA_CHANGE = 2.0
 """Two exposures that share the field of view of one camera do not differ more than this in size."""
 MAX_SIDE_CHANGE = 1.5
@@ -32,11 +35,12 @@ def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: 
     if depth.min() <= 0:
         return "the homography sends part of the image behind the camera"
     quad = apply(homography, frame)
-    edges = np.roll(quad, -1, axis=0) - quad
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
+    edges = quad[_NEXT] - quad
+    following = edges[_NEXT]
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     if turns.min() <= 0:
         return "the homography mirrors or folds the image"
-    area = _area(quad) / _area(frame)
+    area = _area(quad.tolist()) / _area(frame.tolist())
     if not 1 / MAX_AREA_CHANGE < area < MAX_AREA_CHANGE:
         return f"the homography changes the area of the image {area:.2g} times (at most {MAX_AREA_CHANGE:g} is plausible)"
     sides = np.linalg.norm(edges, axis=1)
@@ -47,32 +51,33 @@ def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: 
                 f"the homography makes opposite sides of the image differ {ratio:.2g} times "
                 f"(at most {MAX_SIDE_CHANGE:g} is plausible)"
             )
-    overlap = _overlap(quad, shape)
+    overlap = _overlap(quad.tolist(), shape)
     if overlap < min_overlap:
         return f"the images overlap by {overlap:.0%} (at least {min_overlap:.0%} is needed)"
     return None
 
 
-def _area(polygon: np.ndarray) -> float:
-    x, y = polygon.T
-    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
+def _area(polygon: Sequence[Sequence[float]]) -> float:
+    following = [*polygon[1:], polygon[0]]
+    return abs(sum(x * y_next - y * x_next for (x, y), (x_next, y_next) in zip(polygon, following, strict=True))) / 2
 
 
-def _overlap(quad: np.ndarray, shape: tuple[int, int]) -> float:
+def _overlap(quad: Sequence[Sequence[float]], shape: tuple[int, int]) -> float:
     """Return the share of the image that a convex quadrangle covers (Sutherland-Hodgman clipping)."""
     polygon = quad
     height, width = shape
     for axis, sign, bound in ((0, 1, 0), (0, -1, width - 1), (1, 1, 0), (1, -1, height - 1)):
-        distance = sign * (polygon[:, axis] - bound)
-        clipped = []
-        for here, there, d_here, d_there in zip(
-            polygon, np.roll(polygon, -1, axis=0), distance, np.roll(distance, -1), strict=True
-        ):
+        distance = [sign * (point[axis] - bound) for point in polygon]
+        clipped: list[Sequence[float]] = []
+        for index, here in enumerate(polygon):
+            following = (index + 1) % len(polygon)
+            d_here, d_there = distance[index], distance[following]
             if d_here >= 0:
                 clipped.append(here)
             if (d_here >= 0) != (d_there >= 0):
-                clipped.append(here + (there - here) * (d_here / (d_here - d_there)))
+                share = d_here / (d_here - d_there)
+                clipped.append([a + (b - a) * share for a, b in zip(here, polygon[following], strict=True)])
         if len(clipped) < 3:
             return 0.0
-        polygon = np.array(clipped)
-    return _area(polygon) / _area(corners(shape))
+        polygon = clipped
+    return _area(polygon) / _area(corners(shape).tolist())

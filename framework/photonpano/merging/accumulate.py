@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from photonpano.geometry import apply, corners, inverse, rescaling, translation
-from photonpano.merging.warping import add_footprint, add_warped, run_px
+from photonpano.geometry.sampling import run_px
+from photonpano.merging.warping import add_footprint, add_warped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from photonpano.protocols import Source
     from photonpano.values import FluxImage, Homography, Response
 
-_LONG_RUN_PX = 48
+_LONG_RUN_PX = 96
 """Shorter runs of neighbours are warped faster pixel by pixel."""
 MIN_WEIGHT = 1.0
 """A pixel that was seen in less than one whole frame is unknown."""

@@ -7,23 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.compiling import compiled
+from photonpano.geometry.sampling import run_from, seen_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-_LONGEST_RUN = 256
-"""So that small numbers stay exact enough in float32."""
-
-
-def run_px(to_image: NDArray[np.float64], rows: slice, columns: slice) -> float:
-    """Return for how many pixels of a row of a part of a grid, at its worst corner, each looks one pixel further right."""
-    shortest = float(_LONGEST_RUN)
-    for x in (columns.start, columns.stop):
-        for y in (rows.start, rows.stop):
-            u, v, depth = to_image @ (x, y, 1)
-            drift = to_image[:2, 0] / depth - np.array([u, v]) * to_image[2, 0] / depth**2 - (1, 0)
-            shortest = min(shortest, 1 / max(*np.abs(drift), 1e-9))
-    return shortest
 
 
 @compiled
@@ -38,10 +25,10 @@ def add_warped(image: NDArray[np.float32], to_image: NDArray[np.float64], total:
     height, width = image.shape
     for y in range(total.shape[0]):
         row = total[y]
-        first, last = _seen(to_image, y, -1.0, width, -1.0, height, total.shape[1])
+        first, last = seen_part(to_image, y, -1.0, width, -1.0, height, total.shape[1])
         if first >= last:
             continue
-        inside, outside = _seen(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, total.shape[1])
+        inside, outside = seen_part(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, total.shape[1])
         if inside >= outside:
             inside = outside = last
         for x in range(first, inside):
@@ -68,10 +55,10 @@ def add_footprint(
     """
     height, width = shape
     for y in range(total.shape[0]):
-        first, last = _seen(to_image, y, -1.0, width, -1.0, height, total.shape[1])
+        first, last = seen_part(to_image, y, -1.0, width, -1.0, height, total.shape[1])
         if first >= last:
             continue
-        inside, outside = _seen(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, total.shape[1])
+        inside, outside = seen_part(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, total.shape[1])
         if inside >= outside:
             inside = outside = last
         else:
@@ -84,59 +71,16 @@ def add_footprint(
 
 
 @compiled
-def _seen(
-    to_image: NDArray[np.float64], y: int, left: float, right: float, top: float, bottom: float, width: int
-) -> tuple[int, int]:
-    """Return the pixels of a row, half-open, that see a rectangle of the image, border included."""
-    depth, along = to_image[2, 1] * y + to_image[2, 2], to_image[2, 0]
-    u, du = to_image[0, 1] * y + to_image[0, 2], to_image[0, 0]
-    v, dv = to_image[1, 1] * y + to_image[1, 2], to_image[1, 0]
-    low, high = 0.0, width - 1.0
-    # left <= (u + du x) / (depth + along x) and so on are linear where the depth is positive, as it is in front of the camera.
-    for at, slope in (
-        (u - left * depth, du - left * along),
-        (right * depth - u, right * along - du),
-        (v - top * depth, dv - top * along),
-        (bottom * depth - v, bottom * along - dv),
-        (depth, along),
-    ):
-        if slope > 0:
-            low = max(low, -at / slope)
-        elif slope < 0:
-            high = min(high, -at / slope)
-        elif at < 0:
-            return 0, 0
-    if not low <= high:
-        return 0, 0
-    return int(np.ceil(low)), int(np.floor(high)) + 1
-
-
-@compiled
 def _add_run(image: NDArray[np.float32], to_image: NDArray[np.float64], x: int, y: int, row: NDArray[np.float32]) -> int:
-    """Add to pixels from x on as long as each looks one pixel further right than the last; return how many they are."""
-    depth = to_image[2, 0] * x + to_image[2, 1] * y + to_image[2, 2]
-    u = (to_image[0, 0] * x + to_image[0, 1] * y + to_image[0, 2]) / depth
-    v = (to_image[1, 0] * x + to_image[1, 1] * y + to_image[1, 2]) / depth
-    along = to_image[2, 0] / depth
-    du, dv = to_image[0, 0] / depth - u * along, to_image[1, 0] / depth - v * along
+    """Add to the run of pixels from x on; return how many they are."""
     height, width = image.shape
-    left, top = min(int(u), width - 2), min(int(v), height - 2)
-    # The place t pixels further right looks at (right, down) + (t, 0), where (right, down) times its relative depth 1 + along t
-    # are polynomials of t with small numbers.
-    right, down = u - left, v - top
-    right1, right2, down1 = du - 1 + right * along, -along, dv + down * along
-    ahead = min(float(min(len(row), _LONGEST_RUN)), _positive_until(right, right1, right2))
-    ahead = min(ahead, _positive_until(1 - right, along - right1, -right2))
-    ahead = min(ahead, _positive_until(down, down1, 0.0))
-    ahead = min(ahead, _positive_until(1 - down, along - down1, 0.0))
-    size = max(1, min(int(ahead), width - 1 - left))
+    run = run_from(to_image, x, y, len(row), height, width)
     pixels = image.reshape(-1)
     # An index without a sign needs no look at whether it counts from the end.
-    above = np.uint64(top * width + left)
-    below, one = above + np.uint64(width), np.uint64(1)
-    a0, a1, a2 = np.float32(right), np.float32(right1), np.float32(right2)
-    b0, b1, slope = np.float32(down), np.float32(down1), np.float32(along)
-    for t in range(size):
+    above, one = np.uint64(run.top * width + run.left), np.uint64(1)
+    below = above + np.uint64(width)
+    a0, a1, a2, b0, b1, slope = run.a0, run.a1, run.a2, run.b0, run.b1, run.slope
+    for t in range(run.size):
         t_px = np.float32(t)
         scale = np.float32(1) / (np.float32(1) + slope * t_px)
         a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
@@ -144,20 +88,7 @@ def _add_run(image: NDArray[np.float32], to_image: NDArray[np.float64], x: int, 
         upper = pixels[i] + a * (pixels[i + one] - pixels[i])
         lower = pixels[j] + a * (pixels[j + one] - pixels[j])
         row[t] += upper + b * (lower - upper)
-    return int(size)
-
-
-@compiled
-def _positive_until(constant: float, linear: float, square: float) -> float:
-    """Return where a polynomial that is positive at 0 first becomes negative."""
-    if linear >= 0 and square >= 0:
-        return float(_LONGEST_RUN)
-    # Written so that it holds for a square of 0, too.
-    discriminant = linear * linear - 4 * square * constant
-    if discriminant < 0:
-        return float(_LONGEST_RUN)
-    below = -linear + np.sqrt(discriminant)
-    return float(2 * constant / below) if below > 0 else float(_LONGEST_RUN)
+    return run.size
 
 
 @compiled

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonpano.geometry import apply, inverse, translation
-from photonpano.merging.warping import add_footprint, add_warped, run_px
+from photonpano.geometry.sampling import run_px
+from photonpano.merging.warping import add_footprint, add_warped
 
 IMAGE = np.random.default_rng(0).random((23, 37)).astype(np.float32)
 
