@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import implausibility, inverse, normalised, rescaled, translation
+from photonpano.geometry import implausibility, rescaled, translation
 from photonpano_opencv.pyramid import pyramid_of
 from photonpano_opencv.template import ALL, Quality, Template
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 _COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
 """What moves at the coarsest level of the pyramid (translation) and at the next (affine); the others use all of p1..p8."""
-_DAMPING = 0.1
-"""Where a step leads astray, the next is shortened by this share of the template's curvature, and by more if that does too."""
 _JUDGE = 2
 """The layer of the pyramid on which images are compared at the end: coarse, so that noise is small and blur hardly counts."""
 _COARSE_TOLERANCE = 4
@@ -66,7 +64,8 @@ class DirectLocator:
             elif depth == 0 and best is None:
                 # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
                 return NotLocated(found)
-        assert best is not None
+        if best is None:
+            return NotLocated("nothing is seen by both images")
         scale, homography, quality = best
         alike = Template(moving[judge], np.eye(3)).agreement(rescaled(homography, 0.5**judge), fixed[judge])
         return self._judged(homography, quality, scale, alike)
@@ -75,25 +74,13 @@ class DirectLocator:
         self, template: Template, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], finest: bool
     ) -> NDArray[np.float64] | str:
         """Return the homography, in px of the layers, that aligns two layers, or why there is none."""
-        config = self._config
-        tolerance = config.converged_px * (1 if finest else _COARSE_TOLERANCE)
-        damping, before, least = 0.0, homography, np.inf
-        for _ in range(config.max_iterations):
-            looked = template.step(homography, fixed, free, damping)
-            if looked is None:
-                return "where the images overlap, if they do, there is no texture"
-            step, differs = looked
-            if differs > least:
-                # The last step led astray; a shorter one from the same place will not.
-                homography, least, damping = before, np.inf, max(_DAMPING, 4 * damping)
-                continue
-            before, least, damping = homography, differs, damping / 2
-            homography = normalised(homography @ inverse(step))
-            if reason := implausibility(homography, fixed.image.shape, config.min_overlap):
-                return f"the alignment diverges: {reason}"
-            if template.settled(step, tolerance):
-                return homography
-        return f"the alignment has not settled after {config.max_iterations} steps"
+        tolerance_px = self._config.converged_px * (1 if finest else _COARSE_TOLERANCE)
+        found = template.aligned(homography, fixed, free, tolerance_px, self._config.max_iterations)
+        if isinstance(found, str):
+            return found
+        if reason := implausibility(found, fixed.image.shape, self._config.min_overlap):
+            return f"the alignment diverges: {reason}"
+        return found
 
     def _judged(self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float) -> Located | NotLocated:
         """Say what is to be said of an alignment, whose quality is that of a layer of this scale."""

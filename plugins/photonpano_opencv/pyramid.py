@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from photonpano_opencv.moments import differentiate
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -29,11 +31,13 @@ class Layer:
         weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
         blur_px: standard deviation of the Gaussian that leaves as much of white noise as the blur and the halving did, in px
             of the layer.
+        gradients: (2, H, W) float32, the derivatives of the image along x and y.
     """
 
     image: NDArray[np.float32]
     weight: NDArray[np.float32]
     blur_px: float
+    gradients: NDArray[np.float32]
 
 
 def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[Layer, ...]:
@@ -61,10 +65,17 @@ def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[
     seen = (cv2.erode(bridged, square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0) & (blurred_variance > 0)
     image = np.divide(image, norm, out=np.zeros_like(image), where=norm > 0)
     weight = np.divide(norm, blurred_variance, out=np.zeros_like(norm), where=seen)
-    layers = [Layer(image, weight, _equivalent_blur_px(blur_px, 1))]
+    layers = [layer_of(image, weight, _equivalent_blur_px(blur_px, 1))]
     while len(layers) < levels and min(layers[-1].image.shape) >= 2 * _SMALLEST_SIDE:
         layers.append(_halved(layers[-1], _equivalent_blur_px(blur_px, 2 ** len(layers))))
     return tuple(layers)
+
+
+def layer_of(image: NDArray[np.float32], weight: NDArray[np.float32], blur_px: float) -> Layer:
+    """Return a layer with its derivatives."""
+    gradients = np.empty((2, *image.shape), np.float32)
+    differentiate(np.ascontiguousarray(image), gradients)
+    return Layer(np.ascontiguousarray(image), np.ascontiguousarray(weight), blur_px, gradients)
 
 
 def _equivalent_blur_px(blur_px: float, factor: int) -> float:
@@ -85,4 +96,4 @@ def _halved(layer: Layer, blur_px: float) -> Layer:
     image = np.asarray(cv2.resize(layer.image[:height, :width], size, interpolation=cv2.INTER_AREA), dtype=np.float32)
     weight = cv2.resize(layer.weight[:height, :width], size, interpolation=cv2.INTER_AREA)
     whole = cv2.resize((layer.weight[:height, :width] > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return Layer(image, np.where(whole == 1, 4 * weight, np.float32(0)), blur_px)
+    return layer_of(image, np.where(whole == 1, 4 * weight, np.float32(0)), blur_px)

@@ -1,0 +1,285 @@
+"""Inverse-compositional Gauss-Newton steps on homographies (Baker and Matthews 2004), from moments of two images.
+
+A parameter changes a pixel by its derivative times a polynomial of its place of degree two at most. So sums over all pixels are
+moments of a few products, and no image for each parameter is ever made. Parameters are those of coordinates that run from -1 to
+1 along the longer side.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.compiling import compiled
+from photonpano_opencv.moments import differentiate, look, products
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SETTLED, LOST, UNSETTLED = 0, 1, 2
+"""How a descent ends: at a minimum, where the images have nothing in common, or not at all."""
+_BOLDEST = 5.0
+"""The curvature common to both images is taken to be at least so many times what noise alone leaves in common by chance, which
+is the template's over the root of the number of independent pixels; so steps stay bounded."""
+_DAMPING = 0.1
+"""Where a step leads astray, the next is shortened by this share of the template's curvature, and by more if that does too."""
+_NEGLIGIBLE = 0.02
+"""Steps of this share of what photons leave open do not count: where they tell little, steps stay small for long."""
+_RENEWED_PX = 0.25
+"""The curvature is taken anew until steps are smaller than this."""
+
+
+def _polynomials(terms: dict[int, tuple[tuple[float, int, int], ...]]) -> NDArray[np.float64]:
+    """Return the coefficients of x^i y^j for each parameter: (8, 3, 3)."""
+    coefficients = np.zeros((8, 3, 3))
+    for parameter, polynomial in terms.items():
+        for factor, i, j in polynomial:
+            coefficients[parameter, i, j] = factor
+    return coefficients
+
+
+# A small change of p1..p8 moves (x, y) by (p1 x + p3 y + p5 - p7 x^2 - p8 x y, p2 x + p4 y + p6 - p7 x y - p8 y^2).
+_X = _polynomials({0: ((1, 1, 0),), 2: ((1, 0, 1),), 4: ((1, 0, 0),), 6: ((-1, 2, 0),), 7: ((-1, 1, 1),)})
+_Y = _polynomials({1: ((1, 1, 0),), 3: ((1, 0, 1),), 5: ((1, 0, 0),), 6: ((-1, 1, 1),), 7: ((-1, 0, 2),)})
+
+
+def _products() -> NDArray[np.float64]:
+    """Return the coefficients of the sums of `products` in the product of two parameters: (64, 75)."""
+
+    def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+        result = np.zeros((8, 8, 5, 5))
+        for i in range(3):
+            for j in range(3):
+                result[:, :, i : i + 3, j : j + 3] += first[:, None, i, j, None, None] * second[None]
+        return result
+
+    along = product(_X, _X), product(_X, _Y) + product(_Y, _X), product(_Y, _Y)
+    return np.stack(along, axis=2).reshape(64, 75)
+
+
+_ALONG_X, _ALONG_Y, _PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _products()
+
+
+@compiled
+def descend(
+    image: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    blur_px: float,
+    fixed: NDArray[np.float32],
+    fixed_weight: NDArray[np.float32],
+    homography: NDArray[np.float64],
+    start: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    free: NDArray[np.int64],
+    to_corners: NDArray[np.float64],
+    tolerance_px: float,
+    max_steps: int,
+    residual: NDArray[np.float32],
+    combined: NDArray[np.float32],
+    changes: NDArray[np.float32],
+) -> tuple[int, NDArray[np.float64]]:
+    """Align a template to an image.
+
+    Args:
+        image: (H, W) the template.
+        weight: (H, W) inverse variance of its pixels, 0 where nothing was seen.
+        gradients: (2, H, W) its derivatives along x and y.
+        blur_px: standard deviation of the Gaussian that leaves as much of white noise as is left in it.
+        fixed: (H, W) the other image.
+        fixed_weight: (H, W) inverse variance of its pixels.
+        homography: (3, 3) where to begin, pixels of the template to pixels of the fixed image.
+        start: (3, 3) what is thought of the homography before the photons are asked.
+        prior: (8, 8) inverse covariance of that thought.
+        free: which of the eight parameters may change.
+        to_corners: (8, len(free)) how they move the corners of the template, in px.
+        tolerance_px: steps that move no corner further than that, or by what does not count, are the last.
+        max_steps: how many there are at most.
+        residual: (H, W) memory for the differences.
+        combined: (H, W) memory for their inverse variances.
+        changes: (2, H, W) memory for derivatives.
+
+    Returns:
+        How it ended, and the homography there.
+    """
+    height, width = image.shape
+    half = max(height, width) / 2
+    unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0.0, 0, 1]])
+    from_unit = np.linalg.inv(unit)
+    to_start = unit @ np.linalg.inv(start)
+    along_x, along_y = np.empty((3, 3)), np.empty((3, 3))
+    own, hessian = np.zeros((8, 8)), np.zeros((8, 8))
+    n_free = len(free)
+    normal, towards = np.empty((n_free, n_free)), np.empty(n_free)
+    std_px, known = 0.0, False
+    damping, before, least = 0.0, homography, np.inf
+    for _ in range(max_steps):
+        pixels, squares, _ = look(
+            image, weight, gradients, fixed, fixed_weight, homography, residual, combined, along_x, along_y
+        )
+        if pixels == 0:
+            return LOST, homography
+        if not known:
+            least_share = min(0.5, _BOLDEST * by_chance(pixels, blur_px))
+            own, hessian = curvatures(gradients, residual, combined, changes, 0.0, least_share)
+            hessian += prior
+            std_px, known = _expected_px(hessian, free, to_corners), True
+        at = to_start @ homography @ from_unit
+        at /= at[2, 2]
+        moved = np.array([at[0, 0] - 1, at[1, 0], at[0, 1], at[1, 1] - 1, at[0, 2], at[1, 2], at[2, 0], at[2, 1]])
+        gradient = half * (_ALONG_X @ along_x.reshape(-1) + _ALONG_Y @ along_y.reshape(-1)) + prior @ moved
+        differs = (squares + moved @ prior @ moved) / pixels
+        for i in range(n_free):
+            towards[i] = gradient[free[i]]
+            for j in range(n_free):
+                normal[i, j] = hessian[free[i], free[j]] + damping * own[free[i], free[j]]
+        if not _solve(normal, towards):
+            return LOST, homography
+        p = np.zeros(8)
+        for i in range(n_free):
+            p[free[i]] = towards[i]
+        step = from_unit @ np.array([[1 + p[0], p[2], p[4]], [p[1], 1 + p[3], p[5]], [p[6], p[7], 1]]) @ unit
+        size_px = _size_px(step, height, width)
+        if size_px > _RENEWED_PX:
+            known = False
+        if differs > least:
+            # The last step led astray; a shorter one from the same place will not.
+            homography, least, damping = before, np.inf, max(_DAMPING, 4 * damping)
+            continue
+        before, least, damping = homography, differs, damping / 2
+        homography = homography @ np.linalg.inv(step)
+        homography /= homography[2, 2]
+        if not (size_px < max(height, width)):  # nor if it is not a number
+            return LOST, homography
+        if size_px < max(tolerance_px, _NEGLIGIBLE * std_px):
+            return SETTLED, homography
+    return UNSETTLED, homography
+
+
+@compiled
+def by_chance(pixels: int, blur_px: float) -> float:
+    """Return the curvature that the noise of two images has in common by chance, as a share of that of one of them."""
+    return float(1 / np.sqrt(pixels / max(1.0, 4 * np.pi * blur_px**2)))
+
+
+@compiled
+def curvatures(
+    gradients: NDArray[np.float32],
+    residual: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    changes: NDArray[np.float32],
+    chance: float,
+    least: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the (8, 8) curvature of the template, and that which both images have in common: that of the scene.
+
+    The noise of the template has derivatives too, and in the dark larger ones than the scene. With those of the other image it
+    has nothing in common.
+
+    Args:
+        gradients: (2, H, W) derivatives of the template.
+        residual: (H, W) the fixed image seen from the template minus the template.
+        weight: (H, W) inverse variance of a pixel of the residual.
+        changes: (2, H, W) memory for derivatives.
+        chance: the share of the template's curvature that noise may have in common, which is taken off.
+        least: what is left of a direction in which there is nothing in common, as a share of the template's curvature.
+    """
+    own = quadratic(gradients, gradients, weight)
+    differentiate(residual, changes)
+    difference = quadratic(gradients, changes, weight)
+    # In units in which the template's is the identity, so that no parameter drowns another.
+    root = np.zeros((8, 8))
+    if not _cholesky(own, root):
+        return own, own.copy()
+    whitening = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(np.eye(8) + whitening @ difference @ whitening.T)
+    scaled = np.empty((8, 8))
+    for i in range(8):
+        for j in range(8):
+            scaled[i, j] = vectors[i, j] * np.sqrt(max(values[j] - chance, least))
+    half = root @ scaled
+    return own, half @ half.T
+
+
+@compiled
+def quadratic(first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the (8, 8) weighted sums over pixels of what two parameters do to them, from (2, H, W) derivatives."""
+    sums = np.empty((3, 5, 5))
+    products(first, second, weight, sums)
+    height, width = weight.shape
+    found: NDArray[np.float64] = (_PRODUCTS @ sums.reshape(-1)).reshape(8, 8) * (max(height, width) / 2) ** 2
+    return found
+
+
+@compiled
+def _expected_px(hessian: NDArray[np.float64], free: NDArray[np.int64], to_corners: NDArray[np.float64]) -> float:
+    """Return the expected distance of a corner from where it should be, if noise were white; 0 if nothing is told."""
+    n_free = len(free)
+    normal, root = np.empty((n_free, n_free)), np.zeros((n_free, n_free))
+    for i in range(n_free):
+        for j in range(n_free):
+            normal[i, j] = hessian[free[i], free[j]]
+    if not _cholesky(normal, root):
+        return 0.0
+    # The trace of J (R R^T)^-1 J^T is the sum of the squares of R^-1 J^T.
+    total = 0.0
+    for row in range(8):
+        solved = np.zeros(n_free)
+        for i in range(n_free):
+            left = to_corners[row, i]
+            for k in range(i):
+                left -= root[i, k] * solved[k]
+            solved[i] = left / root[i, i]
+            total += solved[i] * solved[i]
+    return float(np.sqrt(total / 4))
+
+
+@compiled
+def _size_px(step: NDArray[np.float64], height: int, width: int) -> float:
+    """Return how far a step moves the corners of an image at most."""
+    largest = 0.0
+    for x in (0.0, width - 1.0):
+        for y in (0.0, height - 1.0):
+            depth = step[2, 0] * x + step[2, 1] * y + step[2, 2]
+            u = (step[0, 0] * x + step[0, 1] * y + step[0, 2]) / depth - x
+            v = (step[1, 0] * x + step[1, 1] * y + step[1, 2]) / depth - y
+            moved = np.sqrt(u * u + v * v) if depth > 0 else np.inf
+            if not moved <= largest:
+                largest = moved
+    return largest
+
+
+@compiled
+def _cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> bool:
+    """Write the lower root of a matrix into zeros; tell whether it is positive definite."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            left = matrix[i, j]
+            for k in range(j):
+                left -= root[i, k] * root[j, k]
+            if i > j:
+                root[i, j] = left / root[j, j]
+            elif left > 0:
+                root[i, i] = np.sqrt(left)
+            else:
+                return False
+    return True
+
+
+@compiled
+def _solve(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
+    """Replace the right side of linear equations by their solution; tell whether the matrix is positive definite."""
+    n = len(right)
+    root = np.zeros((n, n))
+    if not _cholesky(matrix, root):
+        return False
+    for i in range(n):
+        for k in range(i):
+            right[i] -= root[i, k] * right[k]
+        right[i] /= root[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            right[i] -= root[k, i] * right[k]
+        right[i] /= root[i, i]
+    return True
