@@ -108,6 +108,7 @@ def evaluate(
     from photonpano.evaluation import evaluate as evaluate_folder
     from photonpano.pipeline.panorama import render
     from photonpano.pipeline.progress import Quiet
+    from photonpano.pipeline.threads import thread_count
 
     if not oracle:
         return evaluate_folder(run_folder, truth)
@@ -115,7 +116,8 @@ def evaluate(
     with open_source(plan) as source:
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
-            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, progress or Quiet())
+            threads = thread_count(plan.run)
+            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, threads, progress or Quiet())
 
         return evaluate_folder(run_folder, truth, along_truth)
 

@@ -79,7 +79,7 @@ def descend(
     residual: NDArray[np.float32],
     combined: NDArray[np.float32],
     changes: NDArray[np.float32],
-) -> tuple[int, NDArray[np.float64]]:
+) -> tuple[int, NDArray[np.float64], int, float, float]:
     """Align a template to an image.
 
     Args:
@@ -96,12 +96,12 @@ def descend(
         to_corners: (8, len(free)) how they move the corners of the template, in px.
         tolerance_px: steps that move no corner further than that, or by what does not count, are the last.
         max_steps: how many there are at most.
-        residual: (H, W) memory for the differences.
-        combined: (H, W) memory for their inverse variances.
+        residual: (H, W), becomes the difference where the last step began.
+        combined: (H, W), becomes its inverse variance.
         changes: (2, H, W) memory for derivatives.
 
     Returns:
-        How it ended, and the homography there.
+        How it ended, the homography there, and what `look` told where the last step began.
     """
     height, width = image.shape
     half = max(height, width) / 2
@@ -114,12 +114,13 @@ def descend(
     normal, towards = np.empty((n_free, n_free)), np.empty(n_free)
     std_px, known = 0.0, False
     damping, before, least = 0.0, homography, np.inf
+    pixels, squares, weights = 0, 0.0, 0.0
     for _ in range(max_steps):
-        pixels, squares, _ = look(
+        pixels, squares, weights = look(
             image, weight, gradients, fixed, fixed_weight, homography, residual, combined, along_x, along_y
         )
         if pixels == 0:
-            return LOST, homography
+            return LOST, homography, pixels, squares, weights
         if not known:
             least_share = min(0.5, _BOLDEST * by_chance(pixels, blur_px))
             own, hessian = curvatures(gradients, residual, combined, changes, 0.0, least_share)
@@ -135,7 +136,7 @@ def descend(
             for j in range(n_free):
                 normal[i, j] = hessian[free[i], free[j]] + damping * own[free[i], free[j]]
         if not _solve(normal, towards):
-            return LOST, homography
+            return LOST, homography, pixels, squares, weights
         p = np.zeros(8)
         for i in range(n_free):
             p[free[i]] = towards[i]
@@ -151,10 +152,10 @@ def descend(
         homography = homography @ np.linalg.inv(step)
         homography /= homography[2, 2]
         if not (size_px < max(height, width)):  # nor if it is not a number
-            return LOST, homography
+            return LOST, homography, pixels, squares, weights
         if size_px < max(tolerance_px, _NEGLIGIBLE * std_px):
-            return SETTLED, homography
-    return UNSETTLED, homography
+            return SETTLED, homography, pixels, squares, weights
+    return UNSETTLED, homography, pixels, squares, weights
 
 
 @compiled

@@ -10,19 +10,24 @@ import numpy as np
 from photonpano import Located, NotLocated
 from photonpano.geometry import implausibility, rescaled, translation
 from photonpano_opencv.pyramid import pyramid_of
-from photonpano_opencv.template import ALL, Quality, Template
+from photonpano_opencv.template import ALL, Aligned, Template
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from photonpano import VirtualExposure
     from photonpano_opencv.configs import DirectConfig
     from photonpano_opencv.pyramid import Layer
+    from photonpano_opencv.template import Quality
 
 _COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
 """What moves at the coarsest level of the pyramid (translation) and at the next (affine); the others use all of p1..p8."""
 _JUDGE = 2
 """The layer of the pyramid on which images are compared at the end: coarse, so that noise is small and blur hardly counts."""
+_EXACT_PX = 0.1
+"""A layer that tells corners to this is good enough."""
 _COARSE_TOLERANCE = 4
 """The coarser levels of the pyramid only start the finest, and may stop this much earlier."""
 
@@ -49,38 +54,27 @@ class DirectLocator:
         if not (moving[-1].weight.any() and fixed[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
         start = homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
-        best: tuple[float, NDArray[np.float64], Quality] | None = None
+        found: list[tuple[float, Template, Aligned]] = []
         judge = min(_JUDGE, len(moving) - 1)
         for depth in reversed(range(len(moving))):
             free, scale = _model(depth, len(moving)), 0.5**depth
             template = Template(moving[depth], rescaled(start, scale))
-            found = self._aligned(template, rescaled(homography, scale), fixed[depth], free, depth == 0)
-            if not isinstance(found, str):
-                homography = rescaled(found, 1 / scale)
-                quality = template.quality(found, fixed[depth]) if free == ALL else None
-                # Photons blurred by motion say nothing about details, whose noise a coarse layer averages out.
-                if quality is not None and (best is None or quality.std_px / scale < best[2].std_px / best[0]):
-                    best = scale, homography, quality
-            elif depth == 0 and best is None:
+            tolerance_px = self._config.converged_px * (1 if depth == 0 else _COARSE_TOLERANCE)
+            aligned = template.aligned(
+                rescaled(homography, scale), fixed[depth], free, tolerance_px, self._config.max_iterations
+            )
+            if isinstance(aligned, Aligned):
+                homography = rescaled(aligned.homography, 1 / scale)
+                if free == ALL:
+                    found.append((scale, template, aligned))
+            elif depth == 0 and not found:
                 # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
-                return NotLocated(found)
-        if best is None:
-            return NotLocated("nothing is seen by both images")
-        scale, homography, quality = best
+                return NotLocated(aligned)
+        if reason := implausibility(homography, fixed[0].image.shape, self._config.min_overlap):
+            return NotLocated(f"the alignment diverges: {reason}")
+        scale, homography, quality = _best(found)
         alike = Template(moving[judge], np.eye(3)).agreement(rescaled(homography, 0.5**judge), fixed[judge])
         return self._judged(homography, quality, scale, alike)
-
-    def _aligned(
-        self, template: Template, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], finest: bool
-    ) -> NDArray[np.float64] | str:
-        """Return the homography, in px of the layers, that aligns two layers, or why there is none."""
-        tolerance_px = self._config.converged_px * (1 if finest else _COARSE_TOLERANCE)
-        found = template.aligned(homography, fixed, free, tolerance_px, self._config.max_iterations)
-        if isinstance(found, str):
-            return found
-        if reason := implausibility(found, fixed.image.shape, self._config.min_overlap):
-            return f"the alignment diverges: {reason}"
-        return found
 
     def _judged(self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float) -> Located | NotLocated:
         """Say what is to be said of an alignment, whose quality is that of a layer of this scale."""
@@ -108,6 +102,26 @@ class DirectLocator:
             units = np.array([1, 1, 1, 1, scale, scale, 1 / scale, 1 / scale])
             return Located(homography, quality.information * np.outer(units, units), std_px, evidence)
         return NotLocated(reason, evidence)
+
+
+def _best(found: Sequence[tuple[float, Template, Aligned]]) -> tuple[float, NDArray[np.float64], Quality]:
+    """Return the scale, the homography in px of the finest layer, and the quality of the layer that tells most.
+
+    Photons blurred by motion say nothing about details, whose noise a coarse layer averages out. Where the finest layer tells
+    enough, coarser ones are not asked.
+
+    Args:
+        found: scales, templates and where they lie, coarsest first.
+    """
+    best: tuple[float, NDArray[np.float64], Quality] | None = None
+    for scale, template, aligned in reversed(found):
+        quality = template.quality(aligned)
+        if best is None or quality.std_px / scale < best[2].std_px / best[0]:
+            best = scale, rescaled(aligned.homography, 1 / scale), quality
+        if best[2].std_px / best[0] < _EXACT_PX:
+            break
+    assert best is not None
+    return best
 
 
 def _model(depth: int, layers: int) -> tuple[int, ...]:

@@ -43,18 +43,18 @@ def look(
         along_y: (3, 3), the same for the derivative along y.
 
     Returns:
-        The number of pixels that both see, the weighted sum of the squares of their residuals, and the sum of their variances.
+        The number of pixels that both see, the weighted sum of the squares of their residuals, and the sum of the weights.
     """
     height, width = image.shape
     half = max(height, width) / 2
     along_x[:] = 0
     along_y[:] = 0
-    seen, squares, variances = 0.0, 0.0, 0.0
-    zero, one, tiny, step = np.float32(0), np.float32(1), np.float32(1e-20), np.float32(1 / half)
+    seen, squares, weights = 0.0, 0.0, 0.0
+    zero, one, step = np.float32(0), np.float32(1), np.float32(1 / half)
     for y in range(height):
         _compare(image[y], weight[y], fixed, fixed_weight, homography, y, residual[y], combined[y])
         different, weighted, gx, gy = residual[y], combined[y], gradients[0][y], gradients[1][y]
-        x0, x1, x2, y0, y1, square, count, variance = zero, zero, zero, zero, zero, zero, zero, zero
+        x0, x1, x2, y0, y1, square, count, total = zero, zero, zero, zero, zero, zero, zero, zero
         start = np.float32(-(width - 1) / 2 / half)
         for t in range(width):
             x, r, w = start + step * np.float32(t), different[t], weighted[t]
@@ -67,10 +67,10 @@ def look(
             y1 += by_y * x
             square += wr * r
             count += one if w > zero else zero
-            variance += one / max(w, tiny) if w > zero else zero
+            total += w
         squares += float(square)
         seen += float(count)
-        variances += float(variance)
+        weights += float(total)
         y_unit = (y - (height - 1) / 2) / half
         power = 1.0
         for j in range(3):
@@ -81,7 +81,7 @@ def look(
             along_y[0, j] += y0 * power
             along_y[1, j] += y1 * power
             power *= y_unit
-    return int(seen), squares, variances
+    return int(seen), squares, weights
 
 
 @compiled

@@ -13,7 +13,6 @@ import numpy as np
 from photonpano.geometry import corners, generators, jacobian, slopes
 from photonpano.photometry import noise_free_correlation
 from photonpano_opencv.descent import LOST, SETTLED, by_chance, curvatures, descend, quadratic
-from photonpano_opencv.moments import look
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,6 +32,23 @@ between two exposures shifts the image by any amount, but rolls by a degree or t
 _PRIOR = np.diag(_PRIOR_STD**-2.0)
 _SURROUNDINGS_PX = 4.0
 """What counts as the surroundings of a pixel, as the standard deviation of a Gaussian in px of the layer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """Where a template lies.
+
+    Attributes:
+        homography: (3, 3), pixels of the template to pixels of the fixed layer.
+        pixels: how many pixels both see.
+        squares: weighted sum of the squares of their differences.
+        weights: sum of their weights, the inverse variances of the differences.
+    """
+
+    homography: NDArray[np.float64]
+    pixels: int
+    squares: float
+    weights: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +107,7 @@ class Template:
 
     def aligned(
         self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], tolerance_px: float, max_steps: int
-    ) -> NDArray[np.float64] | str:
+    ) -> Aligned | str:
         """Return the homography that aligns the template to another layer, or why there is none.
 
         Args:
@@ -102,7 +118,7 @@ class Template:
             max_steps: how many there are at most.
         """
         layer, buffers = self._layer, self._buffers
-        ended, homography = descend(
+        ended, homography, pixels, squares, weights = descend(
             layer.image,
             layer.weight,
             layer.gradients,
@@ -121,46 +137,37 @@ class Template:
             buffers.gradients,
         )
         if ended == SETTLED:
-            return homography
+            return Aligned(homography, pixels, squares, weights)
         if ended == LOST:
             return "where the images overlap, if they do, there is no texture"
         return f"the alignment has not settled after {max_steps} steps"
 
-    def quality(self, homography: NDArray[np.float64], fixed: Layer) -> Quality | None:
-        """Return how well the images agree, and what their photons tell about p1..p8 of `homography`; None without overlap."""
+    def quality(self, aligned: Aligned) -> Quality:
+        """Return how well the images agree, and what their photons tell about p1..p8 of the homography.
+
+        The template must not have been aligned to anything else in between, nor another of its shape in this thread.
+        """
         layer, buffers = self._layer, self._buffers
-        weight, gradients, sums = buffers.weight, buffers.gradients, (np.empty((3, 3)), np.empty((3, 3)))
-        pixels, squares, variances = look(
-            layer.image,
-            layer.weight,
-            layer.gradients,
-            fixed.image,
-            fixed.weight,
-            homography,
-            buffers.residual,
-            weight,
-            *sums,
-        )
-        if not pixels:
-            return None
+        weight, gradients = buffers.weight, buffers.gradients
         # White noise, and what the blur leaves of it in a pixel.
-        noise_ratio = squares / pixels * 4 * np.pi * layer.blur_px**2
-        chance = _BY_CHANCE * by_chance(pixels, layer.blur_px)
+        noise_ratio = aligned.squares / aligned.pixels * 4 * np.pi * layer.blur_px**2
+        chance = _BY_CHANCE * by_chance(aligned.pixels, layer.blur_px)
         _, hessian = curvatures(layer.gradients, buffers.residual, weight, gradients, chance, _UNKNOWN)
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
         for axis in (0, 1):
             np.multiply(weight, layer.gradients[axis], out=buffers.residual)
             cv2.GaussianBlur(buffers.residual, (0, 0), layer.blur_px, dst=gradients[axis])
-        scatter = quadratic(gradients, gradients, np.ones_like(weight)) * variances / pixels
+        buffers.residual.fill(aligned.pixels / aligned.weights)
+        scatter = quadratic(gradients, gradients, buffers.residual)
         information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio) + _PRIOR
-        in_parameters = self._in_parameters(homography, information)
-        to_corners = jacobian(homography, corners(self._shape)).reshape(8, 8)
+        in_parameters = self._in_parameters(aligned.homography, information)
+        to_corners = jacobian(aligned.homography, corners(self._shape)).reshape(8, 8)
         return Quality(
             information=in_parameters,
             std_px=float(np.sqrt(np.trace(to_corners @ np.linalg.inv(in_parameters) @ to_corners.T) / 4)),
             noise_ratio=noise_ratio,
-            overlap=pixels / layer.image.size,
+            overlap=aligned.pixels / layer.image.size,
         )
 
     def agreement(self, homography: NDArray[np.float64], fixed: Layer) -> float:

@@ -7,6 +7,7 @@ Convention:
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +26,7 @@ def normalised(matrices: ArrayLike) -> Homography:
     """
     matrices = np.asarray(matrices, dtype=np.float64)
     h33 = matrices[..., 2, 2]
-    if not (np.all(np.isfinite(matrices)) and np.all(h33)):
+    if not (np.isfinite(matrices).all() and h33.all()):
         raise ValueError("a homography must be finite and have h33 other than 0")
     return np.asarray(matrices / h33[..., None, None])
 
@@ -40,14 +41,19 @@ def translation(x: float, y: float) -> Homography:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
+@cache
 def rescaling(scale: float) -> Homography:
     """Return the map from pixels of an image to pixels of the same image rescaled: `(p + 0.5) * scale - 0.5`."""
     offset = 0.5 * scale - 0.5
-    return np.array([[scale, 0.0, offset], [0.0, scale, offset], [0.0, 0.0, 1.0]])
+    matrix = np.array([[scale, 0.0, offset], [0.0, scale, offset], [0.0, 0.0, 1.0]])
+    matrix.flags.writeable = False
+    return matrix
 
 
 def rescaled(homographies: Homography, scale: float) -> Homography:
     """Return the same motions between images that are both rescaled by `scale`."""
+    if scale == 1:
+        return normalised(homographies)
     return normalised(rescaling(scale) @ homographies @ rescaling(1 / scale))
 
 
@@ -89,10 +95,13 @@ def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
     )
 
 
+@cache
 def corners(shape: tuple[int, int]) -> FloatArray:
     """Return the centres of the corner pixels of a (height, width) image, clockwise from the top left: (4, 2)."""
     height, width = shape
-    return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+    points = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+    points.flags.writeable = False
+    return points
 
 
 def corner_displacements(first: Homography, second: Homography, shape: tuple[int, int]) -> FloatArray:

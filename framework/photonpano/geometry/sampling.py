@@ -37,17 +37,6 @@ class Run(NamedTuple):
     slope: np.float32
 
 
-def run_px(to_image: NDArray[np.float64], rows: slice, columns: slice) -> float:
-    """Return for how many pixels of a row of a part of a grid, at its worst corner, each looks one pixel further right."""
-    shortest = float(LONGEST_RUN)
-    for x in (columns.start, columns.stop):
-        for y in (rows.start, rows.stop):
-            u, v, depth = to_image @ (x, y, 1)
-            drift = to_image[:2, 0] / depth - np.array([u, v]) * to_image[2, 0] / depth**2 - (1, 0)
-            shortest = min(shortest, 1 / max(*np.abs(drift), 1e-9))
-    return shortest
-
-
 @compiled
 def seen_part(
     to_image: NDArray[np.float64], y: int, left: float, right: float, top: float, bottom: float, width: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,20 +13,26 @@ if TYPE_CHECKING:
     from photonpano.values import FloatArray, Homography
 
 
+@cache
 def unit_coordinates(shape: tuple[int, int]) -> Homography:
     """Return the map from pixels of a (height, width) image to coordinates with -1 and 1 at the ends of its longer side."""
     height, width = shape
     half = max(height, width) / 2
-    return np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+    unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+    unit.flags.writeable = False
+    return unit
 
 
+@cache
 def generators(shape: tuple[int, int]) -> FloatArray:
     """Return what small changes of p1..p8 in unit coordinates are in pixels: (8, 3, 3).
 
     To first order the change by p is the homography I + p1 G1 + ... + p8 G8 of pixels.
     """
     unit = unit_coordinates(shape)
-    return np.asarray(np.linalg.inv(unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ unit)
+    changes = np.asarray(np.linalg.inv(unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ unit)
+    changes.flags.writeable = False
+    return changes
 
 
 def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:

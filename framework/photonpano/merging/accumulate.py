@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from photonpano.geometry import apply, corners, inverse, rescaling, translation
-from photonpano.geometry.sampling import run_px
+from photonpano.geometry import translation
+from photonpano.merging.landing import landings
 from photonpano.merging.warping import add_footprint, add_warped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Sequence
+    from concurrent.futures import Executor
 
     from photonpano.merging.chunks import Chunk
+    from photonpano.merging.landing import Landing
     from photonpano.protocols import Source
-    from photonpano.values import FluxImage, Homography, Response
+    from photonpano.values import Counts, FluxImage, Homography, Response
 
-_LONG_RUN_PX = 96
-"""Shorter runs of neighbours are warped faster pixel by pixel."""
+_BATCH = 16
+"""So many chunks are summed before they are added to the grid."""
 MIN_WEIGHT = 1.0
 """A pixel that was seen in less than one whole frame is unknown."""
 
@@ -53,10 +57,12 @@ class PhotonSum:
 
 def accumulate(
     source: Source,
-    chunks: Iterable[Chunk],
+    chunks: Sequence[Chunk],
     onto: Homography,
     shape: tuple[int, int],
     advance: Callable[[int], None] | None = None,
+    pool: Executor | None = None,
+    threads: int = 1,
 ) -> PhotonSum:
     """Sum the frames of chunks on a grid, each chunk warped once.
 
@@ -69,72 +75,114 @@ def accumulate(
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
-        advance: is told the number of frames after each chunk.
+        advance: is told the number of frames after every few chunks.
+        pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
+        threads: how many.
     """
-    counts = np.zeros(shape, dtype=np.float32)
-    weight = np.zeros(shape, dtype=np.float32)
-    steps = np.zeros((shape[0], shape[1] + 1), dtype=np.float32)
+    total = _Total.zeros(shape)
+    parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], threads)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
-    frame = np.empty(source.info.frame_shape, dtype=np.float32)
-    for chunk in chunks:
-        frame[...] = source.counts(chunk.span)
-        if masked is not None:
-            frame *= masked
-        summed = frame
-        to_grid = onto @ chunk.homography
-        shrink = _shrink_factor(to_grid, summed.shape)
-        n_frames = float(len(chunk.span))
-        if shrink > 1:
-            seen = np.ones_like(summed) if masked is None else masked
-            summed, seen = _shrunk(summed, shrink), _shrunk(seen, shrink)
-            to_grid = to_grid @ rescaling(shrink)
-            _add(seen * np.float32(n_frames), to_grid, weight)
-        elif masked is not None:
-            _add(masked * np.float32(n_frames), to_grid, weight)
-        else:
-            add_footprint(summed.shape, inverse(to_grid), n_frames, steps, weight)
-        _add(summed, to_grid, counts)
+    placed = landings(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
+    spread = pool.map if pool else map
+    for first in range(0, len(chunks), _BATCH):
+        batch, where = chunks[first : first + _BATCH], placed[first : first + _BATCH]
+        summed = list(spread(partial(_summed, source, masked), batch, where))
+        list(spread(partial(_Total.add, summed=summed), parts))
         if advance is not None:
-            advance(len(chunk.span))
-    weight += np.cumsum(steps, axis=1, dtype=np.float64)[:, :-1].astype(np.float32)
-    return PhotonSum(counts, weight)
+            advance(sum(len(chunk.span) for chunk in batch))
+    return total.result()
 
 
-def _add(image: FluxImage, to_grid: Homography, total: FluxImage) -> None:
-    """Add an image to a grid, interpolated linearly."""
-    box = _bounding_box(to_grid, image.shape, total.shape)
-    if box is None:
-        return
-    rows, columns = box
-    to_image = inverse(to_grid)
-    if run_px(to_image, rows, columns) >= _LONG_RUN_PX:
-        add_warped(np.ascontiguousarray(image), to_image, total)
-        return
-    # The inverse is taken here, in float64, because OpenCV would normalise it in its own way.
-    flags, size = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, (columns.stop - columns.start, rows.stop - rows.start)
-    to_image = to_image @ translation(columns.start, rows.start)
-    total[box] += cv2.warpPerspective(image, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Summed:
+    """The sum of the frames of a chunk, and where it goes.
+
+    Attributes:
+        landing: how it is brought onto the grid.
+        n_frames: how many frames it is made of.
+        counts: (h, w) float32 or uint32.
+        seen: (h, w) float32, in how many frames each pixel was seen; None if in all.
+    """
+
+    landing: Landing
+    n_frames: int
+    counts: FluxImage | Counts
+    seen: FluxImage | None
 
 
-def _bounding_box(to_grid: Homography, frame: tuple[int, int], grid: tuple[int, int]) -> tuple[slice, slice] | None:
-    """Return the rows and columns of the grid that a frame can touch; None if it lies outside."""
-    points = apply(to_grid, corners(frame))
-    low = np.maximum(np.floor(points.min(axis=0)) - 1, 0).astype(int)
-    high = np.minimum(np.ceil(points.max(axis=0)) + 2, (grid[1], grid[0])).astype(int)
-    if np.any(high <= low):
-        return None
-    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+def _summed(source: Source, masked: FluxImage | None, chunk: Chunk, landing: Landing) -> _Summed:
+    n_frames, shrink = len(chunk.span), landing.shrink
+    counts: FluxImage | Counts = np.ascontiguousarray(source.counts(chunk.span))
+    if masked is None and shrink == 1:
+        return _Summed(landing, n_frames, counts, None)
+    seen = np.full(counts.shape, n_frames, np.float32) if masked is None else masked * np.float32(n_frames)
+    counts = counts.astype(np.float32) * (seen > 0)
+    if shrink > 1:
+        counts, seen = _averaged(counts, shrink), _averaged(seen, shrink)
+    return _Summed(landing, n_frames, counts, seen)
 
 
-def _shrink_factor(to_grid: Homography, frame: tuple[int, int]) -> int:
-    """Return how many pixels in a row fall on one grid pixel: bilinear sampling alone would skip photons."""
-    centre = np.array([[(frame[1] - 1) / 2, (frame[0] - 1) / 2]])
-    around = apply(to_grid, centre + np.array([[0, 0], [1, 0], [0, 1]]))
-    step = np.linalg.norm(around[1:] - around[0], axis=1).max()
-    return max(1, int(1 / step + 1e-6))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Total:
+    """Some rows of the grid.
+
+    Attributes:
+        first: the number of the first row.
+        counts: (H, W) float32.
+        weight: (H, W) float32, but for
+        steps: (H, W + 1) float32 whose sums along rows belong to it: frames that saw everything change it at their ends only.
+    """
+
+    first: int
+    counts: FluxImage
+    weight: FluxImage
+    steps: FluxImage
+
+    @classmethod
+    def zeros(cls, shape: tuple[int, int]) -> _Total:
+        height, width = shape
+        return cls(0, *(np.zeros((height, columns), np.float32) for columns in (width, width, width + 1)))
+
+    def rows(self, rows: range) -> _Total:
+        """Return the part that holds some of the rows; what is added to it is added here."""
+        part = slice(rows.start, rows.stop)
+        return _Total(rows.start, self.counts[part], self.weight[part], self.steps[part])
+
+    def add(self, summed: Sequence[_Summed]) -> None:
+        """Add sums of chunks, in order."""
+        for each in summed:
+            to_image = each.landing.to_image @ translation(0, self.first)
+            if each.seen is None:
+                add_footprint(each.counts.shape, to_image, float(each.n_frames), self.steps, self.weight)
+            else:
+                self._warp(each.seen, each.landing, to_image, self.weight)
+            self._warp(each.counts, each.landing, to_image, self.counts)
+
+    def _warp(self, image: FluxImage | Counts, landing: Landing, to_image: Homography, total: FluxImage) -> None:
+        if landing.straight:
+            add_warped(image, to_image, total)
+            return
+        rows = range(max(landing.rows.start - self.first, 0), min(landing.rows.stop - self.first, len(total)))
+        if rows and landing.columns:
+            size = len(landing.columns), len(rows)
+            to_image = to_image @ translation(landing.columns.start, rows.start)
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            box = slice(rows.start, rows.stop), slice(landing.columns.start, landing.columns.stop)
+            pixels = image.astype(np.float32, copy=False)
+            total[box] += cv2.warpPerspective(pixels, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+
+    def result(self) -> PhotonSum:
+        steps = np.cumsum(self.steps, axis=1, dtype=np.float64)[:, :-1].astype(np.float32)
+        return PhotonSum(self.counts, self.weight + steps)
 
 
-def _shrunk(image: FluxImage, factor: int) -> FluxImage:
+def _divided(length: int, parts: int) -> list[tuple[int, int]]:
+    """Divide a length into parts that are about equal."""
+    bounds = [length * part // parts for part in range(parts + 1)]
+    return [(start, stop) for start, stop in pairwise(bounds) if start < stop]
+
+
+def _averaged(image: FluxImage | Counts, factor: int) -> FluxImage:
     """Average squares of `factor` pixels; what is missing of the last ones counts as unseen."""
     height, width = image.shape
     padded = np.pad(image, ((0, -height % factor), (0, -width % factor)))

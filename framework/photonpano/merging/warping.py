@@ -10,15 +10,21 @@ from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, seen_part
 
 if TYPE_CHECKING:
+    from typing import TypeAlias
+
     from numpy.typing import NDArray
+
+    Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
 
 @compiled
-def add_warped(image: NDArray[np.float32], to_image: NDArray[np.float64], total: NDArray[np.float32]) -> None:
+def add_warped(
+    image: NDArray[np.float32] | NDArray[np.uint32], to_image: NDArray[np.float64], total: NDArray[np.float32]
+) -> None:
     """Add an image to a grid: at each pixel, what lies there, interpolated linearly; nothing outside of the image.
 
     Args:
-        image: (h, w).
+        image: (h, w) float32 or uint32.
         to_image: (3, 3), pixels of the grid to pixels of the image.
         total: (H, W) the grid.
     """
@@ -71,7 +77,7 @@ def add_footprint(
 
 
 @compiled
-def _add_run(image: NDArray[np.float32], to_image: NDArray[np.float64], x: int, y: int, row: NDArray[np.float32]) -> int:
+def _add_run(image: Pixels, to_image: NDArray[np.float64], x: int, y: int, row: NDArray[np.float32]) -> int:
     """Add to the run of pixels from x on; return how many they are."""
     height, width = image.shape
     run = run_from(to_image, x, y, len(row), height, width)
@@ -85,14 +91,14 @@ def _add_run(image: NDArray[np.float32], to_image: NDArray[np.float64], x: int, 
         scale = np.float32(1) / (np.float32(1) + slope * t_px)
         a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
         i, j = above + np.uint64(t), below + np.uint64(t)
-        upper = pixels[i] + a * (pixels[i + one] - pixels[i])
-        lower = pixels[j] + a * (pixels[j + one] - pixels[j])
+        p, q = np.float32(pixels[i]), np.float32(pixels[j])
+        upper, lower = p + a * (np.float32(pixels[i + one]) - p), q + a * (np.float32(pixels[j + one]) - q)
         row[t] += upper + b * (lower - upper)
     return run.size
 
 
 @compiled
-def _at(image: NDArray[np.float32], to_image: NDArray[np.float64], x: int, y: int) -> float:
+def _at(image: Pixels, to_image: NDArray[np.float64], x: int, y: int) -> float:
     """Interpolate at the border, beyond which there is nothing."""
     height, width = image.shape
     u, v = _mapped(to_image, x, y)

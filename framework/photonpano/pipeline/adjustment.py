@@ -14,7 +14,6 @@ from photonpano.geometry import (
     from_parameters,
     generators,
     inverse,
-    jacobian,
     normalised,
     parameters,
     slopes,
@@ -69,7 +68,7 @@ class Adjustment:
         self._corners = corners(frame_shape)
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
         self._targets = apply(observed, self._corners)
-        self._whitening = np.array([_whitening(motion, self._corners) for motion in motions])
+        self._whitening = _whitening(motions, self._rows)
         self._half = max(frame_shape) / 2
         self._unit = unit_coordinates(frame_shape)
         self._generators = generators(frame_shape)
@@ -176,9 +175,10 @@ class Adjustment:
 
     def _linearised(self, homographies: FloatArray, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
         """Return the weighted derivatives of the residuals, (8 E, 8 N), and the weighted residuals, (8 E,)."""
-        mapped = self._relative(homographies) @ self._rows
-        d_moving = np.einsum("eij,kjl,lc->ekic", self._relative(homographies), self._generators, self._rows)
-        d_fixed = -np.einsum("kij,ejc->ekic", self._generators, mapped)
+        relative = self._relative(homographies)
+        mapped = relative @ self._rows
+        d_moving = relative[:, None] @ (self._generators @ self._rows)
+        d_fixed = -self._generators @ mapped[:, None]
         root = np.sqrt(weights)[:, None, None] * self._whitening
         n_edges = len(weights)
         edge_rows = np.arange(8 * n_edges).reshape(n_edges, 8, 1)
@@ -193,9 +193,19 @@ class Adjustment:
         return sparse.csr_array(entries, shape=(8 * n_edges, 8 * self._n_nodes)), residuals.ravel()
 
 
-def _whitening(motion: Located, frame: FloatArray) -> FloatArray:
-    """Return the (8, 8) map from errors of the corners, in px, to errors of unit variance."""
-    if motion.information is None:
-        return np.eye(8) / max(motion.residual_px or 1.0, 1e-3)
-    root = np.linalg.cholesky(motion.information).T
-    return np.asarray(root @ np.linalg.inv(jacobian(motion.homography, frame).reshape(8, 8)))
+def _whitening(motions: Sequence[Located], rows: FloatArray) -> FloatArray:
+    """Return the maps from errors of the corners, in px, to errors of unit variance: (E, 8, 8).
+
+    Args:
+        motions: of the edges.
+        rows: (3, 4) the corners in homogeneous coordinates.
+    """
+    whitening = np.array([np.eye(8) / max(motion.residual_px or 1.0, 1e-3) for motion in motions])
+    told = [index for index, motion in enumerate(motions) if motion.information is not None]
+    if told:
+        information = np.array([motions[index].information for index in told])
+        mapped = np.array([motions[index].homography for index in told]) @ rows
+        changes = (from_parameters(np.eye(8)) - np.eye(3)) @ rows
+        to_corners = slopes(mapped, np.broadcast_to(changes, (len(told), *changes.shape)))
+        whitening[told] = np.linalg.cholesky(information).transpose(0, 2, 1) @ np.linalg.inv(to_corners)
+    return whitening

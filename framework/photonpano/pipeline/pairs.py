@@ -27,6 +27,8 @@ _PROMINENCE = 0.25
 columns of the grid hold."""
 _MOST_REVISITS = 3
 """An exposure is registered with so many earlier visits at most, those that it shares most with."""
+_MOST_RETURNS = 64
+"""So many exposures, spread over the capture, are registered with earlier visits at most. Neighbours tie the others to them."""
 
 
 def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int, int]]:
@@ -77,7 +79,7 @@ def revisits(
     """Return pairs (moving, fixed) of exposures that see one place at different times: candidates for loop closures.
 
     For an exposure, the best view of each earlier visit counts: going back in time, the overlap first falls and then rises.
-    Exposures that lie denser than their length are thinned out, since they say the same.
+    Exposures that lie denser than their length are thinned out, since they say the same; of very many, some will do.
 
     Args:
         groups: the groups of the level, in order of their instants.
@@ -93,7 +95,8 @@ def revisits(
     chosen = np.flatnonzero(located & (lengths == length))[:: max(1, round(length / spacing))]
     away = _CLOSURE_SKIP * max([1.0, *skips]) * length
     pairs: list[tuple[int, int]] = []
-    for position, moving in enumerate(chosen):
+    every = -(-len(chosen) // _MOST_RETURNS)
+    for position, moving in list(enumerate(chosen))[::every]:
         earlier = chosen[:position]
         overlap = _overlaps(homographies[moving], homographies[earlier], frame_shape)
         # Between nothing before the first exposure and the exposure itself.

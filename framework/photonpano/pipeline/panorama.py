@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,7 +56,13 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
 
 
 def render(
-    source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas, tolerance_px: float, progress: Progress
+    source: Source,
+    trajectory: Trajectory,
+    span: FrameSpan,
+    canvas: Canvas,
+    tolerance_px: float,
+    threads: int,
+    progress: Progress,
 ) -> Panorama:
     """Merge the frames of a span on a canvas: warped, summed, and one maximum-likelihood estimate for each pixel.
 
@@ -65,11 +72,13 @@ def render(
         span: the frames that are merged.
         canvas: the pixel grid.
         tolerance_px: frames that move less than this are summed before they are warped.
+        threads: how many work on it; the result does not depend on it.
         progress: is told of the frames.
     """
     with progress.stage("panorama", len(span), "frames") as advance:
         chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance)
+        with ThreadPoolExecutor(threads, thread_name_prefix="render") as pool:
+            photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance, pool, threads)
     flux, weight = photons.estimate(source.response)
     return Panorama(flux, weight, canvas.transform)
 

@@ -72,20 +72,34 @@ class Registrar:
         for moving, fixed in pairs:
             partners[moving].append(fixed)
             needed_until[fixed] = max(needed_until[fixed], moving)
-        described = _in_order(pool, self._describe, range(len(self._exposures)), threads)
-        for moving, each in enumerate(described):
-            self._described[moving], self.contrasts[moving] = each, each.contrast
-            found = list(
-                pool.map(
-                    lambda fixed, moving=moving: self._register(moving, fixed, self._initial(moving, fixed)), partners[moving]
-                )
-            )
-            if found and not any(isinstance(edge.motion, Located) for edge in found):
-                found += self._bridge(moving, partners[moving])
-            yield from found
-            for index in [index for index in self._described if needed_until[index] <= moving]:
-                del self._described[index]
-            advance(1)
+        due: deque[tuple[int, list[Future[Edge]]]] = deque()
+        try:
+            for moving, each in enumerate(_in_order(pool, self._describe, range(len(self._exposures)), threads)):
+                self._described[moving], self.contrasts[moving] = each, each.contrast
+                jobs = [pool.submit(self._register, moving, fixed, self._initial(moving, fixed)) for fixed in partners[moving]]
+                due.append((moving, jobs))
+                # Pairs of a few exposures are under way, so that no thread waits for the last pair of one.
+                while len(due) > threads:
+                    yield from self._finished(*due.popleft(), partners, needed_until)
+                    advance(1)
+            while due:
+                yield from self._finished(*due.popleft(), partners, needed_until)
+                advance(1)
+        finally:
+            for _, jobs in due:
+                for job in jobs:
+                    job.cancel()
+
+    def _finished(
+        self, moving: int, jobs: Sequence[Future[Edge]], partners: Mapping[int, Sequence[int]], needed_until: Mapping[int, int]
+    ) -> Iterator[Edge]:
+        """Yield the pairs of a moving exposure, and forget what no later one needs."""
+        found = [job.result() for job in jobs]
+        if found and not any(isinstance(edge.motion, Located) for edge in found):
+            found += self._bridge(moving, partners[moving])
+        yield from found
+        for index in [index for index in self._described if needed_until[index] <= moving]:
+            del self._described[index]
 
     def revisits(self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor) -> Iterator[Edge]:
         """Yield pairs of exposures that may see one place at different times; only those that look alike are located.

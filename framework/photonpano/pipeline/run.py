@@ -95,7 +95,8 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     rendering = time.perf_counter()
     covered = results[-1].located.covered
     canvas = plan_canvas(trajectory, covered, stream.frame_shape, plan.render.scale, int(plan.run.memory))
-    panorama = render(source, trajectory, covered, canvas, plan.render.tolerance_px, progress)
+    with one_thread_inside():
+        panorama = render(source, trajectory, covered, canvas, plan.render.tolerance_px, threads, progress)
     seen = panorama.weight > 0
     white_flux = float(np.quantile(panorama.flux[seen], plan.render.white_quantile)) or 1.0
     frames = np.arange(stream.n_frames)

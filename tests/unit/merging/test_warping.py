@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonpano.geometry import apply, inverse, translation
-from photonpano.geometry.sampling import run_px
+from photonpano.geometry import apply, translation
 from photonpano.merging.warping import add_footprint, add_warped
 
 IMAGE = np.random.default_rng(0).random((23, 37)).astype(np.float32)
@@ -65,11 +64,3 @@ def test_a_footprint_is_the_warp_of_a_single_value(to_image: np.ndarray) -> None
     add_warped(np.full(IMAGE.shape, 3, np.float32), to_image, expected)
     add_footprint(IMAGE.shape, to_image, 3.0, steps, total)
     np.testing.assert_allclose(total + np.cumsum(steps, axis=1)[:, :-1], expected, atol=1e-4)
-
-
-def test_a_run_is_as_long_as_the_image_is_neither_turned_nor_enlarged() -> None:
-    rows, columns = slice(0, 254), slice(0, 496)
-    assert run_px(translation(3.3, 2.1), rows, columns) == 256
-    turned = np.array([[np.cos(0.02), -np.sin(0.02), 0], [np.sin(0.02), np.cos(0.02), 0], [0, 0, 1]])
-    assert run_px(inverse(turned), rows, columns) == pytest.approx(50, rel=0.01)
-    assert run_px(np.diag([1.1, 1.0, 1.0]), rows, columns) == pytest.approx(10)
