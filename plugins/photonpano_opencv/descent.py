@@ -94,7 +94,7 @@ def descend(
         prior: (8, 8) inverse covariance of that thought.
         free: which of the eight parameters may change.
         to_corners: (8, len(free)) how they move the corners of the template, in px.
-        tolerance_px: steps that move no corner further than that, or by what does not count, are the last.
+        tolerance_px: the last step is followed by one that would move no corner further, or by no more than what counts.
         max_steps: how many there are at most.
         residual: (H, W), becomes the difference where the last step began.
         combined: (H, W), becomes its inverse variance.
@@ -113,7 +113,7 @@ def descend(
     n_free = len(free)
     normal, towards = np.empty((n_free, n_free)), np.empty(n_free)
     std_px, known = 0.0, False
-    damping, before, least = 0.0, homography, np.inf
+    damping, before, least, last_px = 0.0, homography, np.inf, 0.0
     pixels, squares, weights = 0, 0.0, 0.0
     for _ in range(max_steps):
         pixels, squares, weights = look(
@@ -146,15 +146,17 @@ def descend(
             known = False
         if differs > least:
             # The last step led astray; a shorter one from the same place will not.
-            homography, least, damping = before, np.inf, max(_DAMPING, 4 * damping)
+            homography, least, last_px, damping = before, np.inf, 0.0, max(_DAMPING, 4 * damping)
             continue
         before, least, damping = homography, differs, damping / 2
         homography = homography @ np.linalg.inv(step)
         homography /= homography[2, 2]
         if not (size_px < max(height, width)):  # nor if it is not a number
             return LOST, homography, pixels, squares, weights
-        if size_px < max(tolerance_px, _NEGLIGIBLE * std_px):
+        # Steps shrink by about the same share each time: the next one is told from this one and the last.
+        if size_px * (min(1.0, size_px / last_px) if last_px > 0 else 1.0) < max(tolerance_px, _NEGLIGIBLE * std_px):
             return SETTLED, homography, pixels, squares, weights
+        last_px = size_px
     return UNSETTLED, homography, pixels, squares, weights
 
 

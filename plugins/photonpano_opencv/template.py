@@ -30,8 +30,8 @@ _PRIOR_STD = np.array([0.03, 0.03, 0.03, 0.03, np.inf, np.inf, 0.03, 0.03])
 """How much p1..p8, in coordinates of about unit size, may differ from the start where photons do not tell: a camera that turns
 between two exposures shifts the image by any amount, but rolls by a degree or two and changes the perspective by little."""
 _PRIOR = np.diag(_PRIOR_STD**-2.0)
-_SURROUNDINGS_PX = 4.0
-"""What counts as the surroundings of a pixel, as the standard deviation of a Gaussian in px of the layer."""
+_SURROUNDINGS_PX = 13
+"""What counts as the surroundings of a pixel: a square of this side, in px of the layer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,17 +183,21 @@ class Template:
         )
         seen = (self._layer.weight > 0) & (there_weight > 0)
         gain = 1 / (4 * np.pi * self._layer.blur_px**2)
-        independent = np.count_nonzero(seen) * min(1.0, gain)
-        if not independent:
+        pixels = np.count_nonzero(seen)
+        if not pixels:
             return 0.0
         # Shadows and slopes that fill the image look alike wherever one looks.
-        first, second = (_details(image, seen)[seen] for image in (self._layer.image, np.asarray(there, np.float32)))
+        mask = seen.astype(np.float32)
+        norm = np.maximum(_surroundings(mask), np.float32(1e-6))
+        first, second = (
+            (image - _surroundings(image * mask) / norm)[seen].astype(np.float32, copy=False)
+            for image in (self._layer.image, np.asarray(there, np.float32))
+        )
         # Interpolation leaves 4/9 of the variance of white noise, on average over where between pixels it looks.
-        noise = [
-            left * gain * float(np.median(1 / weight[seen]))
-            for weight, left in ((self._layer.weight, 1), (there_weight, 4 / 9))
-        ]
-        return noise_free_correlation(first, second, (noise[0], noise[1]), independent)
+        here_noise, there_noise = (
+            gain * pixels / float(np.vdot(weight, mask)) for weight in (self._layer.weight, there_weight)
+        )
+        return noise_free_correlation(first, second, (here_noise, 4 / 9 * there_noise), pixels * min(1.0, gain))
 
     def _in_parameters(self, homography: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert the information on a step to that on p1..p8 of the homography it changes."""
@@ -215,8 +219,6 @@ def _corner_rows(shape: tuple[int, int]) -> NDArray[np.float64]:
     return np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
 
 
-def _details(image: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return what differs from the surroundings."""
-    mask = seen.astype(np.float32)
-    around, norm = (cv2.GaussianBlur(each, (0, 0), _SURROUNDINGS_PX) for each in (image * mask, mask))
-    return np.asarray(image - around / np.maximum(norm, 1e-6), dtype=np.float32)
+def _surroundings(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean of the square around each pixel."""
+    return np.asarray(cv2.blur(image, (_SURROUNDINGS_PX, _SURROUNDINGS_PX)), dtype=np.float32)
