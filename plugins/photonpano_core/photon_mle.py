@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from photonpano import VirtualExposure
 from photonpano.geometry import inverse, rescaling
-from photonpano.merging import Chunk, accumulate, chunks_of
+from photonpano.merging import Chunk, SharedCounts, accumulate, chunks_of, clipped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from photonpano_core.configs import PhotonMleConfig
 
     Decide = Callable[[str, float, str], None]
+
+_SHARED_BYTES = 64 * 1024**2
+"""Sums that overlapping groups share are kept up to this: a group of them."""
 
 
 class PhotonMleMerger:
@@ -35,7 +39,7 @@ class PhotonMleMerger:
             decide: is told how long chunks are along each motion, and why.
         """
         self._config, self._decide = config, decide
-        self._explained: Trajectory | None = None
+        self._along: _Along | None = None
         self._lock = Lock()
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
@@ -45,27 +49,40 @@ class PhotonMleMerger:
             still = Chunk(group.span, np.eye(3))
             photons = accumulate(source, [still], rescaling(scale), shape)
         else:
-            self._explain(source, trajectory)
-            chunks = chunks_of(group.span, trajectory, source.info.frame_shape, self._config.tolerance_px)
+            along = self._chunked(source, trajectory)
+            chunks = clipped(along.chunks, group.span, trajectory)
             to_reference = inverse(trajectory.at([group.reference])[0])
-            photons = accumulate(source, chunks, rescaling(scale) @ to_reference, shape)
+            photons = accumulate(source, chunks, rescaling(scale) @ to_reference, shape, counts_of=along.counts)
         flux, weight = photons.estimate(source.response)
         return VirtualExposure(flux, weight, group, scale, source.response)
 
-    def _explain(self, source: Source, trajectory: Trajectory) -> None:
-        """Record the length of chunks along a motion, once."""
+    def _chunked(self, source: Source, trajectory: Trajectory) -> _Along:
+        """Return the chunks of a capture along a motion, which the groups of a level share."""
         with self._lock:
-            if self._decide is None or trajectory is self._explained:
-                return
-            self._explained = trajectory
-            n_frames = source.info.n_frames
-            count = len(chunks_of(source.info.span, trajectory, source.info.frame_shape, self._config.tolerance_px))
-            self._decide(
-                "chunk_frames",
-                round(n_frames / count, 1),
-                f"so many frames, on average, move less than tolerance_px = {self._config.tolerance_px:g} along the motion, "
-                "and are summed before they are warped",
-            )
+            known = self._along
+            if known is not None and known.source is source and known.trajectory is trajectory:
+                return known
+            tolerance_px = self._config.tolerance_px
+            chunks = chunks_of(source.info.span, trajectory, source.info.frame_shape, tolerance_px)
+            if self._decide is not None:
+                self._decide(
+                    "chunk_frames",
+                    round(source.info.n_frames / len(chunks), 1),
+                    f"so many frames, on average, move less than tolerance_px = {tolerance_px:g} along the motion, "
+                    "and are summed before they are warped",
+                )
+            self._along = _Along(source, trajectory, chunks, SharedCounts(source, _SHARED_BYTES))
+            return self._along
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Along:
+    """What the groups of a level share: the chunks of the capture along a motion, and their sums."""
+
+    source: Source
+    trajectory: Trajectory
+    chunks: tuple[Chunk, ...]
+    counts: SharedCounts
 
 
 def _scaled_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:

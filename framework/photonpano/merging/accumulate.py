@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from photonpano.merging.chunks import Chunk
     from photonpano.merging.landing import Landing
     from photonpano.protocols import Source
-    from photonpano.values import Counts, FluxImage, Homography, Response
+    from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
 """So many chunks are summed before they are added to the grid."""
@@ -63,6 +63,7 @@ def accumulate(
     advance: Callable[[int], None] | None = None,
     pool: Executor | None = None,
     threads: int = 1,
+    counts_of: Callable[[FrameSpan], Counts] | None = None,
 ) -> PhotonSum:
     """Sum the frames of chunks on a grid, each chunk warped once.
 
@@ -78,6 +79,7 @@ def accumulate(
         advance: is told the number of frames after every few chunks.
         pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
         threads: how many.
+        counts_of: sums the frames of a span, if not the source itself.
     """
     total = _Total.zeros(shape)
     parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], threads)]
@@ -86,7 +88,7 @@ def accumulate(
     spread = pool.map if pool else map
     for first in range(0, len(chunks), _BATCH):
         batch, where = chunks[first : first + _BATCH], placed[first : first + _BATCH]
-        summed = list(spread(partial(_summed, source, masked), batch, where))
+        summed = list(spread(partial(_summed, counts_of or source.counts, masked), batch, where))
         list(spread(partial(_Total.add, summed=summed), parts))
         if advance is not None:
             advance(sum(len(chunk.span) for chunk in batch))
@@ -110,9 +112,9 @@ class _Summed:
     seen: FluxImage | None
 
 
-def _summed(source: Source, masked: FluxImage | None, chunk: Chunk, landing: Landing) -> _Summed:
+def _summed(counts_of: Callable[[FrameSpan], Counts], masked: FluxImage | None, chunk: Chunk, landing: Landing) -> _Summed:
     n_frames, shrink = len(chunk.span), landing.shrink
-    counts: FluxImage | Counts = np.ascontiguousarray(source.counts(chunk.span))
+    counts: FluxImage | Counts = np.ascontiguousarray(counts_of(chunk.span))
     if masked is None and shrink == 1:
         return _Summed(landing, n_frames, counts, None)
     seen = np.full(counts.shape, n_frames, np.float32) if masked is None else masked * np.float32(n_frames)

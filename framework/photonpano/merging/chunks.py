@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,8 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from photonpano.protocols import Trajectory
     from photonpano.values import Homography
 
@@ -48,3 +51,22 @@ def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, i
     spans = [FrameSpan(int(frames[start]), int(frames[stop - 1]) + 1) for start, stop in zip(starts, stops, strict=True)]
     centres = trajectory.at([chunk.centre for chunk in spans])
     return tuple(Chunk(chunk, homography) for chunk, homography in zip(spans, centres, strict=True))
+
+
+def clipped(chunks: Sequence[Chunk], span: FrameSpan, trajectory: Trajectory) -> tuple[Chunk, ...]:
+    """Return the parts of chunks that lie in a span. Those inside are the same for every span, so that sums can be shared.
+
+    Args:
+        chunks: in order, as `chunks_of` gives them.
+        span: the frames that are wanted.
+        trajectory: the motion along which they are summed.
+    """
+    first = bisect_right(chunks, span.start, key=lambda chunk: chunk.span.stop)
+    last = bisect_left(chunks, span.stop, key=lambda chunk: chunk.span.start)
+    inside = list(chunks[first:last])
+    for end in {0, len(inside) - 1}:
+        whole = inside[end].span
+        part = FrameSpan(max(whole.start, span.start), min(whole.stop, span.stop))
+        if part != whole:
+            inside[end] = Chunk(part, trajectory.at([part.centre])[0])
+    return tuple(inside)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from photonpano import FrameSpan
 from photonpano.geometry import corner_displacements, from_parameters, inverse, translation
-from photonpano.merging import chunks_of
+from photonpano.merging import chunks_of, clipped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,3 +68,20 @@ def test_chunks_cover_every_frame_once_and_keep_to_the_tolerance(
         np.testing.assert_array_equal(chunk.homography, at(chunk.span.centre))
         moved = inverse(chunk.homography) @ motion.at(range(chunk.span.start, chunk.span.stop))
         assert corner_displacements(moved, np.eye(3), SHAPE).max() <= tolerance_px * 1.01 + 0.01 * (len(chunk.span) > 1)
+
+
+def test_spans_share_the_chunks_inside(pan: Callable) -> None:
+    motion = pan(0.125)
+    chunks = chunks_of(FrameSpan(0, 40), motion, SHAPE, 0.5)
+    found = clipped(chunks, FrameSpan(10, 23), motion)
+    assert [each.span for each in found] == [FrameSpan(10, 12), FrameSpan(12, 16), FrameSpan(16, 20), FrameSpan(20, 23)]
+    assert found[1] is chunks[3]
+    for each in found:
+        np.testing.assert_allclose(each.homography, translation(0.125 * each.span.centre, 0))
+
+
+def test_a_span_within_a_chunk_is_its_part(pan: Callable) -> None:
+    chunks = chunks_of(FrameSpan(0, 40), pan(0.125), SHAPE, 4)
+    (part,) = clipped(chunks, FrameSpan(33, 39), pan(0.125))
+    assert part.span == FrameSpan(33, 39)
+    assert clipped(chunks, FrameSpan(0, 40), pan(0.125)) == chunks

@@ -1,0 +1,68 @@
+"""Sums that are made once."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError
+from photonpano.merging import SharedCounts
+
+
+@pytest.fixture
+def counted(memory_source: type) -> tuple[object, list[FrameSpan]]:
+    """A source of 20 frames, and the spans that it was asked for."""
+    source = memory_source(np.random.default_rng(0).random((20, 4, 6)) < 0.5)
+    asked: list[FrameSpan] = []
+    sums = source.counts
+
+    def counts(span: FrameSpan) -> np.ndarray:
+        asked.append(span)
+        if span.start == 7:
+            raise InputError("a damaged block")
+        return sums(span)
+
+    source.counts = counts
+    return source, asked
+
+
+def test_a_sum_is_made_once(counted: tuple) -> None:
+    source, asked = counted
+    shared = SharedCounts(source, 1000)
+    first = shared(FrameSpan(0, 5))
+    assert shared(FrameSpan(0, 5)) is first
+    assert asked == [FrameSpan(0, 5)]
+    np.testing.assert_array_equal(first, source.frames(FrameSpan(0, 5)).sum(axis=0))
+    assert not first.flags.writeable
+
+
+def test_the_sums_asked_for_last_are_kept(counted: tuple) -> None:
+    source, asked = counted
+    shared = SharedCounts(source, 2 * 4 * 6 * 4)
+    for start in (0, 1, 0, 2, 0, 1):
+        shared(FrameSpan(start, start + 3))
+    assert [span.start for span in asked] == [0, 1, 2, 1]
+
+
+def test_threads_that_ask_for_one_sum_wait_for_each_other(counted: tuple) -> None:
+    source, asked = counted
+    shared, together = SharedCounts(source, 1000), Barrier(4)
+
+    def ask(_: int) -> np.ndarray:
+        together.wait()
+        return shared(FrameSpan(0, 20))
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(ask, range(4)))
+    assert len(asked) == 1
+    assert all(each is found[0] for each in found)
+
+
+def test_what_fails_fails_for_everybody(counted: tuple) -> None:
+    shared = SharedCounts(counted[0], 1000)
+    for _ in range(2):
+        with pytest.raises(InputError, match="a damaged block"):
+            shared(FrameSpan(7, 9))
