@@ -12,8 +12,12 @@ if TYPE_CHECKING:
 
 _BLUR = 0.15
 """Groups of the first level may be blurred by this share of the shorter side of a frame; twice as much spoils the result."""
-_DARK = 12.0
+_DARK = 3.0
 """Below so many photons a pixel noise does more harm than blur does, and groups get longer."""
+_DIM = 8.0
+"""Below so many, groups get longer once the motion is known, so that they are not blurred by it."""
+_KNOWN_FROM = 3
+"""From this level on even a trembling hand is known, whose period would forbid long groups before."""
 _DARK_BLUR = 2.0
 """In the dark, so many times the blur is allowed."""
 _GROUPS = 8
@@ -29,7 +33,8 @@ class AutoMidpointResampler:
 
     def __init__(self, config: MidpointConfig, context: StageContext) -> None:
         self._config, self._context = config, context
-        self._chosen: MidpointResampler | None = None
+        self._size: int | None = None
+        self._doubled = False
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
         """Return the groups of a level: see `MidpointResampler.groups`.
@@ -37,19 +42,26 @@ class AutoMidpointResampler:
         Raises:
             InputError: the capture is shorter than the shortest group.
         """
-        if self._chosen is None:
+        if self._size is None:
             shorter_side = min(self._context.stream.frame_shape)
-            size, reason = choose_group_size(self._context.capture(), n_frames, shorter_side)
+            capture = self._context.capture()
+            size, reason = choose_group_size(capture, n_frames, shorter_side)
+            self._doubled = capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
+            if self._doubled:
+                reason += f"; from level {_KNOWN_FROM} on, twice as many frames, since they hold less than {_DIM:g}"
             self._context.decide("group_size", size, reason)
-            self._chosen = MidpointResampler(self._config.model_copy(update={"group_size": size}))
-        return self._chosen.groups(n_frames, level)
+            self._size = size
+        # Groups twice as long, as dense as they would be at this level.
+        twice = self._doubled and level >= _KNOWN_FROM
+        config = self._config.model_copy(update={"group_size": self._size * (2 if twice else 1)})
+        return MidpointResampler(config).groups(n_frames, level + (1 if twice else 0))
 
 
 def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int) -> tuple[int, str]:
     """Return the group size for a capture, in frames, and a clause that gives the reason.
 
     The blur of a group of m frames at v px a frame is m v px. It may be 0.15 of the shorter side of a frame, and up to twice
-    that as long as a pixel gets fewer than 12 photons. There are at least 16 frames in a group, and at least 8 groups.
+    that as long as a pixel gets fewer than 3 photons. There are at least 16 frames in a group, and at least 8 groups.
     """
     if capture.speed_px is None:
         size, bound = _bounded(_UNKNOWN, n_frames)

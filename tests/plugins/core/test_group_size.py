@@ -33,9 +33,9 @@ def test_in_the_light_motion_blur_decides() -> None:
 
 
 def test_in_the_dark_up_to_twice_the_blur_is_allowed() -> None:
-    size, reason = choice(0.06, 0.3)
-    assert size == 200
-    assert reason.endswith("hold 12 photons a pixel, for which more blur is allowed in the dark")
+    size, reason = choice(0.02, 0.3)
+    assert size == 150
+    assert reason.endswith("hold 3 photons a pixel, for which more blur is allowed in the dark")
     assert choice(0.001, 0.3)[0] == 254
 
 
