@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.compiling import compiled
+from photonpano.geometry.plausibility import MAX_AREA_CHANGE, MAX_SIDE_CHANGE
 from photonpano_opencv.moments import differentiate, look, products
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-SETTLED, LOST, UNSETTLED = 0, 1, 2
-"""How a descent ends: at a minimum, where the images have nothing in common, or not at all."""
+SETTLED, LOST, UNSETTLED, DIVERGED = 0, 1, 2, 3
+"""How a descent ends: at a minimum, where the images have nothing in common, not at all, or where no camera gets to."""
 _BOLDEST = 5.0
 """The curvature common to both images is taken to be at least so many times what noise alone leaves in common by chance, which
 is the template's over the root of the number of independent pixels; so steps stay bounded."""
@@ -151,8 +152,8 @@ def descend(
         before, least, damping = homography, differs, damping / 2
         homography = homography @ np.linalg.inv(step)
         homography /= homography[2, 2]
-        if not (size_px < max(height, width)):  # nor if it is not a number
-            return LOST, homography, pixels, squares, weights
+        if not _plausible(homography, height, width):
+            return DIVERGED, homography, pixels, squares, weights
         # Steps shrink by about the same share each time: the next one is told from this one and the last.
         if size_px * (min(1.0, size_px / last_px) if last_px > 0 else 1.0) < max(tolerance_px, _NEGLIGIBLE * std_px):
             return SETTLED, homography, pixels, squares, weights
@@ -251,6 +252,33 @@ def _size_px(step: NDArray[np.float64], height: int, width: int) -> float:
             if not moved <= largest:
                 largest = moved
     return largest
+
+
+@compiled
+def _plausible(homography: NDArray[np.float64], height: int, width: int) -> bool:
+    """Tell whether a camera can make a motion, but for the overlap: see `photonpano.geometry.implausibility`.
+
+    A descent that leaves this ground may come back to it, but not to the truth.
+    """
+    x, y = np.array([0, width - 1, width - 1, 0]), np.array([0, 0, height - 1, height - 1])
+    depth = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
+    if not depth.min() > 0:  # nor if it is not a number
+        return False
+    u = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / depth
+    v = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / depth
+    area, sides = 0.0, np.empty(4)
+    for k in range(4):
+        here, there, beyond = k, (k + 1) % 4, (k + 2) % 4
+        du, dv = u[there] - u[here], v[there] - v[here]
+        if not du * (v[beyond] - v[there]) - dv * (u[beyond] - u[there]) > 0:
+            return False
+        sides[k] = np.sqrt(du * du + dv * dv)
+        area += (u[here] * v[there] - u[there] * v[here]) / 2
+    change = area / ((width - 1) * (height - 1))
+    if not 1 / MAX_AREA_CHANGE < change < MAX_AREA_CHANGE:
+        return False
+    first, second = max(sides[0], sides[2]) / min(sides[0], sides[2]), max(sides[1], sides[3]) / min(sides[1], sides[3])
+    return bool(max(first, second) <= MAX_SIDE_CHANGE)
 
 
 @compiled

@@ -64,14 +64,15 @@ class DirectLocator:
                 rescaled(homography, scale), fixed[depth], free, tolerance_px, self._config.max_iterations
             )
             if isinstance(aligned, Aligned):
+                reason = implausibility(aligned.homography, fixed[depth].image.shape, self._config.min_overlap)
+                aligned = f"the alignment diverges: {reason}" if reason else aligned
+            if isinstance(aligned, Aligned):
                 homography = rescaled(aligned.homography, 1 / scale)
                 if free == ALL:
                     found.append((scale, template, aligned))
             elif depth == 0 and not found:
                 # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
                 return NotLocated(aligned)
-        if reason := implausibility(homography, fixed[0].image.shape, self._config.min_overlap):
-            return NotLocated(f"the alignment diverges: {reason}")
         scale, homography, quality = _best(found)
         alike = Template(moving[judge], np.eye(3)).agreement(rescaled(homography, 0.5**judge), fixed[judge])
         return self._judged(homography, quality, scale, alike)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from photonpano.geometry import corners, generators, jacobian, slopes
+from photonpano.geometry import corners, generators, implausibility, jacobian, slopes
 from photonpano.photometry import noise_free_correlation
-from photonpano_opencv.descent import LOST, SETTLED, by_chance, curvatures, descend, quadratic
+from photonpano_opencv.descent import DIVERGED, LOST, SETTLED, by_chance, curvatures, descend, quadratic
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -138,6 +138,8 @@ class Template:
         )
         if ended == SETTLED:
             return Aligned(homography, pixels, squares, weights)
+        if ended == DIVERGED:
+            return f"the alignment diverges: {implausibility(homography, self._shape, 0.0)}"
         if ended == LOST:
             return "where the images overlap, if they do, there is no texture"
         return f"the alignment has not settled after {max_steps} steps"
