@@ -48,7 +48,7 @@ class AutoMidpointResampler:
             size, reason = choose_group_size(capture, n_frames, shorter_side)
             self._doubled = capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
             if self._doubled:
-                reason += f"; from level {_KNOWN_FROM} on, twice as many frames, since they hold less than {_DIM:g}"
+                reason += f"; from level {_KNOWN_FROM} on, where the motion is known, they are twice as long for more light"
             self._context.decide("group_size", size, reason)
             self._size = size
         # Groups twice as long, as dense as they would be at this level.

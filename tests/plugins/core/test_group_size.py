@@ -93,6 +93,21 @@ def test_the_size_is_chosen_once_recorded_and_used_at_every_level() -> None:
     assert [what[:2] for what in decided] == [("group_size", 100)]
 
 
+def test_groups_of_a_dim_capture_are_doubled_once_the_motion_is_known() -> None:
+    decided: list[tuple] = []
+    resampler = built(
+        StreamInfo(2000, 254, 496, None),
+        capture=lambda: CaptureSummary(0.05, 0.381, HOW),
+        decide=lambda *what: decided.append(what),
+    )
+    short, long = (MidpointResampler(MidpointConfig(group_size=size)) for size in (100, 200))
+    assert [resampler.groups(2000, level) for level in (1, 2)] == [short.groups(2000, level) for level in (1, 2)]
+    # As dense as the short ones would be.
+    assert resampler.groups(2000, 3) == long.groups(2000, 4)
+    assert decided[0][:2] == ("group_size", 100)
+    assert decided[0][2].endswith("; from level 3 on, where the motion is known, they are twice as long for more light")
+
+
 def test_it_is_left_open_where_no_frames_are_read() -> None:
     resampler = built(StreamInfo(1000, 254, 496, None))
     with pytest.raises(CaptureUnreadError, match=r"^chosen from flux and speed when the capture is read$"):
