@@ -3,7 +3,7 @@
     python tests/benchmarks/ablation.py docs/explanation/ablation.md
 
 Every locator, graph and resampler runs on the same captures: the built-in street, a path of 360 px in 2,400 frames, a hand that
-trembles. The last row of each flux is the bound of Cramer and Rao. It takes about a quarter of an hour.
+trembles. The last row of each flux is the bound of Cramer and Rao. It takes some minutes.
 """
 
 from __future__ import annotations

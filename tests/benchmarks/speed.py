@@ -26,8 +26,10 @@ import numpy as np
 from photonpano import FrameSpan
 from photonpano.evaluation import FrameTrajectory, load_truth
 from photonpano.geometry import inverse
-from photonpano.merging import accumulate, chunks_of
+from photonpano_core.configs import MidpointConfig, PhotonMleConfig
+from photonpano_core.midpoint import MidpointResampler
 from photonpano_core.packed_npy import PackedNpyConfig, PackedNpySource
+from photonpano_core.photon_mle import PhotonMleMerger
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,40 +116,31 @@ def merging(cube: Path) -> list[str]:
         "| --- | --- | --- | --- |",
     ]
     with PackedNpySource(PackedNpyConfig(path=cube)) as source:
-        spans = [FrameSpan(start, start + GROUP_SIZE) for start in range(0, 24 * GROUP_SIZE // 4, GROUP_SIZE // 4)]
+        groups = MidpointResampler(MidpointConfig(group_size=GROUP_SIZE)).groups(source.info.n_frames, 3)
         scene, response = truth.scene, source.response
         assert scene is not None
+        group = groups[len(groups) // 2]
+        reference = trajectory.at([group.reference])[0]
+        to_grid = inverse(reference) @ trajectory.at(np.arange(group.span.start, group.span.stop))
+        naive = seconds(lambda: warped_one_by_one(source, group.span, to_grid), 1) / len(group.span)
+        counts, weight = warped_one_by_one(source, group.span, to_grid)
+        view = cv2.warpPerspective(scene, reference, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        inside = weight > 0.9 * len(group.span)
 
-        def merged(span: FrameSpan, tolerance_px: float) -> Any:
-            onto = inverse(trajectory.at([span.centre])[0])
-            return accumulate(source, chunks_of(span, trajectory, SHAPE, tolerance_px), onto, SHAPE)
+        def psnr_db(flux: np.ndarray) -> float:
+            return float(10 * np.log10(float(view[inside].max()) ** 2 / np.mean((flux[inside] - view[inside]) ** 2)))
 
-        span = spans[0]
-        onto = inverse(trajectory.at([span.centre])[0])
-        to_grid = onto @ trajectory.at(np.arange(span.start, span.stop))
-        naive = seconds(lambda: warped_one_by_one(source, span, to_grid), 1) / len(span)
-        counts, weight = warped_one_by_one(source, span, to_grid)
-        view = cv2.warpPerspective(
-            scene, trajectory.at([span.centre])[0], SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        )
-        inside = weight > 0.9 * len(span)
-
-        def psnr_db(counts: np.ndarray, weight: np.ndarray) -> float:
-            error = response.flux(counts[inside] / weight[inside], weight[inside]) - view[inside]
-            return float(10 * np.log10(float(view[inside].max()) ** 2 / np.mean(error**2)))
-
-        exact = psnr_db(counts, weight)
+        exact = psnr_db(response.flux(counts / np.maximum(weight, 1), weight))
         for tolerance_px in (0.25, 0.5, 1.0):
-            merged(spans[0], tolerance_px)
+            merger = PhotonMleMerger(PhotonMleConfig(tolerance_px=tolerance_px))
+            lost = exact - psnr_db(merger.merge(source, group, trajectory, 1.0).flux)
 
-            def all_of(tolerance_px: float = tolerance_px) -> None:
-                spread(lambda index: merged(spans[index], tolerance_px), range(len(spans)), THREADS)
+            def all_of(merger: PhotonMleMerger = merger) -> None:
+                spread(lambda index: merger.merge(source, groups[index], trajectory, 1.0), range(len(groups)), THREADS)
 
-            # At the third level, a frame is in four groups.
-            level = seconds(all_of) / len(spans) / (GROUP_SIZE / 4) * 100_000
-            photons = merged(span, tolerance_px)
-            lost = exact - psnr_db(photons.counts, photons.weight)
-            ratio = naive * 4 * 100_000 / THREADS / level
+            level = seconds(all_of) / source.info.n_frames * 100_000
+            # Most frames are in four groups.
+            ratio = naive * 100_000 * sum(len(each.span) for each in groups) / source.info.n_frames / THREADS / level
             rows.append(f"| {tolerance_px:g} px | {level:.1f} s | {ratio:.0f} times | {lost:.3f} dB |")
     return rows
 
