@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.compiling import compiled
-from photonpano.geometry.plausibility import MAX_AREA_CHANGE, MAX_SIDE_CHANGE
+from photonpano.geometry.shapes import fault
 from photonpano_opencv.moments import differentiate, look, products
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from photonpano_opencv.moments import Buffers
+    from photonpano_opencv.pyramid import Layer
 
 SETTLED, LOST, UNSETTLED, DIVERGED = 0, 1, 2, 3
 """How a descent ends: at a minimum, where the images have nothing in common, not at all, or where no camera gets to."""
@@ -64,49 +67,38 @@ _ALONG_X, _ALONG_Y, _PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _products()
 
 @compiled
 def descend(
-    image: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    gradients: NDArray[np.float32],
-    blur_px: float,
-    fixed: NDArray[np.float32],
-    fixed_weight: NDArray[np.float32],
+    moving: Layer,
+    fixed: Layer,
     homography: NDArray[np.float64],
     start: NDArray[np.float64],
     prior: NDArray[np.float64],
+    unit: NDArray[np.float64],
     free: NDArray[np.int64],
     to_corners: NDArray[np.float64],
     tolerance_px: float,
     max_steps: int,
-    residual: NDArray[np.float32],
-    combined: NDArray[np.float32],
-    changes: NDArray[np.float32],
+    buffers: Buffers,
 ) -> tuple[int, NDArray[np.float64], int, float, float]:
     """Align a template to an image.
 
     Args:
-        image: (H, W) the template.
-        weight: (H, W) inverse variance of its pixels, 0 where nothing was seen.
-        gradients: (2, H, W) its derivatives along x and y.
-        blur_px: standard deviation of the Gaussian that leaves as much of white noise as is left in it.
-        fixed: (H, W) the other image.
-        fixed_weight: (H, W) inverse variance of its pixels.
+        moving: the template.
+        fixed: the other image, of the same shape.
         homography: (3, 3) where to begin, pixels of the template to pixels of the fixed image.
         start: (3, 3) what is thought of the homography before the photons are asked.
         prior: (8, 8) inverse covariance of that thought.
+        unit: (3, 3), pixels to the coordinates of the parameters.
         free: which of the eight parameters may change.
         to_corners: (8, len(free)) how they move the corners of the template, in px.
         tolerance_px: the last step is followed by one that would move no corner further, or by no more than what counts.
         max_steps: how many there are at most.
-        residual: (H, W), becomes the difference where the last step began.
-        combined: (H, W), becomes its inverse variance.
-        changes: (2, H, W) memory for derivatives.
+        buffers: what `look` leaves in them is that of the place where the last step began.
 
     Returns:
         How it ended, the homography there, and what `look` told where the last step began.
     """
-    height, width = image.shape
+    height, width = moving.image.shape
     half = max(height, width) / 2
-    unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0.0, 0, 1]])
     from_unit = np.linalg.inv(unit)
     to_start = unit @ np.linalg.inv(start)
     along_x, along_y = np.empty((3, 3)), np.empty((3, 3))
@@ -117,14 +109,12 @@ def descend(
     damping, before, least, last_px = 0.0, homography, np.inf, 0.0
     pixels, squares, weights = 0, 0.0, 0.0
     for _ in range(max_steps):
-        pixels, squares, weights = look(
-            image, weight, gradients, fixed, fixed_weight, homography, residual, combined, along_x, along_y
-        )
+        pixels, squares, weights = look(moving, fixed, homography, buffers, along_x, along_y)
         if pixels == 0:
             return LOST, homography, pixels, squares, weights
         if not known:
-            least_share = min(0.5, _BOLDEST * by_chance(pixels, blur_px))
-            own, hessian = curvatures(gradients, residual, combined, changes, 0.0, least_share)
+            least_share = min(0.5, _BOLDEST * by_chance(pixels, moving.blur_px))
+            own, hessian = curvatures(moving, buffers, 0.0, least_share)
             hessian += prior
             std_px, known = _expected_px(hessian, free, to_corners), True
         at = to_start @ homography @ from_unit
@@ -152,7 +142,8 @@ def descend(
         before, least, damping = homography, differs, damping / 2
         homography = homography @ np.linalg.inv(step)
         homography /= homography[2, 2]
-        if not _plausible(homography, height, width):
+        # A descent that leaves what a camera can do may come back to it, but not to the truth.
+        if fault(homography, height, width)[0]:
             return DIVERGED, homography, pixels, squares, weights
         # Steps shrink by about the same share each time: the next one is told from this one and the last.
         if size_px * (min(1.0, size_px / last_px) if last_px > 0 else 1.0) < max(tolerance_px, _NEGLIGIBLE * std_px):
@@ -168,30 +159,21 @@ def by_chance(pixels: int, blur_px: float) -> float:
 
 
 @compiled
-def curvatures(
-    gradients: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    changes: NDArray[np.float32],
-    chance: float,
-    least: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def curvatures(moving: Layer, buffers: Buffers, chance: float, least: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the (8, 8) curvature of the template, and that which both images have in common: that of the scene.
 
     The noise of the template has derivatives too, and in the dark larger ones than the scene. With those of the other image it
     has nothing in common.
 
     Args:
-        gradients: (2, H, W) derivatives of the template.
-        residual: (H, W) the fixed image seen from the template minus the template.
-        weight: (H, W) inverse variance of a pixel of the residual.
-        changes: (2, H, W) memory for derivatives.
+        moving: the template.
+        buffers: residual and weight as `look` left them; the gradients are overwritten.
         chance: the share of the template's curvature that noise may have in common, which is taken off.
         least: what is left of a direction in which there is nothing in common, as a share of the template's curvature.
     """
-    own = quadratic(gradients, gradients, weight)
-    differentiate(residual, changes)
-    difference = quadratic(gradients, changes, weight)
+    own = quadratic(moving.gradients, moving.gradients, buffers.weight)
+    differentiate(buffers.residual, buffers.gradients)
+    difference = quadratic(moving.gradients, buffers.gradients, buffers.weight)
     # In units in which the template's is the identity, so that no parameter drowns another.
     root = np.zeros((8, 8))
     if not _cholesky(own, root):
@@ -252,33 +234,6 @@ def _size_px(step: NDArray[np.float64], height: int, width: int) -> float:
             if not moved <= largest:
                 largest = moved
     return largest
-
-
-@compiled
-def _plausible(homography: NDArray[np.float64], height: int, width: int) -> bool:
-    """Tell whether a camera can make a motion, but for the overlap: see `photonpano.geometry.implausibility`.
-
-    A descent that leaves this ground may come back to it, but not to the truth.
-    """
-    x, y = np.array([0, width - 1, width - 1, 0]), np.array([0, 0, height - 1, height - 1])
-    depth = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
-    if not depth.min() > 0:  # nor if it is not a number
-        return False
-    u = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / depth
-    v = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / depth
-    area, sides = 0.0, np.empty(4)
-    for k in range(4):
-        here, there, beyond = k, (k + 1) % 4, (k + 2) % 4
-        du, dv = u[there] - u[here], v[there] - v[here]
-        if not du * (v[beyond] - v[there]) - dv * (u[beyond] - u[there]) > 0:
-            return False
-        sides[k] = np.sqrt(du * du + dv * dv)
-        area += (u[here] * v[there] - u[there] * v[here]) / 2
-    change = area / ((width - 1) * (height - 1))
-    if not 1 / MAX_AREA_CHANGE < change < MAX_AREA_CHANGE:
-        return False
-    first, second = max(sides[0], sides[2]) / min(sides[0], sides[2]), max(sides[1], sides[3]) / min(sides[1], sides[3])
-    return bool(max(first, second) <= MAX_SIDE_CHANGE)
 
 
 @compiled

@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import run_from, seen_part
+from photonpano.geometry.sampling import sample_run, seen_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano_opencv.pyramid import Layer
+
+
+class Buffers(NamedTuple):
+    """Images that a thread writes to again and again: new memory costs more than what is done to it.
+
+    Attributes:
+        residual: (H, W) float32.
+        weight: (H, W) float32.
+        gradients: (2, H, W) float32.
+    """
+
+    residual: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    gradients: NDArray[np.float32]
+
 
 @compiled
 def look(
-    image: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    gradients: NDArray[np.float32],
-    fixed: NDArray[np.float32],
-    fixed_weight: NDArray[np.float32],
+    moving: Layer,
+    fixed: Layer,
     homography: NDArray[np.float64],
-    residual: NDArray[np.float32],
-    combined: NDArray[np.float32],
+    buffers: Buffers,
     along_x: NDArray[np.float64],
     along_y: NDArray[np.float64],
 ) -> tuple[int, float, float]:
@@ -31,29 +43,27 @@ def look(
     Coordinates x and y of the sums run from -1 to 1 along the longer side, with 0 in the middle.
 
     Args:
-        image: (H, W) the template.
-        weight: (H, W) inverse variance of its pixels, 0 where nothing was seen.
-        gradients: (2, H, W) its derivatives along x and y.
-        fixed: (H, W) the other image.
-        fixed_weight: (H, W) inverse variance of its pixels.
+        moving: the template.
+        fixed: the other image, of the same shape.
         homography: (3, 3), pixels of the template to pixels of the fixed image.
-        residual: (H, W), becomes the fixed image seen from the template, minus the template.
-        combined: (H, W), becomes the inverse variance of the residual; 0 where one of them saw nothing.
+        buffers: their residual becomes the fixed image seen from the template, minus the template, and their weight the inverse
+            variance of that, 0 where one of them saw nothing.
         along_x: (3, 3), becomes the sums of residual times weight times derivative along x times x^i y^j.
         along_y: (3, 3), the same for the derivative along y.
 
     Returns:
         The number of pixels that both see, the weighted sum of the squares of their residuals, and the sum of the weights.
     """
-    height, width = image.shape
+    height, width = moving.image.shape
     half = max(height, width) / 2
     along_x[:] = 0
     along_y[:] = 0
     seen, squares, weights = 0.0, 0.0, 0.0
     zero, one, step = np.float32(0), np.float32(1), np.float32(1 / half)
     for y in range(height):
-        _compare(image[y], weight[y], fixed, fixed_weight, homography, y, residual[y], combined[y])
-        different, weighted, gx, gy = residual[y], combined[y], gradients[0][y], gradients[1][y]
+        _compare(moving, fixed, homography, y, buffers)
+        different, weighted = buffers.residual[y], buffers.weight[y]
+        gx, gy = moving.gradients[0][y], moving.gradients[1][y]
         x0, x1, x2, y0, y1, square, count, total = zero, zero, zero, zero, zero, zero, zero, zero
         start = np.float32(-(width - 1) / 2 / half)
         for t in range(width):
@@ -85,19 +95,10 @@ def look(
 
 
 @compiled
-def _compare(
-    image: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    fixed: NDArray[np.float32],
-    fixed_weight: NDArray[np.float32],
-    homography: NDArray[np.float64],
-    y: int,
-    residual: NDArray[np.float32],
-    combined: NDArray[np.float32],
-) -> None:
-    """Subtract a row of the template from what the fixed image shows there; see `look`."""
-    height, width = fixed.shape
-    pixels, weights = fixed.reshape(-1), fixed_weight.reshape(-1)
+def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: int, buffers: Buffers) -> None:
+    """Subtract row y of the template from what the fixed image shows there; see `look`."""
+    height, width = fixed.image.shape
+    image, weight, residual, combined = moving.image[y], moving.weight[y], buffers.residual[y], buffers.weight[y]
     zero, tiny = np.float32(0), np.float32(1e-20)
     first, last = seen_part(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
     for x in range(width):
@@ -105,31 +106,14 @@ def _compare(
             residual[x], combined[x] = zero, zero
     x = first
     while x < last:
-        run = run_from(homography, x, y, last - x, height, width)
-        here, here_weight = image[x : x + run.size], weight[x : x + run.size]
-        different, weighted = residual[x : x + run.size], combined[x : x + run.size]
-        above, one = np.uint64(run.top * width + run.left), np.uint64(1)
-        below = above + np.uint64(width)
-        a0, a1, a2, b0, b1, slope = run.a0, run.a1, run.a2, run.b0, run.b1, run.slope
-        # Two loops, since one that writes to two images is not vectorised.
-        for t in range(run.size):
-            t_px = np.float32(t)
-            scale = np.float32(1) / (np.float32(1) + slope * t_px)
-            a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
-            i, j = above + np.uint64(t), below + np.uint64(t)
-            upper = pixels[i] + a * (pixels[i + one] - pixels[i])
-            lower = pixels[j] + a * (pixels[j + one] - pixels[j])
-            different[t] = upper + b * (lower - upper) - here[t]
-        for t in range(run.size):
-            t_px = np.float32(t)
-            scale = np.float32(1) / (np.float32(1) + slope * t_px)
-            a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
-            i, j = above + np.uint64(t), below + np.uint64(t)
-            upper = weights[i] + a * (weights[i + one] - weights[i])
-            lower = weights[j] + a * (weights[j + one] - weights[j])
-            w1, w2 = here_weight[t], upper + b * (lower - upper)
-            weighted[t] = w1 * w2 / max(w1 + w2, tiny)
-        x += run.size
+        sample_run(fixed.image, homography, x, y, residual[x:last])
+        # Interpolated too: from the nearest pixel, the border would jump.
+        x += sample_run(fixed.weight, homography, x, y, combined[x:last])
+    # One loop for each image that is written to, since only such loops are vectorised.
+    for x in range(first, last):
+        residual[x] -= image[x]
+    for x in range(first, last):
+        combined[x] *= weight[x] / max(weight[x] + combined[x], tiny)
 
 
 @compiled

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from photonpano.geometry import corners, generators, implausibility, jacobian, slopes
+from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
 from photonpano.photometry import noise_free_correlation
 from photonpano_opencv.descent import DIVERGED, LOST, SETTLED, by_chance, curvatures, descend, quadratic
+from photonpano_opencv.moments import Buffers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,23 +69,14 @@ class Quality:
     overlap: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Buffers:
-    """Images that a thread writes to again and again: new memory costs more than what is done to it."""
-
-    residual: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    gradients: NDArray[np.float32]
-
-
 _of_thread = local()
 
 
-def _buffers(shape: tuple[int, ...]) -> _Buffers:
+def _buffers(shape: tuple[int, ...]) -> Buffers:
     """Return the buffers of this thread for images of a shape."""
-    known: dict[tuple[int, ...], _Buffers] = _of_thread.__dict__.setdefault("buffers", {})
+    known: dict[tuple[int, ...], Buffers] = _of_thread.__dict__.setdefault("buffers", {})
     if shape not in known:
-        known[shape] = _Buffers(*(np.empty(size, np.float32) for size in (shape, shape, (2, *shape))))
+        known[shape] = Buffers(*(np.empty(size, np.float32) for size in (shape, shape, (2, *shape))))
     return known[shape]
 
 
@@ -117,24 +109,18 @@ class Template:
             tolerance_px: steps that move no corner further are the last.
             max_steps: how many there are at most.
         """
-        layer, buffers = self._layer, self._buffers
         ended, homography, pixels, squares, weights = descend(
-            layer.image,
-            layer.weight,
-            layer.gradients,
-            layer.blur_px,
-            fixed.image,
-            fixed.weight,
+            self._layer,
+            fixed,
             homography,
             self._start,
             _PRIOR,
+            np.array(unit_coordinates(self._shape)),
             np.array(free),
             _to_corners(self._shape, free),
             tolerance_px,
             max_steps,
-            buffers.residual,
-            buffers.weight,
-            buffers.gradients,
+            self._buffers,
         )
         if ended == SETTLED:
             return Aligned(homography, pixels, squares, weights)
@@ -154,7 +140,7 @@ class Template:
         # White noise, and what the blur leaves of it in a pixel.
         noise_ratio = aligned.squares / aligned.pixels * 4 * np.pi * layer.blur_px**2
         chance = _BY_CHANCE * by_chance(aligned.pixels, layer.blur_px)
-        _, hessian = curvatures(layer.gradients, buffers.residual, weight, gradients, chance, _UNKNOWN)
+        _, hessian = curvatures(layer, buffers, chance, _UNKNOWN)
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
         for axis in (0, 1):

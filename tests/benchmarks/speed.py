@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,7 +89,7 @@ def sums(cube: Path) -> list[str]:
             def unpacked(length: int = length) -> object:
                 return np.add.reduce(np.unpackbits(packed[:length], axis=-1), axis=0, dtype=np.uint16)
 
-            rates = [size / seconds(lambda: spread(total, range(count), threads)) for threads in (1, THREADS)]  # noqa: B023
+            rates = [size / seconds(partial(spread, total, range(count), threads)) for threads in (1, THREADS)]
             naive = length * frame_bytes / 1e9 / seconds(unpacked)
             rows.append(f"| {length} | {naive:.2f} GB/s | {rates[0]:.1f} GB/s | {rates[1]:.1f} GB/s |")
     return rows

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano.geometry.homographies import corners
+from photonpano.geometry.homographies import apply, corners
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from photonpano.values import Homography
-
-MAX_AREA_CHANGE = 2.0
-"""Two exposures that share the field of view of one camera do not differ more than this in size."""
-MAX_SIDE_CHANGE = 1.5
-"""The same for the ratio of opposite sides, which perspective changes."""
 
 
 def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: float = 0.1) -> str | None:
@@ -28,29 +22,21 @@ def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: 
         shape: (height, width) of both images.
         min_overlap: the least share of the fixed image that the moving one must cover.
     """
-    # Four corners are too few for arrays: plain numbers take a tenth of the time.
-    (a, b, c), (d, e, f), (g, h, i) = matrix = np.asarray(homography, dtype=np.float64).tolist()
-    if not all(math.isfinite(number) for row in matrix for number in row):
-        return "the homography is not finite"
-    frame = corners(shape).tolist()
-    depths = [g * x + h * y + i for x, y in frame]
-    if min(depths) <= 0:
-        return "the homography sends part of the image behind the camera"
-    quad = [((a * x + b * y + c) / z, (d * x + e * y + f) / z) for (x, y), z in zip(frame, depths, strict=True)]
-    edges = [(quad[k - 3][0] - quad[k][0], quad[k - 3][1] - quad[k][1]) for k in range(4)]
-    if min(edges[k][0] * edges[k - 3][1] - edges[k][1] * edges[k - 3][0] for k in range(4)) <= 0:
-        return "the homography mirrors or folds the image"
-    area = _area(quad) / _area(frame)
-    if not 1 / MAX_AREA_CHANGE < area < MAX_AREA_CHANGE:
-        return f"the homography changes the area of the image {area:.2g} times (at most {MAX_AREA_CHANGE:g} is plausible)"
-    sides = [math.hypot(*edge) for edge in edges]
-    for first, second in ((0, 2), (1, 3)):
-        ratio = max(sides[first], sides[second]) / min(sides[first], sides[second])
-        if ratio > MAX_SIDE_CHANGE:
-            return (
-                f"the homography makes opposite sides of the image differ {ratio:.2g} times "
-                f"(at most {MAX_SIDE_CHANGE:g} is plausible)"
-            )
+    from photonpano.geometry import shapes  # compiled
+
+    homography = np.ascontiguousarray(homography, dtype=np.float64)
+    kind, number = shapes.fault(homography, *shape)
+    if kind != shapes.PLAUSIBLE:
+        return {
+            shapes.INFINITE: "the homography is not finite",
+            shapes.BEHIND: "the homography sends part of the image behind the camera",
+            shapes.FOLDED: "the homography mirrors or folds the image",
+            shapes.AREA: f"the homography changes the area of the image {number:.2g} times "
+            f"(at most {shapes.MAX_AREA_CHANGE:g} is plausible)",
+            shapes.SIDES: f"the homography makes opposite sides of the image differ {number:.2g} times "
+            f"(at most {shapes.MAX_SIDE_CHANGE:g} is plausible)",
+        }[kind]
+    quad = apply(homography, corners(shape)).tolist()
     overlap = _overlap(quad, shape)
     if overlap < min_overlap:
         return f"the images overlap by {overlap:.0%} (at least {min_overlap:.0%} is needed)"

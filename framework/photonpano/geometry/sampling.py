@@ -13,13 +13,17 @@ import numpy as np
 from photonpano.compiling import compiled
 
 if TYPE_CHECKING:
+    from typing import TypeAlias
+
     from numpy.typing import NDArray
 
-LONGEST_RUN = 256
+    Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
+
+_LONGEST_RUN = 256
 """So that small numbers stay exact enough in float32."""
 
 
-class Run(NamedTuple):
+class _Run(NamedTuple):
     """Pixels of a row, t = 0, 1, ..., that see `left + t` and its neighbour, in the image's rows `top` and `top + 1`.
 
     Pixel t looks further right by `(a0 + a1 t + a2 t^2) / (1 + slope t)`, and further down by `(b0 + b1 t) / (1 + slope t)`;
@@ -66,7 +70,39 @@ def seen_part(
 
 
 @compiled
-def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: int, width: int) -> Run:
+def sample_run(image: Pixels, to_image: NDArray[np.float64], x: int, y: int, into: NDArray[np.float32]) -> int:
+    """Interpolate an image linearly at the pixels of a row from x on, as long as they see it next to each other.
+
+    Args:
+        image: (h, w) float32 or uint32.
+        to_image: (3, 3), pixels of the grid to pixels of the image.
+        x: the first pixel, which must see the image, border included, as all must that `into` has room for.
+        y: its row.
+        into: becomes what they see.
+
+    Returns:
+        How many they are.
+    """
+    height, width = image.shape
+    run = _run_from(to_image, x, y, len(into), height, width)
+    pixels = image.reshape(-1)
+    # An index without a sign needs no look at whether it counts from the end.
+    above, one = np.uint64(run.top * width + run.left), np.uint64(1)
+    below = above + np.uint64(width)
+    a0, a1, a2, b0, b1, slope = run.a0, run.a1, run.a2, run.b0, run.b1, run.slope
+    for t in range(run.size):
+        t_px = np.float32(t)
+        scale = np.float32(1) / (np.float32(1) + slope * t_px)
+        a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
+        i, j = above + np.uint64(t), below + np.uint64(t)
+        p, q = np.float32(pixels[i]), np.float32(pixels[j])
+        upper, lower = p + a * (np.float32(pixels[i + one]) - p), q + a * (np.float32(pixels[j + one]) - q)
+        into[t] = upper + b * (lower - upper)
+    return run.size
+
+
+@compiled
+def _run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: int, width: int) -> _Run:
     """Return the run of pixels that starts at (x, y).
 
     Args:
@@ -86,11 +122,11 @@ def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: i
     a1, a2 = to_image[0, 0] / depth - u * slope - 1 + a * slope, -slope
     b1 = to_image[1, 0] / depth - v * slope + b * slope
     # How far both fractions stay between 0 and 1.
-    ahead = min(float(min(most, LONGEST_RUN, width - 1 - left)), _positive_until(a, a1, a2))
+    ahead = min(float(min(most, _LONGEST_RUN, width - 1 - left)), _positive_until(a, a1, a2))
     ahead = min(ahead, _positive_until(1 - a, slope - a1, -a2))
     ahead = min(ahead, _positive_until(b, b1, 0.0))
     ahead = min(ahead, _positive_until(1 - b, slope - b1, 0.0))
-    return Run(
+    return _Run(
         max(1, int(ahead)),
         left,
         top,
@@ -107,11 +143,11 @@ def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: i
 def _positive_until(constant: float, linear: float, square: float) -> float:
     """Return where a polynomial that is positive at 0 first becomes negative."""
     if linear >= 0 and square >= 0:
-        return float(LONGEST_RUN)
+        return float(_LONGEST_RUN)
     root = np.sqrt(max(0.0, linear * linear - 4 * square * constant))
     if square < 0:
         return float((linear + root) / (-2 * square))
     if linear * linear < 4 * square * constant:
-        return float(LONGEST_RUN)
+        return float(_LONGEST_RUN)
     # Written so that it holds for a square of 0, too.
     return float(2 * constant / (root - linear))

@@ -76,7 +76,7 @@ def accumulate(
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
-        advance: is told the number of frames after every few chunks.
+        advance: is told the number of frames of each chunk.
         pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
         threads: how many.
         counts_of: sums the frames of a span, if not the source itself.
@@ -90,8 +90,9 @@ def accumulate(
         batch, where = chunks[first : first + _BATCH], placed[first : first + _BATCH]
         summed = list(spread(partial(_summed, counts_of or source.counts, masked), batch, where))
         list(spread(partial(_Total.add, summed=summed), parts))
-        if advance is not None:
-            advance(sum(len(chunk.span) for chunk in batch))
+        for chunk in batch:
+            if advance is not None:
+                advance(len(chunk.span))
     return total.result()
 
 

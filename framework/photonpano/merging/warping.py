@@ -7,20 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import run_from, seen_part
+from photonpano.geometry.sampling import sample_run, seen_part
 
 if TYPE_CHECKING:
-    from typing import TypeAlias
-
     from numpy.typing import NDArray
 
-    Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
+    from photonpano.geometry.sampling import Pixels
 
 
 @compiled
-def add_warped(
-    image: NDArray[np.float32] | NDArray[np.uint32], to_image: NDArray[np.float64], total: NDArray[np.float32]
-) -> None:
+def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.float32]) -> None:
     """Add an image to a grid: at each pixel, what lies there, interpolated linearly; nothing outside of the image.
 
     Args:
@@ -28,22 +24,19 @@ def add_warped(
         to_image: (3, 3), pixels of the grid to pixels of the image.
         total: (H, W) the grid.
     """
-    height, width = image.shape
+    seen = np.empty(total.shape[1], np.float32)
     for y in range(total.shape[0]):
         row = total[y]
-        first, last = seen_part(to_image, y, -1.0, width, -1.0, height, total.shape[1])
-        if first >= last:
-            continue
-        inside, outside = seen_part(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, total.shape[1])
-        if inside >= outside:
-            inside = outside = last
+        first, inside, outside, last = _parts(image.shape, to_image, y, total.shape[1])
         for x in range(first, inside):
             row[x] += _at(image, to_image, x, y)
-        for x in range(max(first, outside), last):
+        for x in range(outside, last):
             row[x] += _at(image, to_image, x, y)
         x = inside
         while x < outside:
-            x += _add_run(image, to_image, x, y, row[x:outside])
+            x += sample_run(image, to_image, x, y, seen[x:outside])
+        for x in range(inside, outside):
+            row[x] += seen[x]
 
 
 @compiled
@@ -59,42 +52,30 @@ def add_footprint(
         steps: (H, W + 1) whose sums along rows are to be added to `total` in the end.
         total: (H, W) the grid.
     """
-    height, width = shape
     for y in range(total.shape[0]):
-        first, last = seen_part(to_image, y, -1.0, width, -1.0, height, total.shape[1])
-        if first >= last:
-            continue
-        inside, outside = seen_part(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, total.shape[1])
-        if inside >= outside:
-            inside = outside = last
-        else:
-            steps[y, inside] += value
-            steps[y, outside] -= value
+        first, inside, outside, last = _parts(shape, to_image, y, total.shape[1])
+        steps[y, inside] += value
+        steps[y, outside] -= value
         for x in range(first, inside):
-            total[y, x] += value * _coverage(height, width, to_image, x, y)
-        for x in range(max(first, outside), last):
-            total[y, x] += value * _coverage(height, width, to_image, x, y)
+            total[y, x] += value * _coverage(shape, to_image, x, y)
+        for x in range(outside, last):
+            total[y, x] += value * _coverage(shape, to_image, x, y)
 
 
 @compiled
-def _add_run(image: Pixels, to_image: NDArray[np.float64], x: int, y: int, row: NDArray[np.float32]) -> int:
-    """Add to the run of pixels from x on; return how many they are."""
-    height, width = image.shape
-    run = run_from(to_image, x, y, len(row), height, width)
-    pixels = image.reshape(-1)
-    # An index without a sign needs no look at whether it counts from the end.
-    above, one = np.uint64(run.top * width + run.left), np.uint64(1)
-    below = above + np.uint64(width)
-    a0, a1, a2, b0, b1, slope = run.a0, run.a1, run.a2, run.b0, run.b1, run.slope
-    for t in range(run.size):
-        t_px = np.float32(t)
-        scale = np.float32(1) / (np.float32(1) + slope * t_px)
-        a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
-        i, j = above + np.uint64(t), below + np.uint64(t)
-        p, q = np.float32(pixels[i]), np.float32(pixels[j])
-        upper, lower = p + a * (np.float32(pixels[i + one]) - p), q + a * (np.float32(pixels[j + one]) - q)
-        row[t] += upper + b * (lower - upper)
-    return run.size
+def _parts(shape: tuple[int, int], to_image: NDArray[np.float64], y: int, columns: int) -> tuple[int, int, int, int]:
+    """Divide a row of a grid.
+
+    Returns:
+        Where the image begins to matter, where four of its pixels lie around what is seen, where they no longer do, and where
+        it ceases to matter.
+    """
+    height, width = shape
+    first, last = seen_part(to_image, y, -1.0, width, -1.0, height, columns)
+    inside, outside = seen_part(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
+    if inside >= outside:
+        return first, last, last, last
+    return first, inside, outside, last
 
 
 @compiled
@@ -111,8 +92,9 @@ def _at(image: Pixels, to_image: NDArray[np.float64], x: int, y: int) -> float:
 
 
 @compiled
-def _coverage(height: int, width: int, to_image: NDArray[np.float64], x: int, y: int) -> float:
+def _coverage(shape: tuple[int, int], to_image: NDArray[np.float64], x: int, y: int) -> float:
     """Interpolate an image of ones at its border."""
+    height, width = shape
     u, v = _mapped(to_image, x, y)
     along = max(0.0, min(1.0, 1 + min(u, width - 1 - u)))
     across = max(0.0, min(1.0, 1 + min(v, height - 1 - v)))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import apply
-from photonpano_opencv.moments import differentiate, look, products
+from photonpano_opencv.moments import Buffers, differentiate, look, products
+from photonpano_opencv.pyramid import Layer
 
 SHAPE = (31, 47)
 HOMOGRAPHY = np.array([[1.01, 0.02, 3.3], [-0.01, 0.99, -2.63], [1e-4, -2e-4, 1]])
@@ -41,16 +42,17 @@ def test_a_look_compares_and_sums(images: np.ndarray) -> None:
     image, weight, gx, gy, fixed, fixed_weight = images
     weight[:4] = 0
     fixed_weight[:, :5] = 0
-    residual, combined = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
+    buffers = Buffers(*(np.empty(shape, np.float32) for shape in (SHAPE, SHAPE, (2, *SHAPE))))
     along_x, along_y = np.empty((3, 3)), np.empty((3, 3))
+    moving = Layer(image, weight, 1.0, images[2:4].copy())
     pixels, squares, weights = look(
-        image, weight, images[2:4].copy(), fixed, fixed_weight, HOMOGRAPHY, residual, combined, along_x, along_y
+        moving, Layer(fixed, fixed_weight, 1.0, images[:2].copy()), HOMOGRAPHY, buffers, along_x, along_y
     )
     there = interpolated(fixed_weight)
     expected = np.nan_to_num(weight * there / np.maximum(weight + there, 1e-12))
     differs = np.where(np.isnan(there), 0, np.nan_to_num(interpolated(fixed)) - image)
-    np.testing.assert_allclose(combined, expected, atol=1e-5)
-    np.testing.assert_allclose(residual, differs, atol=1e-5)
+    np.testing.assert_allclose(buffers.weight, expected, atol=1e-5)
+    np.testing.assert_allclose(buffers.residual, differs, atol=1e-5)
     assert pixels == np.count_nonzero(expected)
     assert squares == pytest.approx(np.sum(expected * differs**2), rel=1e-4)
     assert weights == pytest.approx(expected.sum(), rel=1e-4)

@@ -128,6 +128,7 @@ def test_it_tells_of_every_frame(panning: Any, pan: Callable) -> None:
     render(panning, motion, span, plan_canvas(motion, span, SHAPE, 1.0, GIB), 2.0, 2, progress)
     assert progress.title == ("panorama", 30, "frames")
     assert sum(progress.frames) == 30
+    assert len(progress.frames) == 15
 
 
 def test_the_memory_of_a_pixel_is_no_more_than_is_predicted(memory_source: type, pan: Callable) -> None:

@@ -1,0 +1,56 @@
+"""What a homography does to the shape of an image, as a number: fast enough to be asked at every step of an alignment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.compiling import compiled
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAX_AREA_CHANGE = 2.0
+"""Two exposures that share the field of view of one camera do not differ more than this in size."""
+MAX_SIDE_CHANGE = 1.5
+"""The same for the ratio of opposite sides, which perspective changes."""
+PLAUSIBLE, INFINITE, BEHIND, FOLDED, AREA, SIDES = range(6)
+"""What may be wrong: nothing; it is not finite, sends something behind the camera, mirrors or folds, changes the area, or the
+ratio of opposite sides."""
+
+
+@compiled
+def fault(homography: NDArray[np.float64], height: int, width: int) -> tuple[int, float]:
+    """Tell why a homography cannot be that between two images of one camera, and the number that tells it.
+
+    Args:
+        homography: (3, 3), pixels of the moving image to pixels of the fixed one.
+        height: rows of both images.
+        width: columns of both.
+    """
+    if not np.all(np.isfinite(homography)):
+        return INFINITE, 0.0
+    x, y = np.array([0, width - 1, width - 1, 0]), np.array([0, 0, height - 1, height - 1])
+    depth = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
+    if depth.min() <= 0:
+        return BEHIND, float(depth.min())
+    u = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / depth
+    v = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / depth
+    area, sides = 0.0, np.empty(4)
+    for here in range(4):
+        there, beyond = (here + 1) % 4, (here + 2) % 4
+        du, dv = u[there] - u[here], v[there] - v[here]
+        turn = du * (v[beyond] - v[there]) - dv * (u[beyond] - u[there])
+        if turn <= 0:
+            return FOLDED, float(turn)
+        sides[here] = np.sqrt(du * du + dv * dv)
+        area += (u[here] * v[there] - u[there] * v[here]) / 2
+    change = area / ((width - 1) * (height - 1))
+    if not 1 / MAX_AREA_CHANGE < change < MAX_AREA_CHANGE:
+        return AREA, change
+    for side in range(2):
+        ratio = max(sides[side], sides[side + 2]) / min(sides[side], sides[side + 2])
+        if ratio > MAX_SIDE_CHANGE:
+            return SIDES, ratio
+    return PLAUSIBLE, 0.0
