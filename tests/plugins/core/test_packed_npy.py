@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -182,6 +183,17 @@ def test_frames_that_were_not_packed_are_recognised_by_their_width(tmp_path: Pat
         path,
         width=24,
     )
+
+
+def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    np.save(path, np.zeros((100, 16, 2), np.uint8))
+    with PackedNpySource(PackedNpyConfig(path=path)) as source:
+        os.truncate(path, 1000)
+        assert not source.counts(FrameSpan(0, 10)).any()
+        with pytest.raises(InputError) as caught:
+            source.counts(FrameSpan(10, 100))
+    assert str(caught.value) == (f"{path} has become shorter: frames 10 to 99 are no longer in it; copy or record it again")
 
 
 def test_masks_that_do_not_fit_are_refused(tmp_path: Path) -> None:
