@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import implausibility, rescaled, translation
+from photonpano.geometry import rescaled, translation
+from photonpano_opencv.likeness import agreement
 from photonpano_opencv.pyramid import pyramid_of
 from photonpano_opencv.template import ALL, Aligned, Template
 
@@ -19,16 +20,14 @@ if TYPE_CHECKING:
 
     from photonpano import VirtualExposure
     from photonpano_opencv.configs import DirectConfig
-    from photonpano_opencv.pyramid import Layer
+    from photonpano_opencv.pyramid import Layer, Pyramid
     from photonpano_opencv.template import Quality
 
 _COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
 """What moves at the coarsest level of the pyramid (translation) and at the next (affine); the others use all of p1..p8."""
-_JUDGE = 2
-"""The layer of the pyramid on which images are compared at the end: coarse, so that noise is small and blur hardly counts."""
 _EXACT_PX = 0.1
 """A layer that tells corners to this is good enough."""
-_COARSE_TOLERANCE = 4
+_COARSE_TOLERANCE = 12
 """The coarser levels of the pyramid only start the finest, and may stop this much earlier."""
 
 
@@ -38,34 +37,31 @@ class DirectLocator:
     def __init__(self, config: DirectConfig) -> None:
         self._config = config
 
-    def describe(self, exposure: VirtualExposure) -> tuple[Layer, ...]:
-        """Return the pyramid of the exposure on the scale on which photon noise is uniform, finest first."""
+    def describe(self, exposure: VirtualExposure) -> Pyramid:
+        """Return the pyramid of the exposure on the scale on which photon noise is uniform."""
         return pyramid_of(exposure, self._config.pyramid_levels, self._config.blur_px)
 
-    def register(
-        self, moving: tuple[Layer, ...], fixed: tuple[Layer, ...], initial: NDArray[np.float64] | None
-    ) -> Located | NotLocated:
+    def register(self, moving: Pyramid, fixed: Pyramid, initial: NDArray[np.float64] | None) -> Located | NotLocated:
         """Align; see `photonpano.Locator`.
 
         Returns:
             `NotLocated` with the numbers that decided when the alignment diverges, when too little overlaps, or when the images
             do not look alike after it.
         """
-        if not (moving[-1].weight.any() and fixed[-1].weight.any()):
+        if not (moving.layers[-1].weight.any() and fixed.layers[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
-        start = homography = _by_phase(moving[-1], fixed[-1], len(moving)) if initial is None else initial
+        depths = range(len(moving.layers))
+        start = homography = _by_phase(moving.layers[-1], fixed.layers[-1], len(depths)) if initial is None else initial
         found: list[tuple[float, Template, Aligned]] = []
-        judge = min(_JUDGE, len(moving) - 1)
-        for depth in reversed(range(len(moving))):
-            free, scale = _model(depth, len(moving)), 0.5**depth
-            template = Template(moving[depth], rescaled(start, scale))
+        for depth in reversed(depths):
+            free, scale = _model(depth, len(depths)), 0.5**depth
+            template = Template(moving.layers[depth], rescaled(start, scale))
             tolerance_px = self._config.converged_px * (1 if depth == 0 else _COARSE_TOLERANCE)
             aligned = template.aligned(
-                rescaled(homography, scale), fixed[depth], free, tolerance_px, self._config.max_iterations
+                rescaled(homography, scale), fixed.layers[depth], free, tolerance_px, self._config.max_iterations
             )
-            if isinstance(aligned, Aligned):
-                reason = implausibility(aligned.homography, fixed[depth].image.shape, self._config.min_overlap)
-                aligned = f"the alignment diverges: {reason}" if reason else aligned
+            if isinstance(aligned, Aligned) and aligned.overlap < self._config.min_overlap:
+                aligned = f"both see {aligned.overlap:.0%} of the image, less than min_overlap = {self._config.min_overlap:g}"
             if isinstance(aligned, Aligned):
                 homography = rescaled(aligned.homography, 1 / scale)
                 if free == ALL:
@@ -74,7 +70,7 @@ class DirectLocator:
                 # A coarse layer that leads nowhere is passed over: the start may be good enough without it.
                 return NotLocated(aligned)
         scale, homography, quality = _best(found)
-        alike = Template(moving[judge], np.eye(3)).agreement(rescaled(homography, 0.5**judge), fixed[judge])
+        alike = agreement(moving.details, fixed.details, rescaled(homography, 0.5**moving.judge))
         return self._judged(homography, quality, scale, alike)
 
     def _judged(self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float) -> Located | NotLocated:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import sample_run, seen_part
+from photonpano.geometry.sampling import run_from, sample, seen_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,15 +59,14 @@ def look(
     along_x[:] = 0
     along_y[:] = 0
     seen, squares, weights = 0.0, 0.0, 0.0
-    zero, one, step = np.float32(0), np.float32(1), np.float32(1 / half)
+    across, zero, one = _across(width, half), np.float32(0), np.float32(1)
     for y in range(height):
         _compare(moving, fixed, homography, y, buffers)
         different, weighted = buffers.residual[y], buffers.weight[y]
         gx, gy = moving.gradients[0][y], moving.gradients[1][y]
         x0, x1, x2, y0, y1, square, count, total = zero, zero, zero, zero, zero, zero, zero, zero
-        start = np.float32(-(width - 1) / 2 / half)
         for t in range(width):
-            x, r, w = start + step * np.float32(t), different[t], weighted[t]
+            x, r, w = across[t], different[t], weighted[t]
             wr = w * r
             by_x, by_y = wr * gx[t], wr * gy[t]
             x0 += by_x
@@ -101,19 +100,29 @@ def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: in
     image, weight, residual, combined = moving.image[y], moving.weight[y], buffers.residual[y], buffers.weight[y]
     zero, tiny = np.float32(0), np.float32(1e-20)
     first, last = seen_part(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
-    for x in range(width):
-        if not first <= x < last:
-            residual[x], combined[x] = zero, zero
+    for x in range(first):
+        residual[x], combined[x] = zero, zero
+    for x in range(last, width):
+        residual[x], combined[x] = zero, zero
     x = first
     while x < last:
-        sample_run(fixed.image, homography, x, y, residual[x:last])
+        run = run_from(homography, x, y, last - x, height, width)
+        sample(fixed.image, run, residual[x : x + run.size])
         # Interpolated too: from the nearest pixel, the border would jump.
-        x += sample_run(fixed.weight, homography, x, y, combined[x:last])
+        sample(fixed.weight, run, combined[x : x + run.size])
+        x += run.size
     # One loop for each image that is written to, since only such loops are vectorised.
-    for x in range(first, last):
-        residual[x] -= image[x]
-    for x in range(first, last):
-        combined[x] *= weight[x] / max(weight[x] + combined[x], tiny)
+    image, weight, residual, combined = image[first:last], weight[first:last], residual[first:last], combined[first:last]
+    for t in range(len(image)):
+        residual[t] -= image[t]
+    for t in range(len(image)):
+        combined[t] *= weight[t] / max(weight[t] + combined[t], tiny)
+
+
+@compiled
+def _across(width: int, half: float) -> NDArray[np.float32]:
+    """Return the coordinates of the pixels of a row: (width,). Loops read them faster than they make them."""
+    return ((np.arange(width) - (width - 1) / 2) / half).astype(np.float32)
 
 
 @compiled
@@ -130,7 +139,7 @@ def products(
     """
     height, width = weight.shape
     half = max(height, width) / 2
-    zero, step, start = np.float32(0), np.float32(1 / half), np.float32(-(width - 1) / 2 / half)
+    across, zero = _across(width, half), np.float32(0)
     sums[:] = 0
     for y in range(height):
         px, py, qx, qy, w = first[0][y], first[1][y], second[0][y], second[1][y], weight[y]
@@ -138,7 +147,7 @@ def products(
         xy0, xy1, xy2, xy3 = zero, zero, zero, zero
         yy0, yy1, yy2 = zero, zero, zero
         for t in range(width):
-            x = start + step * np.float32(t)
+            x = across[t]
             x2 = x * x
             wx, wy = w[t] * px[t], w[t] * py[t]
             xx, yy, xy = wx * qx[t], wy * qy[t], np.float32(0.5) * (wx * qy[t] + wy * qx[t])

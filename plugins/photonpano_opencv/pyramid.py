@@ -8,15 +8,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import cv2
 import numpy as np
 
+from photonpano_opencv.likeness import details_of
 from photonpano_opencv.moments import differentiate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano import VirtualExposure
+    from photonpano_opencv.likeness import Details
 
 _SMALLEST_SIDE = 24
 """The pyramid ends before an image gets smaller than this, in px."""
+JUDGE = 2
+"""The layer on which images are compared in the end: coarse, so that noise is small and blur hardly counts."""
 _BORDER = 3
 """Pixels this near to an edge, in units of the blur, are left out."""
 
@@ -30,15 +34,34 @@ class Layer(NamedTuple):
         blur_px: standard deviation of the Gaussian that leaves as much of white noise as the blur and the halving did, in px
             of the layer.
         gradients: (2, H, W) float32, the derivatives of the image along x and y.
+        smoothed: (2, H, W) float32, the same, blurred once more as the noise was.
     """
 
     image: NDArray[np.float32]
     weight: NDArray[np.float32]
     blur_px: float
     gradients: NDArray[np.float32]
+    smoothed: NDArray[np.float32]
 
 
-def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[Layer, ...]:
+class Pyramid(NamedTuple):
+    """An exposure and its halves.
+
+    Attributes:
+        layers: finest first.
+        details: of the layer of number `JUDGE`, or of the coarsest.
+    """
+
+    layers: tuple[Layer, ...]
+    details: Details
+
+    @property
+    def judge(self) -> int:
+        """The number of the layer that the details are of."""
+        return min(JUDGE, len(self.layers) - 1)
+
+
+def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> Pyramid:
     """Return an exposure and its halves, finest first.
 
     Args:
@@ -48,32 +71,34 @@ def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> tuple[
     """
     known = exposure.weight > 0
     stabilised = np.where(known, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(0))
-    variance = np.zeros(known.shape, dtype=np.float32)
-    variance[known] = exposure.response.stabilised_std(exposure.weight[known]) ** 2
+    std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
     # Blurred alike everywhere: more weight for pixels that more frames saw would shift what lies between them.
     mask = known.astype(np.float32)
-    image, blurred_variance, norm = (
-        np.asarray(cv2.GaussianBlur(each, (0, 0), blur_px), np.float32) for each in (stabilised, variance, mask)
+    image, variance, norm = (
+        np.asarray(cv2.GaussianBlur(each, (0, 0), blur_px), np.float32) for each in (stabilised, mask * std * std, mask)
     )
     # Single pixels that are masked are bridged by their neighbours; near an edge the blur
     # is one-sided, and pulls by a few 0.01 px.
     bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     border = math.ceil(_BORDER * blur_px)
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
-    seen = (cv2.erode(bridged, square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0) & (blurred_variance > 0)
-    image = np.divide(image, norm, out=np.zeros_like(image), where=norm > 0)
-    weight = np.divide(norm, blurred_variance, out=np.zeros_like(norm), where=seen)
+    seen = (cv2.erode(bridged, square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0) & (variance > 0)
+    image /= np.where(norm > 0, norm, np.float32(1))
+    weight = np.where(seen, norm / np.where(seen, variance, np.float32(1)), np.float32(0))
     layers = [layer_of(image, weight, _equivalent_blur_px(blur_px, 1))]
     while len(layers) < levels and min(layers[-1].image.shape) >= 2 * _SMALLEST_SIDE:
         layers.append(_halved(layers[-1], _equivalent_blur_px(blur_px, 2 ** len(layers))))
-    return tuple(layers)
+    return Pyramid(tuple(layers), details_of(layers[min(JUDGE, len(layers) - 1)]))
 
 
 def layer_of(image: NDArray[np.float32], weight: NDArray[np.float32], blur_px: float) -> Layer:
     """Return a layer with its derivatives."""
     gradients = np.empty((2, *image.shape), np.float32)
     differentiate(np.ascontiguousarray(image), gradients)
-    return Layer(np.ascontiguousarray(image), np.ascontiguousarray(weight), blur_px, gradients)
+    smoothed = np.empty_like(gradients)
+    for axis in (0, 1):
+        cv2.GaussianBlur(gradients[axis], (0, 0), blur_px, dst=smoothed[axis])
+    return Layer(np.ascontiguousarray(image), np.ascontiguousarray(weight), blur_px, gradients, smoothed)
 
 
 def _equivalent_blur_px(blur_px: float, factor: int) -> float:

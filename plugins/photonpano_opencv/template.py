@@ -7,11 +7,9 @@ from functools import cache
 from threading import local
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
-from photonpano.photometry import noise_free_correlation
 from photonpano_opencv.descent import DIVERGED, LOST, SETTLED, by_chance, curvatures, descend, quadratic
 from photonpano_opencv.moments import Buffers
 
@@ -31,8 +29,6 @@ _PRIOR_STD = np.array([0.03, 0.03, 0.03, 0.03, np.inf, np.inf, 0.03, 0.03])
 """How much p1..p8, in coordinates of about unit size, may differ from the start where photons do not tell: a camera that turns
 between two exposures shifts the image by any amount, but rolls by a degree or two and changes the perspective by little."""
 _PRIOR = np.diag(_PRIOR_STD**-2.0)
-_SURROUNDINGS_PX = 13
-"""What counts as the surroundings of a pixel: a square of this side, in px of the layer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +38,14 @@ class Aligned:
     Attributes:
         homography: (3, 3), pixels of the template to pixels of the fixed layer.
         pixels: how many pixels both see.
+        overlap: share of the template that both see.
         squares: weighted sum of the squares of their differences.
         weights: sum of their weights, the inverse variances of the differences.
     """
 
     homography: NDArray[np.float64]
     pixels: int
+    overlap: float
     squares: float
     weights: float
 
@@ -123,7 +121,7 @@ class Template:
             self._buffers,
         )
         if ended == SETTLED:
-            return Aligned(homography, pixels, squares, weights)
+            return Aligned(homography, pixels, pixels / self._layer.image.size, squares, weights)
         if ended == DIVERGED:
             return f"the alignment diverges: {implausibility(homography, self._shape, 0.0)}"
         if ended == LOST:
@@ -136,18 +134,15 @@ class Template:
         The template must not have been aligned to anything else in between, nor another of its shape in this thread.
         """
         layer, buffers = self._layer, self._buffers
-        weight, gradients = buffers.weight, buffers.gradients
+        weight = buffers.weight
         # White noise, and what the blur leaves of it in a pixel.
         noise_ratio = aligned.squares / aligned.pixels * 4 * np.pi * layer.blur_px**2
         chance = _BY_CHANCE * by_chance(aligned.pixels, layer.blur_px)
         _, hessian = curvatures(layer, buffers, chance, _UNKNOWN)
         # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
         # place hardly change within the blur, so that it is enough to blur the gradients.
-        for axis in (0, 1):
-            np.multiply(weight, layer.gradients[axis], out=buffers.residual)
-            cv2.GaussianBlur(buffers.residual, (0, 0), layer.blur_px, dst=gradients[axis])
-        buffers.residual.fill(aligned.pixels / aligned.weights)
-        scatter = quadratic(gradients, gradients, buffers.residual)
+        np.multiply(weight, weight * np.float32(aligned.pixels / aligned.weights), out=weight)
+        scatter = quadratic(layer.smoothed, layer.smoothed, weight)
         information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio) + _PRIOR
         in_parameters = self._in_parameters(aligned.homography, information)
         to_corners = jacobian(aligned.homography, corners(self._shape)).reshape(8, 8)
@@ -155,37 +150,8 @@ class Template:
             information=in_parameters,
             std_px=float(np.sqrt(np.trace(to_corners @ np.linalg.inv(in_parameters) @ to_corners.T) / 4)),
             noise_ratio=noise_ratio,
-            overlap=aligned.pixels / layer.image.size,
+            overlap=aligned.overlap,
         )
-
-    def agreement(self, homography: NDArray[np.float64], fixed: Layer) -> float:
-        """Return the correlation that the images would have without photon noise: 1 where they show the same.
-
-        Around 0 for different places, and 0 where the scene does not stand out from the noise, so that any two places look
-        alike.
-        """
-        height, width = self._layer.image.shape
-        there, there_weight = (
-            cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-            for image in (fixed.image, fixed.weight)
-        )
-        seen = (self._layer.weight > 0) & (there_weight > 0)
-        gain = 1 / (4 * np.pi * self._layer.blur_px**2)
-        pixels = np.count_nonzero(seen)
-        if not pixels:
-            return 0.0
-        # Shadows and slopes that fill the image look alike wherever one looks.
-        mask = seen.astype(np.float32)
-        norm = np.maximum(_surroundings(mask), np.float32(1e-6))
-        first, second = (
-            (image - _surroundings(image * mask) / norm)[seen].astype(np.float32, copy=False)
-            for image in (self._layer.image, np.asarray(there, np.float32))
-        )
-        # Interpolation leaves 4/9 of the variance of white noise, on average over where between pixels it looks.
-        here_noise, there_noise = (
-            gain * pixels / float(np.vdot(weight, mask)) for weight in (self._layer.weight, there_weight)
-        )
-        return noise_free_correlation(first, second, (here_noise, 4 / 9 * there_noise), pixels * min(1.0, gain))
 
     def _in_parameters(self, homography: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert the information on a step to that on p1..p8 of the homography it changes."""
@@ -205,8 +171,3 @@ def _to_corners(shape: tuple[int, int], free: tuple[int, ...]) -> NDArray[np.flo
 def _corner_rows(shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return the corners of an image in homogeneous coordinates: (3, 4)."""
     return np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
-
-
-def _surroundings(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the mean of the square around each pixel."""
-    return np.asarray(cv2.blur(image, (_SURROUNDINGS_PX, _SURROUNDINGS_PX)), dtype=np.float32)

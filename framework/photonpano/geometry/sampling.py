@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 
     Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
-_LONGEST_RUN = 256
+LONGEST_RUN = 512
 """So that small numbers stay exact enough in float32."""
+_STEPS = np.arange(LONGEST_RUN, dtype=np.float32)
+"""Counters are turned to float32 by reading them here: loops do it slower than all the rest."""
 
 
-class _Run(NamedTuple):
+class Run(NamedTuple):
     """Pixels of a row, t = 0, 1, ..., that see `left + t` and its neighbour, in the image's rows `top` and `top + 1`.
 
     Pixel t looks further right by `(a0 + a1 t + a2 t^2) / (1 + slope t)`, and further down by `(b0 + b1 t) / (1 + slope t)`;
@@ -70,63 +72,32 @@ def seen_part(
 
 
 @compiled
-def sample_run(image: Pixels, to_image: NDArray[np.float64], x: int, y: int, into: NDArray[np.float32]) -> int:
-    """Interpolate an image linearly at the pixels of a row from x on, as long as they see it next to each other.
-
-    Args:
-        image: (h, w) float32 or uint32.
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        x: the first pixel, which must see the image, border included, as all must that `into` has room for.
-        y: its row.
-        into: becomes what they see.
-
-    Returns:
-        How many they are.
-    """
-    height, width = image.shape
-    run = _run_from(to_image, x, y, len(into), height, width)
-    pixels = image.reshape(-1)
-    # An index without a sign needs no look at whether it counts from the end.
-    above, one = np.uint64(run.top * width + run.left), np.uint64(1)
-    below = above + np.uint64(width)
-    a0, a1, a2, b0, b1, slope = run.a0, run.a1, run.a2, run.b0, run.b1, run.slope
-    for t in range(run.size):
-        t_px = np.float32(t)
-        scale = np.float32(1) / (np.float32(1) + slope * t_px)
-        a, b = (a0 + t_px * (a1 + t_px * a2)) * scale, (b0 + t_px * b1) * scale
-        i, j = above + np.uint64(t), below + np.uint64(t)
-        p, q = np.float32(pixels[i]), np.float32(pixels[j])
-        upper, lower = p + a * (np.float32(pixels[i + one]) - p), q + a * (np.float32(pixels[j + one]) - q)
-        into[t] = upper + b * (lower - upper)
-    return run.size
-
-
-@compiled
-def _run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: int, width: int) -> _Run:
+def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: int, width: int) -> Run:
     """Return the run of pixels that starts at (x, y).
 
     Args:
         to_image: (3, 3), pixels of the grid to pixels of the image.
-        x: the first pixel, which must see the image, border included.
+        x: the first pixel, which must see the image, border included, as all must that follow.
         y: its row.
         most: how many pixels the row has from there.
         height: rows of the image.
         width: columns of the image.
     """
-    depth = to_image[2, 0] * x + to_image[2, 1] * y + to_image[2, 2]
-    u = (to_image[0, 0] * x + to_image[0, 1] * y + to_image[0, 2]) / depth
-    v = (to_image[1, 0] * x + to_image[1, 1] * y + to_image[1, 2]) / depth
-    slope = to_image[2, 0] / depth
+    per_depth = 1 / (to_image[2, 0] * x + to_image[2, 1] * y + to_image[2, 2])
+    u = (to_image[0, 0] * x + to_image[0, 1] * y + to_image[0, 2]) * per_depth
+    v = (to_image[1, 0] * x + to_image[1, 1] * y + to_image[1, 2]) * per_depth
+    slope = to_image[2, 0] * per_depth
     left, top = min(int(u), width - 2), min(int(v), height - 2)
     a, b = u - left, v - top
-    a1, a2 = to_image[0, 0] / depth - u * slope - 1 + a * slope, -slope
-    b1 = to_image[1, 0] / depth - v * slope + b * slope
+    a1, a2 = to_image[0, 0] * per_depth - left * slope - 1, -slope
+    b1 = to_image[1, 0] * per_depth - top * slope
     # How far both fractions stay between 0 and 1.
-    ahead = min(float(min(most, _LONGEST_RUN, width - 1 - left)), _positive_until(a, a1, a2))
-    ahead = min(ahead, _positive_until(1 - a, slope - a1, -a2))
-    ahead = min(ahead, _positive_until(b, b1, 0.0))
-    ahead = min(ahead, _positive_until(1 - b, slope - b1, 0.0))
-    return _Run(
+    ahead = float(min(most, LONGEST_RUN, width - 1 - left))
+    ahead = _positive_until(a, a1, a2, ahead)
+    ahead = _positive_until(1 - a, slope - a1, -a2, ahead)
+    ahead = _positive_until(b, b1, 0.0, ahead)
+    ahead = _positive_until(1 - b, slope - b1, 0.0, ahead)
+    return Run(
         max(1, int(ahead)),
         left,
         top,
@@ -140,14 +111,42 @@ def _run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: 
 
 
 @compiled
-def _positive_until(constant: float, linear: float, square: float) -> float:
-    """Return where a polynomial that is positive at 0 first becomes negative."""
-    if linear >= 0 and square >= 0:
-        return float(_LONGEST_RUN)
-    root = np.sqrt(max(0.0, linear * linear - 4 * square * constant))
+def sample(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
+    """Interpolate an image linearly along a run.
+
+    Args:
+        image: (h, w) float32 or uint32.
+        run: where its pixels look.
+        into: (run.size,) becomes what they see.
+    """
+    pixels, width = image.reshape(-1), image.shape[1]
+    above, below = run.top * width + run.left, (run.top + 1) * width + run.left
+    size = len(into)
+    top_left, top_right = pixels[above : above + size], pixels[above + 1 : above + 1 + size]
+    bottom_left, bottom_right = pixels[below : below + size], pixels[below + 1 : below + 1 + size]
+    steps, one = _STEPS[:size], np.float32(1)
+    a0, a1, a2, b0, b1, slope = run.a0, run.a1, run.a2, run.b0, run.b1, run.slope
+    for t in range(size):
+        step = steps[t]
+        scale = one / (one + slope * step)
+        a, b = (a0 + step * (a1 + step * a2)) * scale, (b0 + step * b1) * scale
+        p, q = np.float32(top_left[t]), np.float32(bottom_left[t])
+        upper, lower = p + a * (np.float32(top_right[t]) - p), q + a * (np.float32(bottom_right[t]) - q)
+        into[t] = upper + b * (lower - upper)
+
+
+@compiled
+def _positive_until(constant: float, linear: float, square: float, most: float) -> float:
+    """Return how far a polynomial that is positive at 0 stays so, `most` at most."""
+    at_end = constant + most * (linear + most * square)
+    # Where it is concave, its least value lies at an end; where it is convex, perhaps between.
+    if at_end >= 0 and (square <= 0 or linear >= 0 or linear + 2 * square * most <= 0):
+        return most
+    discriminant = linear * linear - 4 * square * constant
+    if discriminant < 0:
+        return most
+    root = np.sqrt(discriminant)
     if square < 0:
-        return float((linear + root) / (-2 * square))
-    if linear * linear < 4 * square * constant:
-        return float(_LONGEST_RUN)
+        return float(min(most, (linear + root) / (-2 * square)))
     # Written so that it holds for a square of 0, too.
-    return float(2 * constant / (root - linear))
+    return float(min(most, 2 * constant / (root - linear)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -12,10 +13,10 @@ import numpy as np
 
 from photonpano.geometry import translation
 from photonpano.merging.landing import landings
-from photonpano.merging.warping import add_footprint, add_warped
+from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from concurrent.futures import Executor
 
     from photonpano.merging.chunks import Chunk
@@ -47,11 +48,10 @@ class PhotonSum:
         Returns:
             Flux, (H, W) float32, NaN where less than one frame was seen; weight, (H, W) float32, 0 there.
         """
-        known = self.weight >= MIN_WEIGHT
-        weight = np.where(known, self.weight, np.float32(0))
-        flux = np.full(self.counts.shape, np.nan, dtype=np.float32)
-        seen = self.weight[known]
-        flux[known] = response.flux(self.counts[known] / seen, seen)
+        unknown = self.weight < MIN_WEIGHT
+        seen = np.asarray(np.maximum(self.weight, MIN_WEIGHT), dtype=np.float32)
+        flux, weight = response.flux(np.asarray(self.counts / seen, dtype=np.float32), seen), self.weight.copy()
+        flux[unknown], weight[unknown] = np.nan, 0
         return flux, weight
 
 
@@ -85,14 +85,18 @@ def accumulate(
     parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], threads)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
     placed = landings(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
-    spread = pool.map if pool else map
+    # What is started is worked on while the next is started, if there is a pool; results are taken in order.
+    start = pool.map if pool else map
+    adding: Iterable[None] = ()
     for first in range(0, len(chunks), _BATCH):
         batch, where = chunks[first : first + _BATCH], placed[first : first + _BATCH]
-        summed = list(spread(partial(_summed, counts_of or source.counts, masked), batch, where))
-        list(spread(partial(_Total.add, summed=summed), parts))
+        summed = list(start(partial(_summed, counts_of or source.counts, masked), batch, where))
+        deque(adding, maxlen=0)
+        adding = start(partial(_Total.add, summed=summed), parts)
         for chunk in batch:
             if advance is not None:
                 advance(len(chunk.span))
+    deque(adding, maxlen=0)
     return total.result()
 
 
@@ -116,13 +120,14 @@ class _Summed:
 def _summed(counts_of: Callable[[FrameSpan], Counts], masked: FluxImage | None, chunk: Chunk, landing: Landing) -> _Summed:
     n_frames, shrink = len(chunk.span), landing.shrink
     counts: FluxImage | Counts = np.ascontiguousarray(counts_of(chunk.span))
-    if masked is None and shrink == 1:
+    if masked is not None:
+        lit, seen = counts.astype(np.float32) * masked, masked * np.float32(n_frames)
+        return _Summed(landing, n_frames, average_squares(lit, shrink), average_squares(seen, shrink))
+    if shrink == 1:
         return _Summed(landing, n_frames, counts, None)
-    seen = np.full(counts.shape, n_frames, np.float32) if masked is None else masked * np.float32(n_frames)
-    counts = counts.astype(np.float32) * (seen > 0)
-    if shrink > 1:
-        counts, seen = _averaged(counts, shrink), _averaged(seen, shrink)
-    return _Summed(landing, n_frames, counts, seen)
+    whole = not any(side % shrink for side in counts.shape)
+    everywhere = None if whole else average_squares(np.full(counts.shape, n_frames, np.float32), shrink)
+    return _Summed(landing, n_frames, average_squares(counts, shrink), everywhere)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,6 +159,8 @@ class _Total:
     def add(self, summed: Sequence[_Summed]) -> None:
         """Add sums of chunks, in order."""
         for each in summed:
+            if each.landing.rows.start >= self.first + len(self.counts) or each.landing.rows.stop <= self.first:
+                continue
             to_image = each.landing.to_image @ translation(0, self.first)
             if each.seen is None:
                 add_footprint(each.counts.shape, to_image, float(each.n_frames), self.steps, self.weight)
@@ -175,19 +182,11 @@ class _Total:
             total[box] += cv2.warpPerspective(pixels, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
 
     def result(self) -> PhotonSum:
-        steps = np.cumsum(self.steps, axis=1, dtype=np.float64)[:, :-1].astype(np.float32)
-        return PhotonSum(self.counts, self.weight + steps)
+        add_running_sums(self.steps, self.weight)
+        return PhotonSum(self.counts, self.weight)
 
 
 def _divided(length: int, parts: int) -> list[tuple[int, int]]:
     """Divide a length into parts that are about equal."""
     bounds = [length * part // parts for part in range(parts + 1)]
     return [(start, stop) for start, stop in pairwise(bounds) if start < stop]
-
-
-def _averaged(image: FluxImage | Counts, factor: int) -> FluxImage:
-    """Average squares of `factor` pixels; what is missing of the last ones counts as unseen."""
-    height, width = image.shape
-    padded = np.pad(image, ((0, -height % factor), (0, -width % factor)))
-    rows, columns = padded.shape[0] // factor, padded.shape[1] // factor
-    return np.asarray(padded.reshape(rows, factor, columns, factor).mean(axis=(1, 3)), dtype=np.float32)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import sample_run, seen_part
+from photonpano.geometry.sampling import run_from, sample, seen_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,9 +34,12 @@ def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.f
             row[x] += _at(image, to_image, x, y)
         x = inside
         while x < outside:
-            x += sample_run(image, to_image, x, y, seen[x:outside])
-        for x in range(inside, outside):
-            row[x] += seen[x]
+            run = run_from(to_image, x, y, outside - x, image.shape[0], image.shape[1])
+            sample(image, run, seen[x : x + run.size])
+            x += run.size
+        between, found = row[inside:outside], seen[inside:outside]
+        for t in range(len(between)):
+            between[t] += found[t]
 
 
 @compiled
@@ -60,6 +63,38 @@ def add_footprint(
             total[y, x] += value * _coverage(shape, to_image, x, y)
         for x in range(outside, last):
             total[y, x] += value * _coverage(shape, to_image, x, y)
+
+
+@compiled
+def add_running_sums(steps: NDArray[np.float32], total: NDArray[np.float32]) -> None:
+    """Add the sums of all steps up to each pixel of a row; see `add_footprint`."""
+    for y in range(total.shape[0]):
+        running, row, step = 0.0, total[y], steps[y]
+        for x in range(len(row)):
+            running += step[x]
+            row[x] += np.float32(running)
+
+
+def average_squares(image: Pixels, side: int) -> NDArray[np.float32]:
+    """Average squares of pixels, (h, w) to (ceil(h / side), ceil(w / side)); what is missing of the last counts as 0."""
+    if side == 1:
+        return np.asarray(image, dtype=np.float32)
+    averages = np.zeros((-(-image.shape[0] // side), -(-image.shape[1] // side)), np.float32)
+    _add_squares(image, side, averages)
+    return averages
+
+
+@compiled
+def _add_squares(image: Pixels, side: int, averages: NDArray[np.float32]) -> None:
+    share = np.float32(1 / side**2)
+    for y in range(image.shape[0]):
+        row, into = image[y], averages[y // side]
+        whole = len(row) // side
+        for t in range(whole):
+            for x in range(side):
+                into[t] += share * np.float32(row[t * side + x])
+        for x in range(whole * side, len(row)):
+            into[whole] += share * np.float32(row[x])
 
 
 @compiled

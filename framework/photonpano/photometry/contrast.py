@@ -28,7 +28,7 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
     full = counts == _BLOCK**2
     if np.count_nonzero(full) < 2:
         return 0.0
-    noise = float(np.median(exposure.response.stabilised_std(weight[known])))
+    noise = float(exposure.response.stabilised_std(np.median(weight[known], keepdims=True)).item())
     variance = float(np.var(sums[full] / _BLOCK**2)) - noise**2 / _BLOCK**2
     return float(np.sqrt(max(variance, 0.0))) / noise
 

@@ -9,6 +9,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano.values import FloatArray
+
 _FEWEST = 50
 """Fewer independent pixels than this correlate by chance."""
 _STANDS_OUT = 5.0
@@ -30,9 +32,19 @@ def noise_free_correlation(
         1 where they show the same; around 0 where they do not, and 0 where there are hardly any pixels, or nothing stands out
         from the noise, so that any two places look alike.
     """
+    return correlation_without_noise(np.cov(first, second), noise, independent)
+
+
+def correlation_without_noise(covariance: FloatArray, noise: tuple[float, float], independent: float) -> float:
+    """Return the correlation that two images would have without their noise; see `noise_free_correlation`.
+
+    Args:
+        covariance: (2, 2) that of the pixels of both images.
+        noise: the variance of the noise of a pixel of each.
+        independent: how many pixels have noise of their own.
+    """
     if independent < _FEWEST:
         return 0.0
-    covariance = np.cov(first, second)
     scene = np.diag(covariance) - noise
     if np.any(scene < _STANDS_OUT * np.sqrt(2 / independent) * np.asarray(noise)):
         return 0.0

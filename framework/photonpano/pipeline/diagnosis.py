@@ -41,15 +41,15 @@ class Contrast:
 
 def contrast_of(exposure: VirtualExposure) -> Contrast:
     """Measure how far the variations of an exposure exceed its photon noise."""
-    known = exposure.weight > 0
-    if not known.any():
+    longest = exposure.weight.max()
+    if longest == 0:
         return Contrast(0.0, "no pixel was seen")
-    flux = exposure.flux[known]
-    if flux.max() <= 0:
+    # Unlike max and min, these pass over what is unknown.
+    if np.fmax.reduce(exposure.flux, axis=None) <= 0:
         return Contrast(0.0, "no pixel saw a photon; is the shutter closed, or the file the right one?")
-    darkest = exposure.response.mean_count(flux.min(keepdims=True))
+    darkest = exposure.response.mean_count(np.fmin.reduce(exposure.flux, axis=None, keepdims=True))
     # Half a frame is taken to be dark in a pixel that is always lit; one whole dark frame is the next there can be.
-    if 1 - darkest[0] < 0.75 / exposure.weight[known].max():
+    if 1 - darkest.item() < 0.75 / longest:
         return Contrast(0.0, "every pixel is lit in every frame, so that its flux is unknown; use a darker aperture")
     return Contrast(signal_to_noise(exposure))
 

@@ -57,7 +57,8 @@ class Registrar:
     def __init__(self, level: Level, exposures: VirtualExposures, known: Trajectory | None, clock: Stopwatch) -> None:
         self._level = level
         self._exposures = exposures
-        self._known = known
+        # Of all exposures at once: to ask a trajectory costs about the same for one instant as for a thousand.
+        self._to_plane = None if known is None else known.at([group.reference for group in exposures.groups])
         self._clock = clock
         self._independent = independent_share(exposures.groups)
         self._described: dict[int, _Described] = {}
@@ -198,11 +199,9 @@ class Registrar:
 
     def _initial(self, moving: int, fixed: int) -> Homography | None:
         """Return the motion known so far, in px of exposures."""
-        if self._known is None:
+        if self._to_plane is None:
             return None
-        instants = [self._exposures.groups[index].reference for index in (moving, fixed)]
-        to_plane = self._known.at(instants)
-        return rescaled(inverse(to_plane[1]) @ to_plane[0], self._level.scale)
+        return rescaled(inverse(self._to_plane[fixed]) @ self._to_plane[moving], self._level.scale)
 
     def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
         """Convert a motion to px of frames, and refuse what no camera does."""

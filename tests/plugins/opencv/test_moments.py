@@ -44,9 +44,9 @@ def test_a_look_compares_and_sums(images: np.ndarray) -> None:
     fixed_weight[:, :5] = 0
     buffers = Buffers(*(np.empty(shape, np.float32) for shape in (SHAPE, SHAPE, (2, *SHAPE))))
     along_x, along_y = np.empty((3, 3)), np.empty((3, 3))
-    moving = Layer(image, weight, 1.0, images[2:4].copy())
+    moving = Layer(image, weight, 1.0, images[2:4].copy(), images[2:4].copy())
     pixels, squares, weights = look(
-        moving, Layer(fixed, fixed_weight, 1.0, images[:2].copy()), HOMOGRAPHY, buffers, along_x, along_y
+        moving, Layer(fixed, fixed_weight, 1.0, images[:2].copy(), images[:2].copy()), HOMOGRAPHY, buffers, along_x, along_y
     )
     there = interpolated(fixed_weight)
     expected = np.nan_to_num(weight * there / np.maximum(weight + there, 1e-12))
