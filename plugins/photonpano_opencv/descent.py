@@ -13,6 +13,17 @@ import numpy as np
 
 from photonpano.compiling import compiled
 from photonpano.geometry.shapes import fault
+from photonpano_opencv.algebra import (
+    applied,
+    cholesky,
+    dot,
+    inverse_homography,
+    product,
+    scaled_to_one,
+    solve,
+    solve_lower,
+    transposed,
+)
 from photonpano_opencv.moments import differentiate, look, products
 
 if TYPE_CHECKING:
@@ -99,12 +110,11 @@ def descend(
     """
     height, width = moving.image.shape
     half = max(height, width) / 2
-    from_unit = np.linalg.inv(unit)
-    to_start = unit @ np.linalg.inv(start)
+    from_unit, to_start = inverse_homography(unit), product(unit, inverse_homography(start))
     along_x, along_y = np.empty((3, 3)), np.empty((3, 3))
     own, hessian = np.zeros((8, 8)), np.zeros((8, 8))
     n_free = len(free)
-    normal, towards = np.empty((n_free, n_free)), np.empty(n_free)
+    normal, towards = np.empty((n_free, n_free)), np.empty((n_free, 1))
     std_px, known = 0.0, False
     damping, before, least, last_px = 0.0, homography, np.inf, 0.0
     pixels, squares, weights = 0, 0.0, 0.0
@@ -115,23 +125,25 @@ def descend(
         if not known:
             least_share = min(0.5, _BOLDEST * by_chance(pixels, moving.blur_px))
             own, hessian = curvatures(moving, buffers, 0.0, least_share)
-            hessian += prior
+            for i in range(8):
+                for j in range(8):
+                    hessian[i, j] += prior[i, j]
             std_px, known = _expected_px(hessian, free, to_corners), True
-        at = to_start @ homography @ from_unit
-        at /= at[2, 2]
-        moved = np.array([at[0, 0] - 1, at[1, 0], at[0, 1], at[1, 1] - 1, at[0, 2], at[1, 2], at[2, 0], at[2, 1]])
-        gradient = half * (_ALONG_X @ along_x.reshape(-1) + _ALONG_Y @ along_y.reshape(-1)) + prior @ moved
-        differs = (squares + moved @ prior @ moved) / pixels
+        moved = _changes(product(product(to_start, homography), from_unit))
+        pull = applied(prior, moved)
+        differs = (squares + dot(moved, pull)) / pixels
         for i in range(n_free):
-            towards[i] = gradient[free[i]]
+            k = free[i]
+            along = dot(_ALONG_X[k], along_x.reshape(-1)) + dot(_ALONG_Y[k], along_y.reshape(-1))
+            towards[i, 0] = half * along + pull[k]
             for j in range(n_free):
                 normal[i, j] = hessian[free[i], free[j]] + damping * own[free[i], free[j]]
-        if not _solve(normal, towards):
+        if not solve(normal, towards):
             return LOST, homography, pixels, squares, weights
         p = np.zeros(8)
         for i in range(n_free):
-            p[free[i]] = towards[i]
-        step = from_unit @ np.array([[1 + p[0], p[2], p[4]], [p[1], 1 + p[3], p[5]], [p[6], p[7], 1]]) @ unit
+            p[free[i]] = towards[i, 0]
+        step = product(product(from_unit, _changed(p)), unit)
         size_px = _size_px(step, height, width)
         if size_px > _RENEWED_PX:
             known = False
@@ -140,8 +152,7 @@ def descend(
             homography, least, last_px, damping = before, np.inf, 0.0, max(_DAMPING, 4 * damping)
             continue
         before, least, damping = homography, differs, damping / 2
-        homography = homography @ np.linalg.inv(step)
-        homography /= homography[2, 2]
+        homography = scaled_to_one(product(homography, inverse_homography(step)))
         # A descent that leaves what a camera can do may come back to it, but not to the truth.
         if fault(homography, height, width)[0]:
             return DIVERGED, homography, pixels, squares, weights
@@ -150,6 +161,27 @@ def descend(
             return SETTLED, homography, pixels, squares, weights
         last_px = size_px
     return UNSETTLED, homography, pixels, squares, weights
+
+
+@compiled
+def _changes(homography: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return p1..p8 of a homography."""
+    p = np.empty(8)
+    for i in range(8):
+        # The matrix column by column: [[1 + p1, p3, p5], [p2, 1 + p4, p6], [p7, p8, 1]].
+        row, column = (i % 2, i // 2) if i < 6 else (2, i - 6)
+        p[i] = homography[row, column] / homography[2, 2] - (1.0 if row == column else 0.0)
+    return p
+
+
+@compiled
+def _changed(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the homography of p1..p8."""
+    homography = np.eye(3)
+    for i in range(8):
+        row, column = (i % 2, i // 2) if i < 6 else (2, i - 6)
+        homography[row, column] += p[i]
+    return homography
 
 
 @compiled
@@ -176,16 +208,19 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, least: float) -> 
     difference = quadratic(moving.gradients, buffers.gradients, buffers.weight)
     # In units in which the template's is the identity, so that no parameter drowns another.
     root = np.zeros((8, 8))
-    if not _cholesky(own, root):
+    if not cholesky(own, root):
         return own, own.copy()
-    whitening = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(np.eye(8) + whitening @ difference @ whitening.T)
-    scaled = np.empty((8, 8))
+    solve_lower(root, difference)
+    whitened = transposed(difference)
+    solve_lower(root, whitened)
+    for i in range(8):
+        whitened[i, i] += 1
+    values, vectors = np.linalg.eigh(whitened)
+    half = product(root, vectors)
     for i in range(8):
         for j in range(8):
-            scaled[i, j] = vectors[i, j] * np.sqrt(max(values[j] - chance, least))
-    half = root @ scaled
-    return own, half @ half.T
+            half[i, j] *= np.sqrt(max(values[j] - chance, least))
+    return own, product(half, transposed(half))
 
 
 @compiled
@@ -194,7 +229,11 @@ def quadratic(first: NDArray[np.float32], second: NDArray[np.float32], weight: N
     sums = np.empty((3, 5, 5))
     products(first, second, weight, sums)
     height, width = weight.shape
-    found: NDArray[np.float64] = (_PRODUCTS @ sums.reshape(-1)).reshape(8, 8) * (max(height, width) / 2) ** 2
+    scale = (max(height, width) / 2) ** 2
+    found = np.empty((8, 8))
+    for i in range(8):
+        for j in range(8):
+            found[i, j] = scale * dot(_PRODUCTS[8 * i + j], sums.reshape(-1))
     return found
 
 
@@ -202,22 +241,20 @@ def quadratic(first: NDArray[np.float32], second: NDArray[np.float32], weight: N
 def _expected_px(hessian: NDArray[np.float64], free: NDArray[np.int64], to_corners: NDArray[np.float64]) -> float:
     """Return the expected distance of a corner from where it should be, if noise were white; 0 if nothing is told."""
     n_free = len(free)
-    normal, root = np.empty((n_free, n_free)), np.zeros((n_free, n_free))
+    normal, root, moves = np.empty((n_free, n_free)), np.zeros((n_free, n_free)), np.empty((n_free, 8))
     for i in range(n_free):
         for j in range(n_free):
             normal[i, j] = hessian[free[i], free[j]]
-    if not _cholesky(normal, root):
+        for row in range(8):
+            moves[i, row] = to_corners[row, i]
+    if not cholesky(normal, root):
         return 0.0
     # The trace of J (R R^T)^-1 J^T is the sum of the squares of R^-1 J^T.
+    solve_lower(root, moves)
     total = 0.0
-    for row in range(8):
-        solved = np.zeros(n_free)
-        for i in range(n_free):
-            left = to_corners[row, i]
-            for k in range(i):
-                left -= root[i, k] * solved[k]
-            solved[i] = left / root[i, i]
-            total += solved[i] * solved[i]
+    for i in range(n_free):
+        for row in range(8):
+            total += moves[i, row] ** 2
     return float(np.sqrt(total / 4))
 
 
@@ -234,38 +271,3 @@ def _size_px(step: NDArray[np.float64], height: int, width: int) -> float:
             if not moved <= largest:
                 largest = moved
     return largest
-
-
-@compiled
-def _cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> bool:
-    """Write the lower root of a matrix into zeros; tell whether it is positive definite."""
-    for i in range(len(matrix)):
-        for j in range(i + 1):
-            left = matrix[i, j]
-            for k in range(j):
-                left -= root[i, k] * root[j, k]
-            if i > j:
-                root[i, j] = left / root[j, j]
-            elif left > 0:
-                root[i, i] = np.sqrt(left)
-            else:
-                return False
-    return True
-
-
-@compiled
-def _solve(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
-    """Replace the right side of linear equations by their solution; tell whether the matrix is positive definite."""
-    n = len(right)
-    root = np.zeros((n, n))
-    if not _cholesky(matrix, root):
-        return False
-    for i in range(n):
-        for k in range(i):
-            right[i] -= root[i, k] * right[k]
-        right[i] /= root[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            right[i] -= root[k, i] * right[k]
-        right[i] /= root[i, i]
-    return True

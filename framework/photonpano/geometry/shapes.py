@@ -29,15 +29,21 @@ def fault(homography: NDArray[np.float64], height: int, width: int) -> tuple[int
         height: rows of both images.
         width: columns of both.
     """
-    if not np.all(np.isfinite(homography)):
-        return INFINITE, 0.0
-    x, y = np.array([0, width - 1, width - 1, 0]), np.array([0, 0, height - 1, height - 1])
-    depth = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
-    if depth.min() <= 0:
-        return BEHIND, float(depth.min())
-    u = (homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]) / depth
-    v = (homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]) / depth
-    area, sides = 0.0, np.empty(4)
+    for row in range(3):
+        for column in range(3):
+            if not np.isfinite(homography[row, column]):
+                return INFINITE, 0.0
+    u, v, sides = np.empty(4), np.empty(4), np.empty(4)
+    for corner in range(4):
+        x, y = (width - 1.0) * (corner in (1, 2)), (height - 1.0) * (corner in (2, 3))
+        depth = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
+        u[corner] = homography[0, 0] * x + homography[0, 1] * y + homography[0, 2]
+        v[corner] = homography[1, 0] * x + homography[1, 1] * y + homography[1, 2]
+        if depth <= 0:
+            return BEHIND, depth
+        u[corner] /= depth
+        v[corner] /= depth
+    area = 0.0
     for here in range(4):
         there, beyond = (here + 1) % 4, (here + 2) % 4
         du, dv = u[there] - u[here], v[there] - v[here]

@@ -46,9 +46,16 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
     """
     instants, lengths = _instants(groups), _lengths(groups)
     pairs: set[tuple[int, int]] = set()
+    # TODO-THIN
+    import os
+
+    spacing = float(np.median(np.diff(instants))) if len(groups) > 1 else 1.0
+    every = max(1, round(float(os.environ.get("THIN", "0")) * float(np.median(lengths)) / spacing))
     for index, (instant, length) in enumerate(zip(instants, lengths, strict=True)):
         distances = (instants - instant) / ((lengths + length) / 2)
         for skip in skips:
+            if skip > min(skips) and index % every:
+                continue
             for target in (-skip, skip):
                 if not distances[0] - 0.5 / length <= target <= distances[-1] + 0.5 / length:
                     continue
