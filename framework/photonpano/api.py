@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,9 +67,11 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
     from photonpano.pipeline.progress import Quiet
     from photonpano.pipeline.run import execute, write_outcome
     from photonpano.pipeline.run_folder import run_folder
-    from photonpano.report import RunArrays, render_report
+    from photonpano.report import RunArrays, load_figures, render_report
 
-    with open_source(plan) as source, run_folder(plan.output.directory) as folder:
+    with open_source(plan) as source, run_folder(plan.output.directory) as folder, ThreadPoolExecutor(1) as aside:
+        # A second of imports that nothing waits for.
+        aside.submit(load_figures)
         outcome = execute(plan, source, __version__, progress or Quiet())
         write_outcome(folder, outcome, source.info.frame_shape)
         arrays = RunArrays(

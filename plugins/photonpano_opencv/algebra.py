@@ -64,6 +64,15 @@ def inverse_homography(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @compiled
+def rescaled(homography: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """Return the same motion between images that are both rescaled; what `photonpano.geometry.rescaled` does, for one."""
+    offset = 0.5 * scale - 0.5
+    there = np.array([[scale, 0.0, offset], [0.0, scale, offset], [0.0, 0.0, 1.0]])
+    back = np.array([[1 / scale, 0.0, -offset / scale], [0.0, 1 / scale, -offset / scale], [0.0, 0.0, 1.0]])
+    return scaled_to_one(product(product(there, homography), back))
+
+
+@compiled
 def scaled_to_one(homography: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a homography with h33 = 1."""
     result = np.empty((3, 3))

@@ -1,9 +1,4 @@
-"""Inverse-compositional Gauss-Newton steps on homographies (Baker and Matthews 2004), from moments of two images.
-
-A parameter changes a pixel by its derivative times a polynomial of its place of degree two at most. So sums over all pixels are
-moments of a few products, and no image for each parameter is ever made. Parameters are those of coordinates that run from -1 to
-1 along the longer side.
-"""
+"""Inverse-compositional Gauss-Newton steps on homographies (Baker and Matthews 2004)."""
 
 from __future__ import annotations
 
@@ -13,18 +8,9 @@ import numpy as np
 
 from photonpano.compiling import compiled
 from photonpano.geometry.shapes import fault
-from photonpano_opencv.algebra import (
-    applied,
-    cholesky,
-    dot,
-    inverse_homography,
-    product,
-    scaled_to_one,
-    solve,
-    solve_lower,
-    transposed,
-)
-from photonpano_opencv.moments import differentiate, look, products
+from photonpano_opencv.algebra import applied, dot, inverse_homography, product, scaled_to_one, solve
+from photonpano_opencv.curvature import ALONG_X, ALONG_Y, by_chance, curvatures, expected_px
+from photonpano_opencv.moments import look
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,37 +29,6 @@ _NEGLIGIBLE = 0.02
 """Steps of this share of what photons leave open do not count: where they tell little, steps stay small for long."""
 _RENEWED_PX = 0.25
 """The curvature is taken anew until steps are smaller than this."""
-
-
-def _polynomials(terms: dict[int, tuple[tuple[float, int, int], ...]]) -> NDArray[np.float64]:
-    """Return the coefficients of x^i y^j for each parameter: (8, 3, 3)."""
-    coefficients = np.zeros((8, 3, 3))
-    for parameter, polynomial in terms.items():
-        for factor, i, j in polynomial:
-            coefficients[parameter, i, j] = factor
-    return coefficients
-
-
-# A small change of p1..p8 moves (x, y) by (p1 x + p3 y + p5 - p7 x^2 - p8 x y, p2 x + p4 y + p6 - p7 x y - p8 y^2).
-_X = _polynomials({0: ((1, 1, 0),), 2: ((1, 0, 1),), 4: ((1, 0, 0),), 6: ((-1, 2, 0),), 7: ((-1, 1, 1),)})
-_Y = _polynomials({1: ((1, 1, 0),), 3: ((1, 0, 1),), 5: ((1, 0, 0),), 6: ((-1, 1, 1),), 7: ((-1, 0, 2),)})
-
-
-def _products() -> NDArray[np.float64]:
-    """Return the coefficients of the sums of `products` in the product of two parameters: (64, 75)."""
-
-    def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-        result = np.zeros((8, 8, 5, 5))
-        for i in range(3):
-            for j in range(3):
-                result[:, :, i : i + 3, j : j + 3] += first[:, None, i, j, None, None] * second[None]
-        return result
-
-    along = product(_X, _X), product(_X, _Y) + product(_Y, _X), product(_Y, _Y)
-    return np.stack(along, axis=2).reshape(64, 75)
-
-
-_ALONG_X, _ALONG_Y, _PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _products()
 
 
 @compiled
@@ -128,13 +83,13 @@ def descend(
             for i in range(8):
                 for j in range(8):
                     hessian[i, j] += prior[i, j]
-            std_px, known = _expected_px(hessian, free, to_corners), True
+            std_px, known = expected_px(hessian, free, to_corners), True
         moved = _changes(product(product(to_start, homography), from_unit))
         pull = applied(prior, moved)
         differs = (squares + dot(moved, pull)) / pixels
         for i in range(n_free):
             k = free[i]
-            along = dot(_ALONG_X[k], along_x.reshape(-1)) + dot(_ALONG_Y[k], along_y.reshape(-1))
+            along = dot(ALONG_X[k], along_x.reshape(-1)) + dot(ALONG_Y[k], along_y.reshape(-1))
             towards[i, 0] = half * along + pull[k]
             for j in range(n_free):
                 normal[i, j] = hessian[free[i], free[j]] + damping * own[free[i], free[j]]
@@ -182,80 +137,6 @@ def _changed(p: NDArray[np.float64]) -> NDArray[np.float64]:
         row, column = (i % 2, i // 2) if i < 6 else (2, i - 6)
         homography[row, column] += p[i]
     return homography
-
-
-@compiled
-def by_chance(pixels: int, blur_px: float) -> float:
-    """Return the curvature that the noise of two images has in common by chance, as a share of that of one of them."""
-    return float(1 / np.sqrt(pixels / max(1.0, 4 * np.pi * blur_px**2)))
-
-
-@compiled
-def curvatures(moving: Layer, buffers: Buffers, chance: float, least: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the (8, 8) curvature of the template, and that which both images have in common: that of the scene.
-
-    The noise of the template has derivatives too, and in the dark larger ones than the scene. With those of the other image it
-    has nothing in common.
-
-    Args:
-        moving: the template.
-        buffers: residual and weight as `look` left them; the gradients are overwritten.
-        chance: the share of the template's curvature that noise may have in common, which is taken off.
-        least: what is left of a direction in which there is nothing in common, as a share of the template's curvature.
-    """
-    own = quadratic(moving.gradients, moving.gradients, buffers.weight)
-    differentiate(buffers.residual, buffers.gradients)
-    difference = quadratic(moving.gradients, buffers.gradients, buffers.weight)
-    # In units in which the template's is the identity, so that no parameter drowns another.
-    root = np.zeros((8, 8))
-    if not cholesky(own, root):
-        return own, own.copy()
-    solve_lower(root, difference)
-    whitened = transposed(difference)
-    solve_lower(root, whitened)
-    for i in range(8):
-        whitened[i, i] += 1
-    values, vectors = np.linalg.eigh(whitened)
-    half = product(root, vectors)
-    for i in range(8):
-        for j in range(8):
-            half[i, j] *= np.sqrt(max(values[j] - chance, least))
-    return own, product(half, transposed(half))
-
-
-@compiled
-def quadratic(first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the (8, 8) weighted sums over pixels of what two parameters do to them, from (2, H, W) derivatives."""
-    sums = np.empty((3, 5, 5))
-    products(first, second, weight, sums)
-    height, width = weight.shape
-    scale = (max(height, width) / 2) ** 2
-    found = np.empty((8, 8))
-    for i in range(8):
-        for j in range(8):
-            found[i, j] = scale * dot(_PRODUCTS[8 * i + j], sums.reshape(-1))
-    return found
-
-
-@compiled
-def _expected_px(hessian: NDArray[np.float64], free: NDArray[np.int64], to_corners: NDArray[np.float64]) -> float:
-    """Return the expected distance of a corner from where it should be, if noise were white; 0 if nothing is told."""
-    n_free = len(free)
-    normal, root, moves = np.empty((n_free, n_free)), np.zeros((n_free, n_free)), np.empty((n_free, 8))
-    for i in range(n_free):
-        for j in range(n_free):
-            normal[i, j] = hessian[free[i], free[j]]
-        for row in range(8):
-            moves[i, row] = to_corners[row, i]
-    if not cholesky(normal, root):
-        return 0.0
-    # The trace of J (R R^T)^-1 J^T is the sum of the squares of R^-1 J^T.
-    solve_lower(root, moves)
-    total = 0.0
-    for i in range(n_free):
-        for row in range(8):
-            total += moves[i, row] ** 2
-    return float(np.sqrt(total / 4))
 
 
 @compiled

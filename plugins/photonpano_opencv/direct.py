@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import rescaled, translation
+from photonpano.geometry import translation
+from photonpano_opencv.algebra import rescaled
 from photonpano_opencv.likeness import agreement
 from photonpano_opencv.pyramid import pyramid_of
 from photonpano_opencv.template import ALL, Aligned, Template
@@ -51,7 +52,9 @@ class DirectLocator:
         if not (moving.layers[-1].weight.any() and fixed.layers[-1].weight.any()):
             return NotLocated("nothing was seen far enough from what was not")
         depths = range(len(moving.layers))
-        start = homography = _by_phase(moving.layers[-1], fixed.layers[-1], len(depths)) if initial is None else initial
+        if initial is None:
+            initial = _by_phase(moving.layers[-1], fixed.layers[-1], len(depths))
+        start = homography = np.array(initial, dtype=np.float64)
         found: list[tuple[float, Template, Aligned]] = []
         for depth in reversed(depths):
             free, scale = _model(depth, len(depths)), 0.5**depth

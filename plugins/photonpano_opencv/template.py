@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
-from photonpano_opencv.descent import DIVERGED, LOST, SETTLED, by_chance, curvatures, descend, quadratic
+from photonpano.geometry import corners, generators, implausibility, slopes, unit_coordinates
+from photonpano_opencv.curvature import told
+from photonpano_opencv.descent import DIVERGED, LOST, SETTLED, descend
 from photonpano_opencv.moments import Buffers
 
 if TYPE_CHECKING:
@@ -20,11 +21,6 @@ if TYPE_CHECKING:
 
 ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 """All of p1..p8."""
-_BY_CHANCE = 1.0
-"""The best alignment of noise has a curvature in common of up to so many times what noise has in common anywhere; that much
-tells nothing."""
-_UNKNOWN = 1e-3
-"""Where no more than that is in common, next to nothing is known: this share of the template's curvature."""
 _PRIOR_STD = np.array([0.03, 0.03, 0.03, 0.03, np.inf, np.inf, 0.03, 0.03])
 """How much p1..p8, in coordinates of about unit size, may differ from the start where photons do not tell: a camera that turns
 between two exposures shifts the image by any amount, but rolls by a degree or two and changes the perspective by little."""
@@ -67,6 +63,23 @@ class Quality:
     overlap: float
 
 
+class _Geometry:
+    """What is the same for all templates of a shape, in arrays that compiled functions take as they are."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        rows = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
+        self.unit, self.generators = np.array(unit_coordinates(shape)), np.array(generators(shape))
+        self._to_corners = slopes(rows, self.generators @ rows)
+        self._of: dict[tuple[int, ...], NDArray[np.float64]] = {}
+
+    def to_corners(self, free: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return how small changes of some of p1..p8 move the corners of an image: (8, len(free))."""
+        if free not in self._of:
+            self._of[free] = np.ascontiguousarray(self._to_corners[:, list(free)])
+        return self._of[free]
+
+
+_geometry = cache(_Geometry)
 _of_thread = local()
 
 
@@ -93,7 +106,7 @@ class Template:
         """
         self._layer, self._start = layer, start
         self._shape = (layer.image.shape[0], layer.image.shape[1])
-        self._buffers = _buffers(self._shape)
+        self._known, self._buffers = _geometry(self._shape), _buffers(self._shape)
 
     def aligned(
         self, homography: NDArray[np.float64], fixed: Layer, free: tuple[int, ...], tolerance_px: float, max_steps: int
@@ -113,9 +126,9 @@ class Template:
             homography,
             self._start,
             _PRIOR,
-            np.array(unit_coordinates(self._shape)),
+            self._known.unit,
             np.array(free),
-            _to_corners(self._shape, free),
+            self._known.to_corners(free),
             tolerance_px,
             max_steps,
             self._buffers,
@@ -133,41 +146,18 @@ class Template:
 
         The template must not have been aligned to anything else in between, nor another of its shape in this thread.
         """
-        layer, buffers = self._layer, self._buffers
-        weight = buffers.weight
+        layer = self._layer
         # White noise, and what the blur leaves of it in a pixel.
         noise_ratio = aligned.squares / aligned.pixels * 4 * np.pi * layer.blur_px**2
-        chance = _BY_CHANCE * by_chance(aligned.pixels, layer.blur_px)
-        _, hessian = curvatures(layer, buffers, chance, _UNKNOWN)
-        # The blur correlates the noise of neighbours, so that the step scatters by H^-1 M H^-1 and not by H^-1. Weight and
-        # place hardly change within the blur, so that it is enough to blur the gradients.
-        np.multiply(weight, weight * np.float32(aligned.pixels / aligned.weights), out=weight)
-        scatter = quadratic(layer.smoothed, layer.smoothed, weight)
-        information = hessian @ np.linalg.solve(scatter, hessian) / max(1.0, noise_ratio) + _PRIOR
-        in_parameters = self._in_parameters(aligned.homography, information)
-        to_corners = jacobian(aligned.homography, corners(self._shape)).reshape(8, 8)
-        return Quality(
-            information=in_parameters,
-            std_px=float(np.sqrt(np.trace(to_corners @ np.linalg.inv(in_parameters) @ to_corners.T) / 4)),
-            noise_ratio=noise_ratio,
-            overlap=aligned.overlap,
+        information, std_px = told(
+            layer,
+            self._buffers,
+            aligned.homography,
+            aligned.pixels,
+            aligned.weights,
+            noise_ratio,
+            _PRIOR,
+            self._known.generators,
+            self._known.to_corners(ALL),
         )
-
-    def _in_parameters(self, homography: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert the information on a step to that on p1..p8 of the homography it changes."""
-        rows = _corner_rows(self._shape)
-        to_corners = slopes(homography @ rows, homography @ generators(self._shape) @ rows)
-        to_step = np.linalg.solve(to_corners, jacobian(homography, corners(self._shape)).reshape(8, 8))
-        return np.asarray(to_step.T @ information @ to_step)
-
-
-@cache
-def _to_corners(shape: tuple[int, int], free: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return how small changes of some of p1..p8 move the corners of an image: (8, len(free))."""
-    rows = _corner_rows(shape)
-    return np.ascontiguousarray(slopes(rows, generators(shape) @ rows)[:, list(free)])
-
-
-def _corner_rows(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the corners of an image in homogeneous coordinates: (3, 4)."""
-    return np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
+        return Quality(information, std_px, noise_ratio, aligned.overlap)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,7 +46,8 @@ def correlation_without_noise(covariance: FloatArray, noise: tuple[float, float]
     """
     if independent < _FEWEST:
         return 0.0
-    scene = np.diag(covariance) - noise
-    if np.any(scene < _STANDS_OUT * np.sqrt(2 / independent) * np.asarray(noise)):
+    (first, both), (_, second) = np.asarray(covariance).tolist()
+    scene = first - noise[0], second - noise[1]
+    if any(left < _STANDS_OUT * math.sqrt(2 / independent) * of for left, of in zip(scene, noise, strict=True)):
         return 0.0
-    return float(covariance[0, 1] / np.sqrt(scene.prod()))
+    return float(both / math.sqrt(scene[0] * scene[1]))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
-CONVERGED_PX = 1e-4
+CONVERGED_PX = 1e-3
 CAUCHY = 2.385
 """Residuals of so many typical ones weigh half (95 % efficiency for Gaussian noise)."""
 CONTRADICTION = 8.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,14 +15,14 @@ from photonpano.pipeline.adjustment import Adjustment
 from photonpano.values import Located
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from photonpano.values import BoolArray, Edge, FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class GraphSolution:
     """Where the exposures lie.
 
@@ -33,17 +34,34 @@ class GraphSolution:
         located: (N,) True for nodes that are tied to the anchor.
         contradictions: positions, in the list that was solved, of edges that were dropped because the others outvote them.
         residual_px: root mean square disagreement of the other edges at the corners, 0 for a tree.
-        information: (N, 8, 8) inverse covariance of p1..p8 of a node while all others are held, NaN where not located.
-        std_px: (N,) expected distance of a corner of the frame from where it should be, after the best alignment of the two
-            planes, NaN where not located.
+        assess: makes `information` and `std_px`, which takes about as long as to solve the graph.
     """
 
     homographies: FloatArray
     located: BoolArray
     contradictions: tuple[int, ...]
     residual_px: float
-    information: FloatArray
-    std_px: FloatArray
+    assess: Callable[[], tuple[FloatArray, FloatArray]]
+
+    @property
+    def information(self) -> FloatArray:
+        """Inverse covariances of p1..p8 of each node while all others are held, (N, 8, 8), NaN where not located."""
+        return self._assessed[0]
+
+    @property
+    def std_px(self) -> FloatArray:
+        """How far a corner of the frame is expected to be from where it should, after the best alignment of the two planes.
+
+        (N,), NaN where not located.
+        """
+        return self._assessed[1]
+
+    @cached_property
+    def _assessed(self) -> tuple[FloatArray, FloatArray]:
+        information, std_px = np.full((len(self.located), 8, 8), np.nan), np.full(len(self.located), np.nan)
+        if self.located.sum() > 1:
+            information[self.located], std_px[self.located] = self.assess()
+        return information, std_px
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
@@ -76,9 +94,8 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
     motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
     homographies = np.full((n_nodes, 3, 3), np.nan)
     homographies[anchor] = np.eye(3)
-    information, std_px = np.full((n_nodes, 8, 8), np.nan), np.full(n_nodes, np.nan)
     if not tied:
-        return GraphSolution(homographies, located, (), 0.0, information, std_px)
+        return GraphSolution(homographies, located, (), 0.0, lambda: (np.empty((0, 8, 8)), np.empty(0)))
     pairs = pairs[tied]
     observed = np.array([motion.homography for motion in motions])
     _compose_tree(homographies, order[1:], parents, pairs, observed)
@@ -92,10 +109,11 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
         kept = agreeing
         found, norms = adjustment.minimise(found, kept)
     homographies[located] = found
-    information[located], std_px[located] = adjustment.uncertainty(found, norms, kept)
     residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[kept] ** 2)))
     contradictions = tuple(int(position) for position in positions[~kept])
-    return GraphSolution(homographies, located, contradictions, residual_px, information, std_px)
+    return GraphSolution(
+        homographies, located, contradictions, residual_px, partial(adjustment.uncertainty, found, norms, kept)
+    )
 
 
 def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
-from scipy.signal import find_peaks
 from scipy.sparse.csgraph import connected_components
 
 from photonpano.geometry import apply, corners, inverse
@@ -46,16 +45,9 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
     """
     instants, lengths = _instants(groups), _lengths(groups)
     pairs: set[tuple[int, int]] = set()
-    # TODO-THIN
-    import os
-
-    spacing = float(np.median(np.diff(instants))) if len(groups) > 1 else 1.0
-    every = max(1, round(float(os.environ.get("THIN", "0")) * float(np.median(lengths)) / spacing))
     for index, (instant, length) in enumerate(zip(instants, lengths, strict=True)):
         distances = (instants - instant) / ((lengths + length) / 2)
         for skip in skips:
-            if skip > min(skips) and index % every:
-                continue
             for target in (-skip, skip):
                 if not distances[0] - 0.5 / length <= target <= distances[-1] + 0.5 / length:
                     continue
@@ -106,9 +98,7 @@ def revisits(
     for position, moving in list(enumerate(chosen))[::every]:
         earlier = chosen[:position]
         overlap = _overlaps(homographies[moving], homographies[earlier], frame_shape)
-        # Between nothing before the first exposure and the exposure itself.
-        profile = np.concatenate([[0.0], overlap, [1.0]])
-        peaks = find_peaks(profile, height=min_overlap, prominence=_PROMINENCE)[0] - 1
+        peaks = _visits(overlap, min_overlap)
         peaks = peaks[instants[earlier[peaks]] <= instants[moving] - away]
         best = peaks[np.argsort(-overlap[peaks], kind="stable")[:_MOST_REVISITS]]
         pairs += [(int(moving), int(fixed)) for fixed in np.sort(earlier[best])]
@@ -137,6 +127,24 @@ def _parts(n_groups: int, pairs: set[tuple[int, int]]) -> NDArray[np.integer]:
     moving, fixed = np.array(sorted(pairs), dtype=int).reshape(-1, 2).T
     ties = sparse.csr_array((np.ones(len(moving)), (moving, fixed)), shape=(n_groups, n_groups))
     return np.asarray(connected_components(ties, directed=False)[1])
+
+
+def _visits(overlap: FloatArray, least: float) -> NDArray[np.integer]:
+    """Return where overlap is largest in each earlier visit: it is at least `least`, and prominent.
+
+    As `scipy.signal.find_peaks` does, whose import alone takes a second.
+    """
+    # Between nothing before the first exposure and the exposure itself.
+    profile = np.concatenate([[0.0], overlap, [1.0]])
+    peaks = []
+    for peak in np.flatnonzero((profile[1:-1] >= least) & (profile[1:-1] > profile[:-2]) & (profile[1:-1] >= profile[2:])) + 1:
+        before, after = (np.flatnonzero(side > profile[peak]) for side in (profile[:peak], profile[peak:]))
+        start, stop = before[-1] if before.size else 0, peak + (after[0] if after.size else len(profile) - peak)
+        rises = profile[peak] - max(profile[start:peak].min(), profile[peak:stop].min())
+        if rises >= _PROMINENCE:
+            level = int(np.argmax(profile[peak:] != profile[peak]))
+            peaks.append(peak - 1 + (level - 1) // 2)
+    return np.array(peaks, dtype=int)
 
 
 def _instants(groups: Sequence[Group]) -> FloatArray:

@@ -59,6 +59,7 @@ class Registrar:
         self._exposures = exposures
         # Of all exposures at once: to ask a trajectory costs about the same for one instant as for a thousand.
         self._to_plane = None if known is None else known.at([group.reference for group in exposures.groups])
+        self._from_plane = None if self._to_plane is None else inverse(self._to_plane)
         self._clock = clock
         self._independent = independent_share(exposures.groups)
         self._described: dict[int, _Described] = {}
@@ -199,9 +200,9 @@ class Registrar:
 
     def _initial(self, moving: int, fixed: int) -> Homography | None:
         """Return the motion known so far, in px of exposures."""
-        if self._to_plane is None:
+        if self._to_plane is None or self._from_plane is None:
             return None
-        return rescaled(inverse(self._to_plane[fixed]) @ self._to_plane[moving], self._level.scale)
+        return rescaled(self._from_plane[fixed] @ self._to_plane[moving], self._level.scale)
 
     def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
         """Convert a motion to px of frames, and refuse what no camera does."""

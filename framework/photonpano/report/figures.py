@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import re
 from contextlib import contextmanager
@@ -70,6 +71,12 @@ _STYLE: Any = {
 }
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
+
+
+def load_figures() -> None:
+    """Import what figures are drawn with, which takes a second: another thread can do it while frames are merged."""
+    importlib.import_module("matplotlib.figure")
+    importlib.import_module("matplotlib.backends.backend_svg")
 
 
 def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:

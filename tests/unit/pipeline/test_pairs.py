@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import find_peaks
 
 from photonpano import FrameSpan, Group
 from photonpano.geometry import translation
-from photonpano.pipeline.pairs import pairs_of, revisits, shared_share
+from photonpano.pipeline.pairs import _PROMINENCE, _visits, pairs_of, revisits, shared_share
 
 SHAPE = (40, 60)
 
@@ -226,3 +227,13 @@ def test_pairs_that_meet_are_ordered_unique_and_beyond_the_skips(
         away = np.abs(np.subtract(places[moving], places[fixed]))
         # Counted on a grid of eight by eight.
         assert np.prod(np.maximum(0, 1 - away / [59, 39]) + 1 / 8) >= min_overlap
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_visits_are_the_prominent_peaks_of_the_overlap(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    overlap = np.cumsum(rng.normal(0, 0.15, rng.integers(1, 60))) % 1.0
+    if seed % 2:
+        overlap = np.round(overlap * 8) / 8
+    expected, _ = find_peaks(np.concatenate([[0.0], overlap, [1.0]]), height=0.5, prominence=_PROMINENCE)
+    np.testing.assert_array_equal(_visits(overlap, 0.5), expected - 1)
