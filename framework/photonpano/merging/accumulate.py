@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _BATCH = 16
 """So many chunks are summed before they are added to the grid."""
+_PART_ROWS = 128
+"""A thread adds to about so many rows of the grid at a time."""
 MIN_WEIGHT = 1.0
 """A pixel that was seen in less than one whole frame is unknown."""
 
@@ -82,7 +84,9 @@ def accumulate(
         counts_of: sums the frames of a span, if not the source itself.
     """
     total = _Total.zeros(shape)
-    parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], threads)]
+    # Narrow enough that several threads find work wherever frames lie on the grid.
+    n_parts = 1 if threads == 1 else max(threads, shape[0] // _PART_ROWS)
+    parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], n_parts)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
     placed = landings(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
     # What is started is worked on while the next is started, if there is a pool; results are taken in order.
@@ -124,7 +128,7 @@ def _summed(counts_of: Callable[[FrameSpan], Counts], masked: FluxImage | None, 
         lit, seen = counts.astype(np.float32) * masked, masked * np.float32(n_frames)
         return _Summed(landing, n_frames, average_squares(lit, shrink), average_squares(seen, shrink))
     if shrink == 1:
-        return _Summed(landing, n_frames, counts, None)
+        return _Summed(landing, n_frames, counts if landing.straight else counts.astype(np.float32), None)
     whole = not any(side % shrink for side in counts.shape)
     everywhere = None if whole else average_squares(np.full(counts.shape, n_frames, np.float32), shrink)
     return _Summed(landing, n_frames, average_squares(counts, shrink), everywhere)
@@ -178,8 +182,7 @@ class _Total:
             to_image = to_image @ translation(landing.columns.start, rows.start)
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             box = slice(rows.start, rows.stop), slice(landing.columns.start, landing.columns.stop)
-            pixels = image.astype(np.float32, copy=False)
-            total[box] += cv2.warpPerspective(pixels, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+            total[box] += cv2.warpPerspective(image, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
 
     def result(self) -> PhotonSum:
         add_running_sums(self.steps, self.weight)
