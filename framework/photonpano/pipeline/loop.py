@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from photonpano.errors import PluginError
 from photonpano.pipeline.locate import locate
 from photonpano.pipeline.merge import merge
+from photonpano.pipeline.observers import NOBODY
 from photonpano.pipeline.stopwatch import Stopwatch
 from photonpano.pipeline.trajectory import ReferencedTrajectory
 from photonpano.pipeline.uncertainty import Uncertainty
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from photonpano.pipeline.components import Level
     from photonpano.pipeline.locate import LocatedLevel
+    from photonpano.pipeline.observers import Observers
     from photonpano.pipeline.progress import Progress
     from photonpano.protocols import Source, Trajectory
     from photonpano.spec.settings import GraphSettings
@@ -63,6 +65,7 @@ def estimate_motion(
     threads: int,
     progress: Progress,
     until_converged: bool = False,
+    observers: Observers = NOBODY,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level.
 
@@ -74,6 +77,7 @@ def estimate_motion(
         threads: how many exposures are worked on at once; the result does not depend on it.
         progress: is told of the stages.
         until_converged: stop as soon as a level changes the motion by less than its own uncertainty.
+        observers: are told of the stages of a level when it is done.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -90,6 +94,7 @@ def estimate_motion(
         uncertainty = Uncertainty(located, trajectory, known, source.info.n_frames)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds))
         progress.note(_summary(results[-1]))
+        observers.level_finished(results[-1])
         known = trajectory
         if until_converged and results[-1].converged:
             break
