@@ -110,11 +110,11 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
             component(level.resample),
             component(level.merge),
             tuple(
-                NamedLocator(name, component(choice), _origin(choice))
+                NamedLocator(name, component(choice), origin_of(choice))
                 for name, choice in _named((level.locate, *level.fallbacks))
             ),
             component(level.interpolate),
-            {choice.contribution.kind: _origin(choice) for choice in (level.resample, level.merge, level.interpolate)},
+            {choice.contribution.kind: origin_of(choice) for choice in (level.resample, level.merge, level.interpolate)},
         )
         for number, level in enumerate(plan.levels, start=1)
     )
@@ -127,7 +127,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     for number, level in enumerate(plan.levels, start=1):
         resampler: Resampler = _built(level.resample, context)
         try:
-            with _blaming(_origin(level.resample), number):
+            with _blaming(origin_of(level.resample), number):
                 foreseen.append(resampler.groups(source.info.n_frames, number))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
@@ -164,7 +164,7 @@ def _blaming(origin: str, level: int) -> Iterator[None]:
 
 def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: ContextT) -> ComponentT:
     contribution = choice.contribution
-    who = _origin(choice)
+    who = origin_of(choice)
     for requirement in contribution.requires:
         if importlib.util.find_spec(requirement.module) is None:
             raise PluginError(f'{who} needs {requirement.module}: run pip install "{requirement.install}"')
@@ -176,5 +176,6 @@ def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: Con
         raise PluginError(f"{who} could not be built: {type(error).__name__}: {error}") from error
 
 
-def _origin(choice: Choice[Contribution[Any, Any, Any]]) -> str:
+def origin_of(choice: Choice[Contribution[Any, Any, Any]]) -> str:
+    """Return who provides a component, such as "merger 'photon-mle' of photonpano 0.1.0"."""
     return f"{choice.contribution.kind} {choice.contribution.name!r} of {choice.plugin} {choice.version}"

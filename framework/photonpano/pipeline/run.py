@@ -11,8 +11,9 @@ import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.components import build_levels, origin_of
 from photonpano.pipeline.loop import estimate_motion
+from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.observers import NOBODY
 from photonpano.pipeline.panorama import plan_canvas, render
 from photonpano.pipeline.record import (
@@ -77,8 +78,10 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
         InputError: the capture shows nothing, or does not suit the plan.
         LocationError: the motion could not be found.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
+        PluginError: a component failed in its own way, or broke its contract.
     """
     start = time.perf_counter()
+    source = NamedSource(source, origin_of(plan.source))
     threads = thread_count(plan.run)
     stream = source.info
     reference = _reference_frame(plan, stream.n_frames)
