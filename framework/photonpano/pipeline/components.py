@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
 from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError
-from photonpano.pipeline.probing import summarise
 from photonpano.pipeline.threads import thread_count
 from photonpano.values import Decision
 
@@ -90,6 +89,8 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
         source: the capture.
         decisions: what the components choose because of what the capture shows is added here, once they are at work.
     """
+    from photonpano.pipeline.probing import summarise  # imports OpenCV, which checking a spec does not need
+
     threads = thread_count(plan.run)
     capture = cache(lambda: summarise(source, threads))
     context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
