@@ -59,7 +59,7 @@ def test_a_source_that_raises_or_gives_another_shape_is_named(source: Any, metho
     assert str(caught.value) == f"{ORIGIN} broke its contract at frames 2 to 4: expected the shape {expected}, got (6, 4)"
 
 
-def test_what_is_meant_for_users_passes(source: Any, make_level: Callable, pan: Callable) -> None:
+def test_what_is_meant_for_users_passes(source: Any) -> None:
     error = InputError("the disk was pulled out")
     source.counts = raising(error)
     with pytest.raises(InputError) as caught:
