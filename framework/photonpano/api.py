@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from photonpano.errors import InputError, SpecError
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from photonpano.evaluation import Evaluation
     from photonpano.geometry import Canvas
+    from photonpano.pipeline.observers import Observers
     from photonpano.pipeline.progress import Progress
     from photonpano.protocols import Source, Trajectory
     from photonpano.registry import Catalog
@@ -63,8 +64,19 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
     Raises:
         PhotonpanoError: the run failed; the message says why, and what was in the run folder before is still there.
     """
-    from photonpano import __version__
+    from photonpano.pipeline.observers import Observers
     from photonpano.pipeline.progress import Quiet
+
+    observers = Observers(plan.observers, plan.output.directory)
+    with observers.run(plan.document):
+        record = _run(plan, progress or Quiet(), observers)
+    observers.run_finished(record)
+    return RunResult(plan.output.directory, cast("RunRecord", record))
+
+
+def _run(plan: Plan, progress: Progress, observers: Observers) -> dict[str, Any]:
+    """Run a plan, write its run folder, and return the content of `run.json`."""
+    from photonpano import __version__
     from photonpano.pipeline.run import execute, write_outcome
     from photonpano.pipeline.run_folder import run_folder
     from photonpano.report import RunArrays, load_figures, render_report
@@ -72,7 +84,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
     with open_source(plan) as source, run_folder(plan.output.directory) as folder, ThreadPoolExecutor(1) as aside:
         # A second of imports that nothing waits for.
         aside.submit(load_figures)
-        outcome = execute(plan, source, __version__, progress or Quiet())
+        outcome = execute(plan, source, __version__, progress, observers)
         write_outcome(folder, outcome, source.info.frame_shape)
         arrays = RunArrays(
             preview=outcome.picture,
@@ -84,9 +96,8 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
             frame_shape=source.info.frame_shape,
             reference=outcome.reference,
         )
-        record = cast("RunRecord", outcome.record)
-        folder.write_report(render_report(record, arrays))
-    return RunResult(plan.output.directory, record)
+        folder.write_report(render_report(cast("RunRecord", outcome.record), arrays))
+    return outcome.record
 
 
 def evaluate(

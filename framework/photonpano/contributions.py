@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
+API_VERSION = 1
+"""The version of the contract with plugins: hooks, contributions, protocols. It changes only when plugins must change."""
+
 
 class Config(BaseModel):
     """Base of the configs of components: closed (an unknown key is an error) and frozen.
@@ -111,6 +114,8 @@ class Contribution(Generic[C, ContextT, ComponentT]):
         config: the closed, frozen model of the keys under `with`.
         build: makes the component from its config and the context; heavy libraries are imported here, not before.
         requires: libraries that may be missing, and how to install them.
+        api_version: the version of the contract that the plugin was made for. A plugin that is published writes the number, so
+            that a photonpano with another contract refuses it with a clear message.
     """
 
     kind: ClassVar[str]
@@ -120,6 +125,7 @@ class Contribution(Generic[C, ContextT, ComponentT]):
     config: type[C]
     build: Callable[[C, ContextT], ComponentT]
     requires: tuple[Requirement, ...] = ()
+    api_version: int = API_VERSION
 
     def __post_init__(self) -> None:
         if not _KEBAB.fullmatch(self.name):
@@ -128,6 +134,8 @@ class Contribution(Generic[C, ContextT, ComponentT]):
             raise ValueError(f"{self.name}: the summary is one line, got {self.summary!r}")
         if not issubclass(self.config, BaseModel):
             raise TypeError(f"{self.name}: config is a pydantic model class, got {self.config!r}")
+        if not isinstance(self.api_version, int):
+            raise TypeError(f"{self.name}: api_version is a whole number, such as {API_VERSION}; got {self.api_version!r}")
         settings = self.config.model_config
         if settings.get("extra") != "forbid" or not settings.get("frozen"):
             raise ValueError(

@@ -1,4 +1,4 @@
-"""The extension points: one hook a kind, no arguments, each returns contributions.
+"""The extension points: one hook a kind, no arguments, each returns contributions; and hooks that watch runs.
 
 A plugin is a module with these hooks, named in the entry-point group `photonpano` of its distribution:
 
@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+    from typing import Any
 
     from photonpano.contributions import (
         InterpolatorContribution,
@@ -196,5 +198,84 @@ def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: i
                 config=NearestConfig,
                 build=lambda config, context: Nearest(),
             )
+        ```
+    """
+
+
+@hookspec
+def photonpano_run_started(directory: Path, spec: Mapping[str, Any]) -> None:
+    """Watch a run begin, before its capture is opened.
+
+    Observation hooks look and do not touch: what they are given is frozen, what they return is ignored, and what they raise is
+    logged with the name of their plugin, while the run goes on. They are called in the thread that runs, one after the other. A
+    plugin takes those of the arguments that it needs, by name.
+
+    Args:
+        directory: the run folder. It may not be there yet, and belongs to the run: write elsewhere.
+        spec: the resolved spec, defaults filled in.
+
+    Example:
+        ```python
+        import sys
+
+        from photonpano import hookimpl
+
+
+        @hookimpl
+        def photonpano_run_started(directory, spec):
+            print(f"{directory}: begins with {spec['source']['use']}, seed {spec['run']['seed']}", file=sys.stderr)
+        ```
+    """
+
+
+@hookspec
+def photonpano_stage_finished(
+    directory: Path, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]
+) -> None:
+    """Watch a stage end. Merging and locating alternate, so all four stages of a level are told when the level is done.
+
+    Args:
+        directory: the run folder, which tells runs apart.
+        level: from 1; None for the panorama.
+        stage: "resample", "merge", "locate" or "interpolate"; at the end of the run "render".
+        seconds: how long it took.
+        summary: what it made. resample: `groups`; merge: `exposures`; locate: `pairs`, how many of them `failed`, and `located`
+            exposures; interpolate: `change_px` (None at level 1) and `std_px` (None if not known), as in `run.json`; render:
+            `height` and `width` of the panorama.
+
+    Example:
+        ```python
+        import sys
+
+        from photonpano import hookimpl
+
+
+        @hookimpl
+        def photonpano_stage_finished(level, stage, seconds):
+            where = "" if level is None else f"level {level}: "
+            print(f"{where}{stage} took {seconds:.1f} s", file=sys.stderr)
+        ```
+    """
+
+
+@hookspec
+def photonpano_run_finished(directory: Path, record: Mapping[str, Any] | None, error: str | None) -> None:
+    """Watch a run end, well or not: called once for each run that started.
+
+    Args:
+        directory: the run folder; complete if the run ended well, else as it was before.
+        record: the content of `run.json`; None if the run failed.
+        error: the class of what ended the run, and its message; None if it ended well.
+
+    Example:
+        ```python
+        import sys
+
+        from photonpano import hookimpl
+
+
+        @hookimpl
+        def photonpano_run_finished(directory, record, error):
+            print(f"{directory}: {error or 'done'}", file=sys.stderr)
         ```
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import itertools
 import re
 import shlex
 import shutil
@@ -34,6 +35,8 @@ BLOCK = re.compile(
     r"|^<!-- test: setup\n(?P<setup>.*?)^-->$",
     re.MULTILINE | re.DOTALL,
 )
+
+ASSIGNMENT = re.compile(r"[A-Z_]+=")
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,8 @@ class Reader:
             exec(compile("\n" * block.line + block.text, str(block.page), "exec"), self.names)
 
     def run_command(self, block: Block, words: list[str], shown: str) -> None:
+        environment = dict(word.split("=", 1) for word in itertools.takewhile(ASSIGNMENT.match, words))
+        words = words[len(environment) :]
         match words:
             case ["photonpano", *arguments]:
                 pass
@@ -160,7 +165,7 @@ class Reader:
                 pytest.fail(f"{block}: no rule for {words}")
         arguments, target = (arguments[:-2], arguments[-1]) if ">" in arguments else (arguments, None)
         more = "--help" if block.marker == "test: parse" else block.argument("test: with")
-        done = CliRunner().invoke(app, arguments + shlex.split(more or ""), prog_name="photonpano")
+        done = CliRunner().invoke(app, arguments + shlex.split(more or ""), env=environment, prog_name="photonpano")
         fails = "error:" in shown
         assert (done.exit_code != 0) == fails, f"{block}: {words}\n{done.output}\n{done.exception!r}"
         if target is not None:

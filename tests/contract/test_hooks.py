@@ -5,19 +5,16 @@ from __future__ import annotations
 import inspect
 import re
 import types
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, PluginError, api, hookspecs
+from photonpano import FrameSpan, Group, PluginError, api, hookspecs, registry
 from photonpano.registry import discover
-from photonpano.registry.plugins import contributions_of
+from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.spec import parse_spec
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import Any
 
 HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}
 KINDS = {
@@ -26,6 +23,19 @@ KINDS = {
     "photonpano_mergers": ("merger", "naive-sum"),
     "photonpano_locators": ("locator", "never-found"),
     "photonpano_interpolators": ("interpolator", "nearest"),
+}
+
+
+WATCHED = {
+    "photonpano_run_started": "runs/scan: begins with simulator, seed 3\n",
+    "photonpano_stage_finished": "level 2: locate took 1.5 s\n",
+    "photonpano_run_finished": "runs/scan: done\n",
+}
+"""What the examples of the hooks that watch runs print, of `TOLD`."""
+TOLD: dict[str, dict[str, Any]] = {
+    "photonpano_run_started": {"spec": {"source": {"use": "simulator"}, "run": {"seed": 3}}},
+    "photonpano_stage_finished": {"level": 2, "stage": "locate", "seconds": 1.46, "summary": {}},
+    "photonpano_run_finished": {"record": {}, "error": None},
 }
 
 
@@ -38,8 +48,10 @@ def example_of(hook: str) -> types.ModuleType:
     return module
 
 
-def test_there_is_one_hook_for_each_kind() -> None:
-    assert set(HOOKS) == set(KINDS)
+def test_every_hook_offers_a_kind_or_watches_runs_and_is_tested_here() -> None:
+    assert set(HOOKS) == {*KINDS, *WATCHED}
+    assert {hook: kind for hook, (kind, _) in KINDS.items()} == {kind.hook: kind.name for kind in registry.KINDS.values()}
+    assert set(WATCHED) == set(OBSERVATION_HOOKS)
 
 
 @pytest.mark.parametrize("hook", KINDS)
@@ -47,6 +59,19 @@ def test_a_hook_takes_nothing_and_shows_a_complete_example(hook: str) -> None:
     assert not inspect.signature(HOOKS[hook]).parameters
     (contribution,) = contributions_of(example_of(hook))
     assert (contribution.kind, contribution.name) == KINDS[hook]
+
+
+@pytest.mark.parametrize("hook", WATCHED)
+def test_a_hook_that_watches_explains_its_arguments_and_shows_a_complete_example(
+    hook: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    docstring = inspect.getdoc(HOOKS[hook]) or ""
+    arguments = list(inspect.signature(HOOKS[hook]).parameters)
+    assert re.findall(r"^    (\w+): ", docstring.partition("Args:\n")[2].partition("Example:")[0], re.MULTILINE) == arguments
+    observation = observation_of(example_of(hook))
+    assert set(TOLD[hook]) | {"directory"} == set(arguments)
+    getattr(observation, hook)(directory=Path("runs/scan"), **TOLD[hook])
+    assert capsys.readouterr().err == WATCHED[hook]
 
 
 @pytest.mark.parametrize("section", ["merge", "interpolate"])

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
-HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile")
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia", "pycolmap")
+COMMANDS = ["--help", "plugins list", "plugins show direct", "schema", "check scan.yaml"]
+HELP_SECONDS = 0.5
 
 
-def imported_by(statement: str) -> set[str]:
-    """Return the top-level modules that a fresh interpreter holds after a statement."""
-    code = f"{statement}\nimport sys; print(*{{name.split('.')[0] for name in sys.modules}})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return set(done.stdout.split())
+def imported_by(statement: str, folder: Path | None = None) -> set[str]:
+    """Return the top-level modules that a fresh interpreter holds when it has done a statement and ends."""
+    tell = "import atexit, sys; atexit.register(lambda: print(*{name.split('.')[0] for name in sys.modules}, file=sys.stderr))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{tell}\n{statement}"], capture_output=True, text=True, check=True, cwd=folder
+    )
+    return set(done.stderr.split())
 
 
 def test_the_package_imports_nothing_at_all() -> None:
@@ -33,3 +42,32 @@ def test_the_package_imports_nothing_at_all() -> None:
 )
 def test_what_plugins_offer_is_told_without_their_libraries(statement: str) -> None:
     assert imported_by(statement) & set(HEAVY) == set()
+
+
+@pytest.mark.parametrize("arguments", COMMANDS)
+def test_commands_that_do_not_run_need_no_heavy_library(arguments: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.zeros((2000, 16, 2), np.uint8))
+    (tmp_path / "scan.yaml").write_text(
+        "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\nresample: {with: {group_size: 100}}\n"
+    )
+    command = f"import sys; sys.argv[1:] = {arguments.split()}; from photonpano.cli import main; main()"
+    loaded = imported_by(command, tmp_path)
+    assert "typer" in loaded
+    assert loaded & set(HEAVY) == set()
+
+
+def test_help_is_quick() -> None:
+    """In seconds of the processor, the best of a few: what else the machine does is not ours."""
+    resource = pytest.importorskip("resource", reason="only Unix tells the time of a process that has ended")
+
+    def spent() -> float:
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return float(usage.ru_utime + usage.ru_stime)
+
+    def seconds() -> float:
+        before = spent()
+        command = [sys.executable, "-c", "from photonpano.cli import main; main()", "--help"]
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+        return spent() - before
+
+    assert min(seconds() for _ in range(3)) < HELP_SECONDS

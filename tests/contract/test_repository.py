@@ -40,6 +40,14 @@ def test_every_dependency_is_pinned_to_a_version_that_it_allows() -> None:
         assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)]), line
 
 
+def test_every_extra_is_what_a_component_asks_for() -> None:
+    """What is said of a missing library, `pip install "photonpano[kornia]"`, names an extra that there is, and none is idle."""
+    rows = [entry for entry in photonpano.discover().rows if entry.plugin == "photonpano"]
+    asked = {requirement.install for entry in rows for requirement in entry.contribution.requires}
+    extras = {f"photonpano[{name}]" for name in PROJECT["project"]["optional-dependencies"] if name != "dev"}
+    assert asked == extras
+
+
 @pytest.mark.parametrize(
     "listed",
     [

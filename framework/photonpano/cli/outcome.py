@@ -1,5 +1,6 @@
 """How commands end: what goes wrong becomes a message on stderr and an exit code."""
 
+import logging
 import sys
 import traceback
 from collections.abc import Iterator
@@ -18,12 +19,16 @@ INTERRUPTED = 130
 def reported(*, debug: bool = False) -> Iterator[None]:
     """Report the errors of a command that are made for users; others are defects and keep their traceback.
 
+    What is logged as a warning meanwhile, such as what a plugin that watches runs has raised, is printed as one.
+
     Args:
-        debug: whether errors made for users show their traceback as well.
+        debug: whether errors made for users, and warnings, show their traceback as well.
 
     Raises:
         typer.Exit: with the exit code of what went wrong.
     """
+    logger, handler = logging.getLogger("photonpano"), _Warnings(debug)
+    logger.addHandler(handler)
     try:
         yield
         sys.stdout.flush()  # a closed pipe shows here at the latest, and typer ends in silence
@@ -34,6 +39,23 @@ def reported(*, debug: bool = False) -> Iterator[None]:
     except KeyboardInterrupt as error:
         typer.echo("\ninterrupted; nothing half-written is left under a final name", err=True)
         raise typer.Exit(INTERRUPTED) from error
+    finally:
+        logger.removeHandler(handler)
+
+
+class _Warnings(logging.Handler):
+    """Prints what is logged, a line each."""
+
+    def __init__(self, debug: bool) -> None:
+        super().__init__(logging.WARNING)
+        self._debug = debug
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a warning."""
+        if self._debug and record.exc_info:
+            traceback.print_exception(record.exc_info[1])
+        # Not by typer, which would write past the progress bars.
+        sys.stderr.write(f"warning: {record.getMessage()}\n")
 
 
 def _told(error: PhotonpanoError) -> int:

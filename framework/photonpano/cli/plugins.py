@@ -2,12 +2,14 @@
 
 import json
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
 if TYPE_CHECKING:
-    from photonpano.registry import Catalog, Entry
+    from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer
+
+    Origin: TypeAlias = BrokenPlugin | DisabledPlugin | Entry | Observer
 
 plugins = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="See what the installed plugins offer.")
 
@@ -45,8 +47,8 @@ def list_plugins(
     if as_json:
         typer.echo(json.dumps(_data(rows, catalog), indent=2))
         return
-    if rows:
-        table = [[entry.kind, entry.name, f"{entry.plugin} {entry.version}", _summary(entry, catalog)] for entry in rows]
+    table = [] if broken else _table(rows, catalog, with_observers=kind is None)
+    if table:
         typer.echo(columns([["KIND", "NAME", "PLUGIN", "SUMMARY"], *table]))
     if broken:
         for plugin in catalog.broken:
@@ -67,22 +69,44 @@ def show_plugin(
             metavar="KIND", help=f"Its kind, if components of several have the name: {_KIND_NAMES}.", show_default=False
         ),
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
     """Show a component, its keys, and YAML to paste.
 
     Example: photonpano plugins show opencv-sift
     """
     from photonpano.registry import discover
-    from photonpano.registry.suggestions import suggestion
 
     catalog = discover()
-    offered = [entry for entry in catalog.rows if kind is None or entry.kind == kind.value]
-    kinds = dict.fromkeys(entry.kind for entry in offered if entry.name == name)
+    wanted = None if kind is None else kind.value
+    kinds = dict.fromkeys(entry.kind for entry in catalog.rows if entry.name == name and wanted in (None, entry.kind))
     if not kinds:
-        what = "component" if kind is None else kind.value
-        hint = suggestion(name, [entry.name for entry in offered])
-        raise typer.BadParameter(f"there is no {what} {name!r}; {hint or 'no plugin offers any'}", param_hint="'NAME'")
-    typer.echo("\n\n".join(_page(catalog.find(each, name)) for each in kinds))
+        raise typer.BadParameter(catalog.unknown(wanted, name), param_hint="'NAME'")
+    entries = [catalog.find(each, name) for each in kinds]
+    if as_json:
+        typer.echo(json.dumps({"components": [_details(entry) for entry in entries]}, indent=2))
+    else:
+        typer.echo("\n\n".join(map(_page, entries)))
+
+
+def _table(rows: list["Entry"], catalog: "Catalog", with_observers: bool) -> list[list[str]]:
+    """Return the rows of the list: components, plugins that watch runs, and plugins of which nothing is known."""
+    return [
+        *([entry.kind, entry.name, _release(entry), _summary(entry, catalog)] for entry in rows),
+        *(
+            ["observer", _label(each), _release(each), f"Watches runs: {', '.join(each.watches)}"]
+            for each in (catalog.observers if with_observers else ())
+        ),
+        *(["disabled", _label(each), _release(each), f"By {each.by}"] for each in catalog.disabled),
+    ]
+
+
+def _release(plugin: "Origin") -> str:
+    return f"{plugin.plugin} {plugin.version}"
+
+
+def _label(plugin: "Origin") -> str:
+    return plugin.entry_point.partition(" = ")[0]
 
 
 def _summary(entry: "Entry", catalog: "Catalog") -> str:
@@ -95,22 +119,33 @@ def _summary(entry: "Entry", catalog: "Catalog") -> str:
 
 def _data(rows: list["Entry"], catalog: "Catalog") -> dict[str, Any]:
     return {
-        "components": [
-            {
-                "kind": entry.kind,
-                "name": entry.name,
-                "summary": entry.contribution.summary,
-                "plugin": entry.plugin,
-                "version": entry.version,
-                "entry_point": entry.entry_point,
-                "unavailable": entry.unavailable,
-            }
-            for entry in rows
-        ],
-        "broken": [
-            {"plugin": each.plugin, "version": each.version, "entry_point": each.entry_point, "error": each.error}
-            for each in catalog.broken
-        ],
+        "components": [_facts(entry) for entry in rows],
+        "broken": [_origin(each) | {"error": each.error} for each in catalog.broken],
+        "disabled": [_origin(each) | {"by": each.by} for each in catalog.disabled],
+        "observers": [_origin(each) | {"hooks": each.watches} for each in catalog.observers],
+    }
+
+
+def _origin(plugin: "Origin") -> dict[str, Any]:
+    return {"plugin": plugin.plugin, "version": plugin.version, "entry_point": plugin.entry_point}
+
+
+def _facts(entry: "Entry") -> dict[str, Any]:
+    named = {"kind": entry.kind, "name": entry.name, "summary": entry.contribution.summary}
+    return named | _origin(entry) | {"unavailable": entry.unavailable}
+
+
+def _details(entry: "Entry") -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from photonpano.registry import describe
+
+    description = describe(entry.contribution)
+    return _facts(entry) | {
+        "api_version": entry.contribution.api_version,
+        "requires": [asdict(each) for each in entry.contribution.requires],
+        "keys": [asdict(row) for row in description.rows],
+        "snippet": description.snippet,
     }
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
 from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError
-from photonpano.pipeline.probing import summarise
 from photonpano.pipeline.threads import thread_count
 from photonpano.values import Decision
 
@@ -90,6 +89,8 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
         source: the capture.
         decisions: what the components choose because of what the capture shows is added here, once they are at work.
     """
+    from photonpano.pipeline.probing import summarise  # imports OpenCV, which checking a spec does not need
+
     threads = thread_count(plan.run)
     capture = cache(lambda: summarise(source, threads))
     context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
@@ -110,11 +111,11 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
             component(level.resample),
             component(level.merge),
             tuple(
-                NamedLocator(name, component(choice), _origin(choice))
+                NamedLocator(name, component(choice), origin_of(choice))
                 for name, choice in _named((level.locate, *level.fallbacks))
             ),
             component(level.interpolate),
-            {choice.contribution.kind: _origin(choice) for choice in (level.resample, level.merge, level.interpolate)},
+            {choice.contribution.kind: origin_of(choice) for choice in (level.resample, level.merge, level.interpolate)},
         )
         for number, level in enumerate(plan.levels, start=1)
     )
@@ -127,7 +128,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     for number, level in enumerate(plan.levels, start=1):
         resampler: Resampler = _built(level.resample, context)
         try:
-            with _blaming(_origin(level.resample), number):
+            with _blaming(origin_of(level.resample), number):
                 foreseen.append(resampler.groups(source.info.n_frames, number))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
@@ -164,7 +165,7 @@ def _blaming(origin: str, level: int) -> Iterator[None]:
 
 def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: ContextT) -> ComponentT:
     contribution = choice.contribution
-    who = _origin(choice)
+    who = origin_of(choice)
     for requirement in contribution.requires:
         if importlib.util.find_spec(requirement.module) is None:
             raise PluginError(f'{who} needs {requirement.module}: run pip install "{requirement.install}"')
@@ -176,5 +177,6 @@ def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: Con
         raise PluginError(f"{who} could not be built: {type(error).__name__}: {error}") from error
 
 
-def _origin(choice: Choice[Contribution[Any, Any, Any]]) -> str:
+def origin_of(choice: Choice[Contribution[Any, Any, Any]]) -> str:
+    """Return who provides a component, such as "merger 'photon-mle' of photonpano 0.1.0"."""
     return f"{choice.contribution.kind} {choice.contribution.name!r} of {choice.plugin} {choice.version}"

@@ -11,7 +11,7 @@ import numpy as np
 from photonpano.pipeline.diagnosis import require_tied
 from photonpano.pipeline.graph import components, solve
 from photonpano.pipeline.pairs import pairs_of, revisits
-from photonpano.pipeline.registration import Registrar
+from photonpano.pipeline.registration import Registrar, require_motion
 from photonpano.values import FrameSpan, NotLocated
 
 if TYPE_CHECKING:
@@ -114,6 +114,7 @@ def locate(
     with ThreadPoolExecutor(threads) as pool:
         with progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, threads, advance))
+        require_motion(level, edges)
         with clock("locate"):
             labels = components(len(groups), edges)
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)

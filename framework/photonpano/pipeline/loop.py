@@ -9,19 +9,22 @@ from typing import TYPE_CHECKING
 from photonpano.errors import PluginError
 from photonpano.pipeline.locate import locate
 from photonpano.pipeline.merge import merge
+from photonpano.pipeline.named import NamedTrajectory
+from photonpano.pipeline.observers import NOBODY
 from photonpano.pipeline.stopwatch import Stopwatch
 from photonpano.pipeline.trajectory import ReferencedTrajectory
 from photonpano.pipeline.uncertainty import Uncertainty
+from photonpano.values import Group
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from photonpano.pipeline.components import Level
     from photonpano.pipeline.locate import LocatedLevel
+    from photonpano.pipeline.observers import Observers
     from photonpano.pipeline.progress import Progress
     from photonpano.protocols import Source, Trajectory
     from photonpano.spec.settings import GraphSettings
-    from photonpano.values import Group
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +66,7 @@ def estimate_motion(
     threads: int,
     progress: Progress,
     until_converged: bool = False,
+    observers: Observers = NOBODY,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level.
 
@@ -74,6 +78,7 @@ def estimate_motion(
         threads: how many exposures are worked on at once; the result does not depend on it.
         progress: is told of the stages.
         until_converged: stop as soon as a level changes the motion by less than its own uncertainty.
+        observers: are told of the stages of a level when it is done.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -90,6 +95,7 @@ def estimate_motion(
         uncertainty = Uncertainty(located, trajectory, known, source.info.n_frames)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds))
         progress.note(_summary(results[-1]))
+        observers.level_finished(results[-1])
         known = trajectory
         if until_converged and results[-1].converged:
             break
@@ -100,12 +106,15 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
     """Choose the groups of a level (paper, section 4, "Re-sample").
 
     Raises:
-        PluginError: they are not in order, or lie outside the capture.
+        PluginError: they are no groups, not in order, or lie outside the capture.
     """
     with clock("resample"), level.blaming("resampler"):
-        groups = level.resampler.groups(n_frames, level.number)
-    instants = [group.reference for group in groups]
+        groups = tuple(level.resampler.groups(n_frames, level.number))
     who = f"{level.origins['resampler']} broke its contract at level {level.number}"
+    for group in groups:
+        if not isinstance(group, Group):
+            raise PluginError(f"{who}: expected groups, got {group!r:.60}")
+    instants = [group.reference for group in groups]
     if not groups or any(later <= earlier for earlier, later in pairwise(instants)):
         raise PluginError(f"{who}: expected at least one group, in order, each instant once; got the instants {instants}")
     if beyond := [str(group) for group in groups if group.span.stop > n_frames]:
@@ -117,7 +126,7 @@ def interpolate(level: Level, located: LocatedLevel, reference: int, clock: Stop
     """Turn the located instants into a homography for every frame (paper, section 4, "Interpolate")."""
     with clock("interpolate"), level.blaming("interpolator"):
         free = level.interpolator.fit(located.instants, located.homographies, located.information)
-        return ReferencedTrajectory(free, reference)
+        return ReferencedTrajectory(NamedTrajectory(free, level), reference)
 
 
 def _summary(result: LevelResult) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from photonpano.errors import PluginError
+from photonpano.values import VirtualExposure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from photonpano.pipeline.components import Level
     from photonpano.pipeline.stopwatch import Stopwatch
     from photonpano.protocols import Source, Trajectory
-    from photonpano.values import Group, VirtualExposure
+    from photonpano.values import Group
 
 
 def merge(
@@ -53,6 +54,11 @@ class VirtualExposures:
         level = self._level
         with self._clock("merge"), level.blaming("merger"):
             exposure = level.merger.merge(self._source, self.groups[index], self._known, level.scale)
+        if not isinstance(exposure, VirtualExposure):
+            raise PluginError(
+                f"{level.origins['merger']} broke its contract at level {level.number}: "
+                f"expected a VirtualExposure, got {type(exposure).__name__}"
+            )
         if exposure.scale != level.scale:
             raise PluginError(
                 f"{level.origins['merger']} broke its contract at level {level.number}: "

@@ -176,8 +176,14 @@ def _failures(result: LevelResult) -> Iterator[dict[str, Any]]:
             "moving": [moving.start, moving.stop],
             "fixed": [fixed.start, fixed.stop],
             "reason": edge.motion.reason,
-            "evidence": dict(edge.motion.evidence),
+            "evidence": {key: _number(value) for key, value in edge.motion.evidence.items()},
         }
+
+
+def _number(value: float) -> float | None:
+    """Return what a locator counted as JSON can hold it: numbers of Python, None for what is not finite."""
+    plain: float = value.item() if isinstance(value, np.generic) else value
+    return plain if np.isfinite(plain) else None
 
 
 def _contradictions(result: LevelResult) -> Iterator[dict[str, list[int]]]:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from photonpano.errors import PluginError
-from photonpano.geometry import implausibility, inverse, rescaled
+from photonpano.geometry import corner_displacements, implausibility, inverse, rescaled
 from photonpano.pipeline.agreement import agreement
 from photonpano.pipeline.diagnosis import Contrast, contrast_of
 from photonpano.pipeline.pairs import independent_share, shared_share
+from photonpano.registry.suggestions import listed
 from photonpano.values import Edge, Located, NotLocated
 
 if TYPE_CHECKING:
@@ -30,6 +32,9 @@ BRIDGE = 3
 """An exposure that none of its pairs ties to an earlier one is tried against so many predecessors."""
 SHARED_PHOTONS = 0.05
 """The least weight of a pair. Photons that two exposures share say where the motion known so far puts them, and nothing new."""
+STILL_SHARE = 0.1
+"""Where the motion known so far moves the corners by this share of the shorter side of a frame, the identity is no answer. The
+first level errs by a few pixels, so a locator of whole pixels may rightly see nothing move where less is expected."""
 MIN_AGREEMENT = 0.7
 """Views of one place at different times agree by 0.9 and more where photons tell; different places by less than half."""
 
@@ -192,10 +197,10 @@ class Registrar:
         with self._clock("locate"):
             with self._level.blaming(locator):
                 motion = locator.component.register(*features, initial)
+            if broken := broken_promise(motion) or self._standstill(motion, initial):
+                raise PluginError(f"{locator.origin} broke its contract at level {self._level.number}: {broken}")
             if isinstance(motion, NotLocated):
                 return motion
-            if broken := broken_promise(motion):
-                raise PluginError(f"{locator.origin} broke its contract at level {self._level.number}: {broken}")
             return self._checked(motion, moving, fixed)
 
     def _initial(self, moving: int, fixed: int) -> Homography | None:
@@ -203,6 +208,16 @@ class Registrar:
         if self._to_plane is None or self._from_plane is None:
             return None
         return rescaled(self._from_plane[fixed] @ self._to_plane[moving], self._level.scale)
+
+    def _standstill(self, motion: Located | NotLocated, initial: Homography | None) -> str | None:
+        """Tell that a locator gives the identity where the motion known so far is far from it; None if all is well."""
+        if initial is None or isinstance(motion, NotLocated) or not is_identity(motion.homography):
+            return None
+        shape = self._exposures.frame_shape
+        moved_px = corner_displacements(rescaled(initial, 1 / self._level.scale), np.eye(3), shape).mean()
+        if moved_px < STILL_SHARE * min(shape):
+            return None
+        return f"got the identity where the motion known so far moves the corners by {moved_px:.0f} px; a failure is NotLocated"
 
     def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
         """Convert a motion to px of frames, and refuse what no camera does."""
@@ -229,15 +244,48 @@ def _lost_by_all(lost: Mapping[str, NotLocated]) -> NotLocated:
 
 
 def broken_promise(motion: object) -> str | None:
-    """Tell what is wrong with what a locator calls a located pair; None if nothing is."""
-    if not isinstance(motion, Located):
+    """Tell what is wrong with what a locator returns for a pair; None if nothing is."""
+    if not isinstance(motion, Located | NotLocated):
         return f"expected Located or NotLocated, got {type(motion).__name__}"
+    for key, value in motion.evidence.items():
+        if not isinstance(value, Real | np.generic):
+            return f"evidence consists of numbers, got {key} = {value!r:.60}"
+    if isinstance(motion, NotLocated):
+        return None
     matrix, information = np.asarray(motion.homography), motion.information
     if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)) or matrix[2, 2] == 0:
         return f"a homography is a finite (3, 3) matrix with h33 = 1, got {matrix.tolist()}; a failure is NotLocated"
     if information is not None and not _is_positive_definite(np.asarray(information)):
         return "information is an inverse covariance: an (8, 8) matrix, finite and positive definite; None if there is none"
     return None
+
+
+def require_motion(level: Level, edges: Sequence[Edge]) -> None:
+    """Refuse a level where nothing moves, to the last digit, in any pair: it is what a locator gives that fails unnoticed.
+
+    Photon noise sees to it that a camera which stands still gives nearly, and never exactly, the identity.
+
+    Args:
+        level: its locators.
+        edges: its pairs.
+
+    Raises:
+        PluginError: every located pair is exactly the identity.
+    """
+    located = [(edge.locator, edge.motion.homography) for edge in edges if isinstance(edge.motion, Located)]
+    if not located or not all(is_identity(homography) for _, homography in located):
+        return
+    names = {name for name, _ in located}
+    origins = listed(locator.origin for locator in level.locators if locator.name in names)
+    raise PluginError(
+        f"{origins} broke {'its' if len(names) == 1 else 'their'} contract at level {level.number}: every pair that was "
+        "located is exactly the identity, which a camera that stands still does not give; a failure is NotLocated"
+    )
+
+
+def is_identity(homography: Homography) -> bool:
+    """Tell whether a map is the identity to within rounding, which no estimate from photons is."""
+    return bool(np.abs(np.asarray(homography) - np.eye(3)).max() < 1e-9)
 
 
 def _is_positive_definite(matrix: FloatArray) -> bool:

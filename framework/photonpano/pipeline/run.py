@@ -11,8 +11,10 @@ import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.components import build_levels, origin_of
 from photonpano.pipeline.loop import estimate_motion
+from photonpano.pipeline.named import NamedSource
+from photonpano.pipeline.observers import NOBODY
 from photonpano.pipeline.panorama import plan_canvas, render
 from photonpano.pipeline.record import (
     level_record,
@@ -32,6 +34,7 @@ from photonpano.values import Decision, FrameSpan
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano.pipeline.observers import Observers
     from photonpano.pipeline.progress import Progress
     from photonpano.pipeline.run_folder import RunFolder
     from photonpano.protocols import Source
@@ -68,15 +71,17 @@ class RunOutcome:
         return tone_mapped(self.panorama.flux, self.record["panorama"]["white_flux"])
 
 
-def execute(plan: Plan, source: Source, version: str, progress: Progress) -> RunOutcome:
+def execute(plan: Plan, source: Source, version: str, progress: Progress, observers: Observers = NOBODY) -> RunOutcome:
     """Run a plan on its open source: the loop, then the panorama.
 
     Raises:
         InputError: the capture shows nothing, or does not suit the plan.
         LocationError: the motion could not be found.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
+        PluginError: a component failed in its own way, or broke its contract.
     """
     start = time.perf_counter()
+    source = NamedSource(source, origin_of(plan.source))
     threads = thread_count(plan.run)
     stream = source.info
     reference = _reference_frame(plan, stream.n_frames)
@@ -88,7 +93,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     decisions: list[Decision] = []
     levels = build_levels(plan, source, decisions)
     with one_thread_inside():
-        results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged)
+        results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged, observers)
     if plan.until_converged:
         decisions.append(levels_decision(results))
     trajectory = results[-1].trajectory
@@ -97,6 +102,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress) -> Run
     canvas = plan_canvas(trajectory, covered, stream.frame_shape, plan.render.scale, int(plan.run.memory))
     with one_thread_inside():
         panorama = render(source, trajectory, covered, canvas, plan.render.tolerance_px, threads, progress)
+    observers.rendered(canvas, time.perf_counter() - rendering)
     seen = panorama.weight > 0
     white_flux = float(np.quantile(panorama.flux[seen], plan.render.white_quantile)) or 1.0
     frames = np.arange(stream.n_frames)

@@ -6,7 +6,6 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-import cv2
 from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
@@ -25,6 +24,8 @@ def thread_count(settings: RunSettings) -> int:
 @contextmanager
 def one_thread_inside() -> Iterator[None]:
     """Keep OpenCV and BLAS from starting threads of their own under ours: they would fight for the cores."""
+    import cv2
+
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -1,8 +1,21 @@
 """Discovery of plugins and the catalog of what they contribute."""
 
-from photonpano.registry.catalog import BrokenPlugin, Catalog, Entry
+from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry
 from photonpano.registry.description import ConfigRow, Description, describe
 from photonpano.registry.discovery import discover
 from photonpano.registry.kinds import KINDS, Kind
+from photonpano.registry.observers import Observer
 
-__all__ = ["KINDS", "BrokenPlugin", "Catalog", "ConfigRow", "Description", "Entry", "Kind", "describe", "discover"]
+__all__ = [
+    "KINDS",
+    "BrokenPlugin",
+    "Catalog",
+    "ConfigRow",
+    "Description",
+    "DisabledPlugin",
+    "Entry",
+    "Kind",
+    "Observer",
+    "describe",
+    "discover",
+]

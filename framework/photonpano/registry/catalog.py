@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from photonpano.contributions import Contribution
 from photonpano.errors import PluginError
 from photonpano.registry.kinds import KINDS
-from photonpano.registry.plugins import contributions_of
+from photonpano.registry.observers import Observer
+from photonpano.registry.plugins import contributions_of, observation_of, require_same_contract
 from photonpano.registry.suggestions import listed, suggestion
 
 if TYPE_CHECKING:
@@ -81,16 +82,40 @@ class BrokenPlugin:
 
 
 @dataclass(frozen=True, slots=True)
+class DisabledPlugin:
+    """A plugin that was not imported, because the environment says so.
+
+    Attributes:
+        plugin: its distribution.
+        version: the version of that distribution.
+        entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
+        by: what disables it, such as "PHOTONPANO_DISABLE_PLUGINS=core".
+    """
+
+    plugin: str
+    version: str
+    entry_point: str
+    by: str
+
+    def __str__(self) -> str:
+        return f"{self.plugin} {self.version} ({self.entry_point}), by {self.by}"
+
+
+@dataclass(frozen=True, slots=True)
 class Catalog:
     """What can be chosen in a spec. `discover()` makes one from the installed plugins; `Catalog()` is empty.
 
     Attributes:
         rows: every component on offer, ordered by kind and name.
         broken: the plugins that failed; none of their components is on offer.
+        disabled: the plugins that were not imported; what they offer is not known.
+        observers: the plugins that watch runs.
     """
 
     rows: tuple[Entry, ...] = ()
     broken: tuple[BrokenPlugin, ...] = ()
+    disabled: tuple[DisabledPlugin, ...] = ()
+    observers: tuple[Observer, ...] = ()
 
     def names(self, kind: str) -> tuple[str, ...]:
         """Return the names on offer for a kind, such as "locator", in alphabetical order."""
@@ -104,14 +129,15 @@ class Catalog:
             name: what specs call it.
 
         Raises:
-            PluginError: no plugin offers the name (says the nearest ones, and which plugins are broken), or several do.
+            PluginError: no plugin offers the name (says the nearest ones, and which plugins are broken
+                or disabled), or several do.
         """
         found = [entry for entry in self.rows if entry.kind == kind and entry.name == name]
         if not found:
-            raise PluginError(self._unknown(kind, name))
+            raise PluginError(self.unknown(kind, name))
         if len(found) > 1:
             origins = listed(entry.origin for entry in found)
-            raise PluginError(f"the {kind} {name!r} is offered by {origins}; uninstall all but one")
+            raise PluginError(f"the {kind} {name!r} is offered by {origins}; uninstall or disable all but one")
         return found[0]
 
     def get(self, kind: str, name: str) -> Entry:
@@ -139,20 +165,35 @@ class Catalog:
             PluginError: one of the plugins is broken.
         """
         added: list[Entry] = []
+        observers = list(self.observers)
         for offer in offers:
-            given = (offer,) if isinstance(offer, Contribution) else contributions_of(offer)
+            if isinstance(offer, Contribution):
+                require_same_contract(offer)
+                given: tuple[AnyContribution, ...] = (offer,)
+            else:
+                given = contributions_of(offer)
+                if hook := observation_of(offer):
+                    name = getattr(offer, "__name__", type(offer).__name__)
+                    observers.append(Observer(name, "unreleased", "given in Python", hook))
             added += [make_entry(each, each.build.__module__, "unreleased", "given in Python") for each in given]
-        return Catalog(ordered([*self.rows, *added]), self.broken)
+        return replace(self, rows=ordered([*self.rows, *added]), observers=tuple(observers))
 
-    def _unknown(self, kind: str, name: str) -> str:
-        message = f"there is no {kind} {name!r}"
+    def unknown(self, kind: str | None, name: str) -> str:
+        """Say that no plugin offers a name: the nearest ones, and which plugins might, were they not broken or disabled.
+
+        Args:
+            kind: such as "locator"; None if any would do.
+            name: what was asked for.
+        """
+        message = f"there is no {kind or 'component'} {name!r}"
         others = [entry.kind for entry in self.rows if entry.name == name]
-        hint = f"it is one of the {others[0]}s" if others else suggestion(name, self.names(kind))
-        if hint:
+        near = suggestion(name, {entry.name for entry in self.rows if kind in (None, entry.kind)})
+        if hint := f"it is one of the {others[0]}s" if others else near:
             message += f"; {hint}"
-        if self.broken:
-            stop = " " if message.endswith("?") else ". "
-            message += f"{stop}Broken plugins may have offered it: {listed(map(str, self.broken))}"
+        for state, plugins in (("Broken", self.broken), ("Disabled", self.disabled)):
+            if plugins:
+                stop = " " if message.endswith("?") else ". "
+                message += f"{stop}{state} plugins may have offered it: {listed(map(str, plugins))}"
         return message
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pluggy
 
 from photonpano import hookspecs
-from photonpano.contributions import Contribution
+from photonpano.contributions import API_VERSION, Contribution
 from photonpano.errors import PluginError
 from photonpano.registry.kinds import KINDS, Kind
 from photonpano.registry.suggestions import listed
@@ -16,19 +16,54 @@ if TYPE_CHECKING:
     from photonpano.contributions import AnyContribution
 
 PREFIX = f"{hookspecs.PROJECT}_"
+HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
+"""All hooks, in the order in which they are specified."""
+OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
+"""Those that offer nothing: they are told what happens in a run."""
 
 
 def contributions_of(plugin: object) -> tuple[AnyContribution, ...]:
-    """Call the five hooks of one plugin and check what they return.
-
-    The plugin has a plugin manager of its own, so that nothing it does wrong touches another.
+    """Call the five hooks of one plugin that offer components, and check what they return.
 
     Args:
         plugin: a module, or any object, with hooks.
 
     Raises:
-        PluginError: a hook is unknown, lacks its mark, takes arguments, raises, or offers something of another kind.
+        PluginError: a hook is unknown, lacks its mark, takes arguments that it does not have, raises, or offers something of
+            another kind or for another version of the contract.
     """
+    manager = _registered(plugin)
+    return tuple(contribution for kind in KINDS.values() for contribution in _offered(manager, kind))
+
+
+def observation_of(plugin: object) -> pluggy.HookRelay | None:
+    """Return the caller of a plugin's observation hooks; None if it has none.
+
+    Raises:
+        PluginError: a hook is unknown, lacks its mark, or takes arguments that it does not have.
+    """
+    manager = _registered(plugin)
+    implemented = {caller.name for caller in manager.get_hookcallers(plugin) or ()}
+    return manager.hook if implemented.intersection(OBSERVATION_HOOKS) else None
+
+
+def require_same_contract(contribution: AnyContribution) -> None:
+    """Refuse a contribution that was made for another version of the contract.
+
+    Raises:
+        PluginError: says which version, and what to upgrade.
+    """
+    made_for = contribution.api_version
+    if made_for == API_VERSION:
+        return
+    raise PluginError(
+        f"{_short(contribution)} was made for version {made_for} of the plugin contract, and this photonpano has version "
+        f"{API_VERSION}; upgrade {'the plugin' if made_for < API_VERSION else 'photonpano'}"
+    )
+
+
+def _registered(plugin: object) -> pluggy.PluginManager:
+    """Register a plugin with a manager of its own, so that nothing it does wrong touches another."""
     manager = pluggy.PluginManager(hookspecs.PROJECT)
     manager.add_hookspecs(hookspecs)
     _check_names(plugin, manager)
@@ -37,17 +72,16 @@ def contributions_of(plugin: object) -> tuple[AnyContribution, ...]:
         manager.check_pending()
     except pluggy.PluginValidationError as error:
         raise PluginError(" ".join(str(error).split())) from error
-    return tuple(contribution for kind in KINDS.values() for contribution in _offered(manager, kind))
+    return manager
 
 
 def _check_names(plugin: object, manager: pluggy.PluginManager) -> None:
     """Refuse functions that look like hooks and are none: pluggy would pass over them in silence."""
-    hooks = [kind.hook for kind in KINDS.values()]
     for name in dir(plugin):
         if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
             continue
-        if name not in hooks:
-            raise PluginError(f"there is no hook {name!r}; known: {listed(hooks)}")
+        if name not in HOOKS:
+            raise PluginError(f"there is no hook {name!r}; known: {listed(HOOKS)}")
         if manager.parse_hookimpl_opts(plugin, name) is None:
             raise PluginError(f"{name} is not marked with @photonpano.hookimpl")
 
@@ -61,6 +95,7 @@ def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[AnyContribution]
     for item in offered:
         if not isinstance(item, kind.contribution):
             raise PluginError(f"{kind.hook} offers {_short(item)}, expected a {kind.contribution.__name__}")
+        require_same_contract(item)
     return offered
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         ResamplerContribution,
         SourceContribution,
     )
+    from photonpano.registry import Observer
     from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.spec.tree import Place
 
@@ -70,6 +71,7 @@ class Plan:
         document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
         places: where each value of the spec was written, by its path, for messages that come up later.
         file: the spec file, None for a spec that was built in Python.
+        observers: the plugins that watch the run.
     """
 
     source: Choice[SourceContribution[Any]]
@@ -82,3 +84,4 @@ class Plan:
     document: Mapping[str, Any]
     places: Mapping[str, Place] = field(default_factory=dict)
     file: Path | None = None
+    observers: tuple[Observer, ...] = ()

@@ -116,6 +116,7 @@ class _Resolver:
             document={},
             places=self.places,
             file=self.root.head.file,
+            observers=self.catalog.observers,
         )
         return replace(plan, document=self.document(plan, stages))
 

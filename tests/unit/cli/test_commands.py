@@ -2,15 +2,18 @@ from __future__ import annotations
 
 import json
 import re
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from pydantic import Field
 from ruamel.yaml import YAML
 
-from photonpano import Config, LocatorContribution, Requirement
-from photonpano.registry import BrokenPlugin, Catalog
+from photonpano import Config, LocatorContribution, Requirement, hookimpl
+from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer
 from photonpano.registry.catalog import make_entry
+from photonpano.registry.plugins import observation_of
 from photonpano.spec import load_spec, parse_spec
 
 if TYPE_CHECKING:
@@ -180,12 +183,12 @@ def test_schema(folder: Path, invoke: Callable[..., Any]) -> None:
     assert json.loads((folder / "schema.json").read_text()) == printed
 
 
-class Nothing(Config):
-    pass
+class Keys(Config):
+    ratio: float = Field(0.8, gt=0, description="how far")
 
 
-def locator(name: str, *requires: Requirement) -> LocatorContribution[Nothing]:
-    return LocatorContribution(name=name, summary="A toy", config=Nothing, build=lambda *_: None, requires=requires)
+def locator(name: str, *requires: Requirement) -> LocatorContribution[Keys]:
+    return LocatorContribution(name=name, summary="A toy", config=Keys, build=lambda *_: None, requires=requires)
 
 
 @pytest.fixture
@@ -193,7 +196,12 @@ def odd_catalog(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [make_entry(locator("twice"), plugin, "2.0", f"{plugin} = {plugin}.hooks") for plugin in ("alpha", "beta")]
     rows.append(make_entry(locator("far", Requirement("no_such_library", "gamma[far]")), "gamma", "1.0", "g = gamma.hooks"))
     broken = BrokenPlugin("delta", "0.3", "d = delta.hooks", "ImportError: no module named [delta]")
-    monkeypatch.setattr("photonpano.registry.discover", lambda: Catalog(tuple(rows), (broken,)))
+    disabled = DisabledPlugin("epsilon", "0.4", "e = epsilon.hooks", "PHOTONPANO_DISABLE_PLUGINS=e")
+    plugin = ModuleType("zeta")
+    plugin.photonpano_run_started = plugin.photonpano_run_finished = hookimpl(lambda: None)
+    observer = Observer("zeta", "0.5", "z = zeta.hooks", observation_of(plugin))
+    catalog = Catalog(tuple(rows), (broken,), (disabled,), (observer,))
+    monkeypatch.setattr("photonpano.registry.discover", lambda: catalog)
 
 
 def test_plugins_list(invoke: Callable[..., Any]) -> None:
@@ -211,10 +219,12 @@ def test_plugins_list(invoke: Callable[..., Any]) -> None:
 def test_plugins_list_shows_what_cannot_be_used(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "list")
     assert result.stdout == (
-        "KIND     NAME   PLUGIN     SUMMARY\n"
-        "locator  twice  alpha 2.0  [name taken twice] A toy\n"
-        "locator  twice  beta 2.0   [name taken twice] A toy\n"
-        "locator  far    gamma 1.0  [not installed: gamma[far]] A toy\n"
+        "KIND      NAME   PLUGIN       SUMMARY\n"
+        "locator   twice  alpha 2.0    [name taken twice] A toy\n"
+        "locator   twice  beta 2.0     [name taken twice] A toy\n"
+        "locator   far    gamma 1.0    [not installed: gamma[far]] A toy\n"
+        "observer  z      zeta 0.5     Watches runs: photonpano_run_started, photonpano_run_finished\n"
+        "disabled  e      epsilon 0.4  By PHOTONPANO_DISABLE_PLUGINS=e\n"
     )
     assert result.stderr == "1 plugin is broken, see: photonpano plugins list --broken\n"
 
@@ -245,6 +255,24 @@ def test_plugins_list_json(invoke: Callable[..., Any]) -> None:
             "error": "ImportError: no module named [delta]",
         }
     ]
+    assert data["disabled"] == [
+        {"plugin": "epsilon", "version": "0.4", "entry_point": "e = epsilon.hooks", "by": "PHOTONPANO_DISABLE_PLUGINS=e"}
+    ]
+    assert data["observers"] == [
+        {
+            "plugin": "zeta",
+            "version": "0.5",
+            "entry_point": "z = zeta.hooks",
+            "hooks": ["photonpano_run_started", "photonpano_run_finished"],
+        }
+    ]
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_list_of_a_kind_shows_what_may_be_of_it(invoke: Callable[..., Any]) -> None:
+    assert invoke("plugins", "list", "--kind", "source").stdout == (
+        "KIND      NAME  PLUGIN       SUMMARY\ndisabled  e     epsilon 0.4  By PHOTONPANO_DISABLE_PLUGINS=e\n"
+    )
 
 
 def test_no_plugin_is_broken(invoke: Callable[..., Any]) -> None:
@@ -269,7 +297,9 @@ def test_plugins_show_says_how_to_install(invoke: Callable[..., Any]) -> None:
         "kind    locator\n"
         "plugin  gamma 1.0 (g = gamma.hooks)\n"
         'needs   pip install "gamma[far]" (not installed)\n\n'
-        "locate:\n  use: far\n"
+        "KEY    TYPE    DEFAULT  BOUNDS   MEANING\n"
+        "ratio  number  0.8      above 0  how far\n\n"
+        "locate:\n  use: far\n  with:\n    ratio: 0.8  # how far\n"
     )
 
 
@@ -279,8 +309,37 @@ def test_plugins_show_of_a_name_that_two_offer(invoke: Callable[..., Any]) -> No
     assert result.exit_code == 1
     assert result.stderr == (
         "error: the locator 'twice' is offered by alpha 2.0 (alpha = alpha.hooks) and beta 2.0 (beta = beta.hooks); "
-        "uninstall all but one\n"
+        "uninstall or disable all but one\n"
     )
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_show_names_the_plugins_that_may_have_offered_a_name(invoke: Callable[..., Any]) -> None:
+    result = invoke("plugins", "show", "near")
+    assert result.exit_code == 2
+    assert result.stderr.endswith(
+        "there is no component 'near'; known: far and twice. Broken plugins may have offered it: delta 0.3 (d = delta.hooks): "
+        "ImportError: no module named [delta]. Disabled plugins may have offered it: epsilon 0.4 (e = epsilon.hooks), "
+        "by PHOTONPANO_DISABLE_PLUGINS=e\n"
+    )
+
+
+@pytest.mark.usefixtures("odd_catalog")
+def test_plugins_show_json(invoke: Callable[..., Any]) -> None:
+    (shown,) = json.loads(invoke("plugins", "show", "far", "--json").stdout)["components"]
+    assert shown == {
+        "kind": "locator",
+        "name": "far",
+        "summary": "A toy",
+        "plugin": "gamma",
+        "version": "1.0",
+        "entry_point": "g = gamma.hooks",
+        "unavailable": "the locator 'far' needs no_such_library, which is not installed: pip install \"gamma[far]\"",
+        "api_version": 1,
+        "requires": [{"module": "no_such_library", "install": "gamma[far]"}],
+        "keys": [{"key": "ratio", "type": "number", "default": "0.8", "bounds": "above 0", "description": "how far"}],
+        "snippet": "locate:\n  use: far\n  with:\n    ratio: 0.8  # how far\n",
+    }
 
 
 def test_plugins_show_of_an_unknown_name(invoke: Callable[..., Any]) -> None:
@@ -288,4 +347,4 @@ def test_plugins_show_of_an_unknown_name(invoke: Callable[..., Any]) -> None:
     assert result.exit_code == 2
     assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'?" in result.stderr
     wrong_kind = invoke("plugins", "show", "opencv-sift", "--kind", "source")
-    assert "there is no source 'opencv-sift'; known: packed-npy and simulator" in wrong_kind.stderr
+    assert "there is no source 'opencv-sift'; it is one of the locators" in wrong_kind.stderr

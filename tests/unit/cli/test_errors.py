@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -127,6 +128,45 @@ def test_debug_shows_the_traceback(
     assert result.exit_code == 2
     assert result.stderr.startswith("Traceback (most recent call last):")
     assert result.stderr.endswith("error: the spec has 1 problem\n")
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_warnings_that_are_logged_are_printed(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
+    logger = logging.getLogger("photonpano.anywhere")
+    with reported(debug=debug):
+        logger.info("not this")
+        try:
+            _ = 1 / 0
+        except ZeroDivisionError:
+            logger.warning("%s came loose", "the cable", exc_info=True)
+    printed = capsys.readouterr().err
+    assert printed.endswith("warning: the cable came loose\n")
+    assert printed.startswith("Traceback" if debug else "warning: ")
+    assert not logging.getLogger("photonpano").handlers
+
+
+def test_names_of_disabled_plugins_that_are_none_are_told(
+    folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "opencw")
+    result = invoke("check", "capture.yaml")
+    assert result.exit_code == 0
+    assert result.stderr == (
+        "warning: PHOTONPANO_DISABLE_PLUGINS names 'opencw', which is no installed plugin; did you mean 'opencv'?\n"
+    )
+
+
+def test_a_name_of_a_disabled_plugin_says_what_disables_it(
+    folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "opencv")
+    result = invoke("check", "capture.yaml", "--set", "locate.use=opencv-sift")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "locate.use: there is no locator 'opencv-sift'. Disabled plugins may have offered it: photonpano 0.1.0 "
+        "(opencv = photonpano_opencv.hooks), by PHOTONPANO_DISABLE_PLUGINS=opencv (in the override locate.use=opencv-sift)\n"
+        "error: the spec has 1 problem\n"
+    )
 
 
 def test_defects_keep_their_traceback() -> None:

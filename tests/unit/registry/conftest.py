@@ -28,16 +28,18 @@ def locator(name, **more):
 def install(tmp_path, monkeypatch) -> Callable[..., None]:
     """Install a distribution with one hook module: `install("alpha", "1.0", "code of the hook module")`."""
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delenv("PHOTONPANO_DISABLE_PLUGINS", raising=False)
 
-    def install(name: str, version: str, code: str, metadata: bool = True) -> None:
+    def install(name: str, version: str, code: str, metadata: bool = True, distribution: str = "") -> None:
         module = f"{name}_hooks"
         monkeypatch.delitem(sys.modules, module, raising=False)
         (tmp_path / f"{module}.py").write_text(HEADER + dedent(code))
-        info = tmp_path / f"{name}-{version}.dist-info"
+        distribution = distribution or name
+        info = tmp_path / f"{distribution.replace('-', '_')}-{version}.dist-info"
         info.mkdir()
         (info / "entry_points.txt").write_text(f"[photonpano]\n{name} = {module}\n")
         if metadata:
-            (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+            (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
         importlib.invalidate_caches()
 
     yield install

@@ -1,12 +1,13 @@
 """Looking components up."""
 
 import sys
+from dataclasses import replace
 from types import ModuleType
 
 import pytest
 
 from photonpano import Config, LocatorContribution, MergerContribution, PluginError, Requirement, hookimpl
-from photonpano.registry import BrokenPlugin, Catalog
+from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin
 
 
 class Keys(Config):
@@ -57,6 +58,22 @@ def test_including_a_broken_plugin_is_an_error():
         Catalog().including(plugin)
 
 
+def test_including_what_watches_runs():
+    plugin = ModuleType("my_hooks")
+    plugin.photonpano_run_started = hookimpl(lambda: None)
+    catalog = Catalog().including(plugin, MERGER).including(locator("direct"))
+    assert [each.origin for each in catalog.observers] == ["my_hooks unreleased (given in Python)"]
+    assert [each.name for each in catalog.rows] == ["sum", "direct"]
+
+
+def test_including_a_contribution_for_another_contract_is_an_error():
+    with pytest.raises(PluginError) as caught:
+        Catalog().including(replace(MERGER, api_version=7))
+    assert str(caught.value) == (
+        "the merger 'sum' was made for version 7 of the plugin contract, and this photonpano has version 1; upgrade photonpano"
+    )
+
+
 @pytest.mark.parametrize(
     ("kind", "name", "expected"),
     [
@@ -76,6 +93,13 @@ def test_unknown_name_of_a_catalog_with_broken_plugins():
     assert message(Catalog(broken=broken), "source", "cube") == (
         "there is no source 'cube'. Broken plugins may have offered it: "
         "a 1 (a = a.hooks): ImportError: x and b 2 (b = b.hooks): ValueError: y"
+    )
+
+
+def test_unknown_name_of_a_catalog_with_disabled_plugins():
+    disabled = (DisabledPlugin("a", "1", "a = a.hooks", "X=a"),)
+    assert message(Catalog(disabled=disabled), "source", "cube") == (
+        "there is no source 'cube'. Disabled plugins may have offered it: a 1 (a = a.hooks), by X=a"
     )
 
 

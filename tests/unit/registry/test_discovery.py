@@ -3,7 +3,7 @@
 import pytest
 
 from photonpano import PluginError
-from photonpano.registry import BrokenPlugin, discover
+from photonpano.registry import BrokenPlugin, DisabledPlugin, discover
 
 GOOD = """
 @hookimpl
@@ -48,7 +48,8 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
         (
             "@hookimpl\ndef photonpano_source(): return []",
             "there is no hook 'photonpano_source'; known: photonpano_sources, photonpano_resamplers, photonpano_mergers, "
-            "photonpano_locators and photonpano_interpolators",
+            "photonpano_locators, photonpano_interpolators, photonpano_run_started, photonpano_stage_finished and "
+            "photonpano_run_finished",
         ),
         ("def photonpano_sources(): return []", "photonpano_sources is not marked with @photonpano.hookimpl"),
         ("@hookimpl\ndef camera(): return []", "unknown hook 'camera' in plugin <module 'broken_hooks' from '{path}'>"),
@@ -66,6 +67,25 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
         (
             "@hookimpl\ndef photonpano_sources(): return [source('Toy')]",
             "photonpano_sources raised ValueError: the name of a contribution is kebab-case, such as 'my-source'; got 'Toy'",
+        ),
+        (
+            "@hookimpl\ndef photonpano_run_finished(score): pass",
+            "Plugin 'broken_hooks' for hook 'photonpano_run_finished' hookimpl definition: photonpano_run_finished(score) "
+            "Argument(s) {'score'} are declared in the hookimpl but can not be found in the hookspec",
+        ),
+        (
+            "@hookimpl\ndef photonpano_sources(): return [source('old', api_version=0)]",
+            "the source 'old' was made for version 0 of the plugin contract, and this photonpano has version 1; "
+            "upgrade the plugin",
+        ),
+        (
+            "@hookimpl\ndef photonpano_sources(): return [source('fine', api_version=1), source('new', api_version=2)]",
+            "the source 'new' was made for version 2 of the plugin contract, and this photonpano has version 1; "
+            "upgrade photonpano",
+        ),
+        (
+            "@hookimpl\ndef photonpano_sources(): return [source('odd', api_version='1')]",
+            "photonpano_sources raised TypeError: odd: api_version is a whole number, such as 1; got '1'",
         ),
         (
             "@hookimpl\ndef photonpano_sources(): return [source('x', requires=['torch'])]",
@@ -108,7 +128,7 @@ def test_name_of_two_plugins_is_an_error_on_use_alone(install):
         catalog.get("source", "toy-camera")
     assert str(caught.value) == (
         "the source 'toy-camera' is offered by alpha 1.2 (alpha = alpha_hooks) and beta 2.0 (beta = beta_hooks); "
-        "uninstall all but one"
+        "uninstall or disable all but one"
     )
 
 
@@ -121,3 +141,76 @@ def test_unknown_name_mentions_the_broken_plugins(install):
         "there is no locator 'toy-lokator'; did you mean 'toy-locator'? "
         "Broken plugins may have offered it: broken 0.3 (broken = broken_hooks): RuntimeError: two lines"
     )
+
+
+def test_observers_are_kept_apart_from_components(install):
+    install("watcher", "0.4", "@hookimpl\ndef photonpano_run_started(spec): pass")
+    install("both", "0.5", GOOD + "@hookimpl\ndef photonpano_run_finished(): pass")
+    catalog = discover()
+    assert [(each.origin, each.watches) for each in catalog.observers] == [
+        ("both 0.5 (both = both_hooks)", ("photonpano_run_finished",)),
+        ("watcher 0.4 (watcher = watcher_hooks)", ("photonpano_run_started",)),
+    ]
+    assert {row.plugin for row in of_toys(catalog.rows)} == {"both"}
+
+
+@pytest.mark.parametrize("word", ["Beta", "beta_lab", "beta-lab", " beta.lab ,"])
+def test_a_disabled_plugin_is_a_row_and_is_not_imported(word, install, monkeypatch):
+    install("alpha", "1.2", GOOD)
+    install("beta", "2.0", "raise SystemExit('imported')", distribution="beta-lab")
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", word)
+    catalog = discover()
+    by = f"PHOTONPANO_DISABLE_PLUGINS={word.strip(' ,')}"
+    assert of_toys(catalog.disabled) == [DisabledPlugin("beta-lab", "2.0", "beta = beta_hooks", by)]
+    assert of_toys(catalog.broken) == []
+    assert {row.plugin for row in of_toys(catalog.rows)} == {"alpha"}
+
+
+def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
+    install("alpha", "1.2", GOOD)
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "photonpano")
+    catalog = discover()
+    assert {row.plugin for row in catalog.rows} == {"alpha"}
+    assert [row.entry_point.partition(" = ")[0] for row in catalog.disabled] == ["core", "opencv", "simulator"]
+
+
+def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
+    install("alpha", "1.2", GOOD)
+    install("beta", "2.0", GOOD.replace("toy", "mine"))
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "beta")
+    with pytest.raises(PluginError) as caught:
+        discover().get("source", "zzz")
+    assert str(caught.value) == (
+        "there is no source 'zzz'; known: packed-npy, simulator and toy-camera. Disabled plugins may have offered it: "
+        "beta 2.0 (beta = beta_hooks), by PHOTONPANO_DISABLE_PLUGINS=beta"
+    )
+
+
+def test_disabling_one_of_two_settles_whose_a_name_is(install, monkeypatch):
+    install("alpha", "1.2", GOOD)
+    install("beta", "2.0", GOOD)
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "alpha")
+    assert discover().get("source", "toy-camera").plugin == "beta"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("alpa", "names 'alpa', which is no installed plugin; did you mean 'alpha'?"),
+        ("zzz,alpha, yyy", "names 'zzz' and 'yyy', which are no installed plugins; known: {known}"),
+    ],
+)
+def test_unknown_names_of_disabled_plugins_are_told(words, message, install, monkeypatch, caplog):
+    install("alpha", "1.2", GOOD)
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
+    discover()
+    known = "alpha, core, opencv, photonpano and simulator"
+    assert caplog.messages == [f"PHOTONPANO_DISABLE_PLUGINS {message.format(known=known)}"]
+
+
+@pytest.mark.parametrize("words", ["", " , ", "alpha"])
+def test_nothing_is_told_where_nothing_is_wrong(words, install, monkeypatch, caplog):
+    install("alpha", "1.2", GOOD)
+    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
+    assert len(of_toys(discover().disabled)) == (words == "alpha")
+    assert caplog.messages == []

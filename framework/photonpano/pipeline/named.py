@@ -1,0 +1,119 @@
+"""Sources and trajectories are asked from many places: what goes wrong in one carries its name, not that of who asked."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from photonpano.errors import PhotonpanoError, PluginError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from photonpano.pipeline.components import Level
+    from photonpano.protocols import Source, Trajectory
+    from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Response, StreamInfo
+
+ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
+
+
+class NamedSource:
+    """A source that is named in what it raises by mistake, whoever reads it: a merger, the renderer, a look at the capture.
+
+    Args:
+        source: the source.
+        origin: who provides it, such as "source 'packed-npy' of photonpano 0.1.0".
+    """
+
+    def __init__(self, source: Source, origin: str) -> None:
+        self._source = source
+        self._origin = origin
+
+    @property
+    def info(self) -> StreamInfo:
+        """Frames, size, rate."""
+        return self._source.info
+
+    @property
+    def response(self) -> Response:
+        """How flux becomes counts."""
+        return self._source.response
+
+    @property
+    def valid(self) -> BoolArray:
+        """(H, W) mask."""
+        return self._source.valid
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span.
+
+        Raises:
+            PluginError: the source failed in its own way, or broke its contract.
+        """
+        return self._checked(self._source.counts, span, self.info.frame_shape)
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span.
+
+        Raises:
+            PluginError: the source failed in its own way, or broke its contract.
+        """
+        return self._checked(self._source.frames, span, (len(span), *self.info.frame_shape))
+
+    def close(self) -> None:
+        """Let go of files."""
+        self._source.close()
+
+    def __enter__(self) -> NamedSource:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _checked(self, read: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+        try:
+            found = read(span)
+        except PhotonpanoError:
+            raise
+        except Exception as error:
+            raise PluginError(f"{self._origin} failed at {span}: {type(error).__name__}: {error}") from error
+        if np.shape(found) != shape:
+            raise PluginError(f"{self._origin} broke its contract at {span}: expected the shape {shape}, got {np.shape(found)}")
+        return found
+
+
+class NamedTrajectory:
+    """A trajectory whose interpolator is named in what goes wrong, and which gives a homography for every instant.
+
+    Args:
+        trajectory: what the interpolator made.
+        level: the level that it was made at.
+    """
+
+    def __init__(self, trajectory: Trajectory, level: Level) -> None:
+        self._trajectory = trajectory
+        self._level = level
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants: (N, 3, 3).
+
+        Raises:
+            PluginError: the trajectory failed in its own way, or gave something else.
+        """
+        with self._level.blaming("interpolator"):
+            found = np.asarray(self._trajectory.at(frame_indices), dtype=np.float64)
+        frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
+        problem = None
+        if found.shape != (len(frames), 3, 3):
+            problem = f"expected homographies of the shape ({len(frames)}, 3, 3), got {found.shape}"
+        elif (bad := ~np.isfinite(found).all(axis=(1, 2)) | (found[:, 2, 2] == 0)).any():
+            first = int(np.argmax(bad))
+            problem = f"a homography is finite with h33 = 1, that of frame {frames[first]:g} is {found[first].tolist()}"
+        if problem:
+            level = self._level
+            raise PluginError(f"{level.origins['interpolator']} broke its contract at level {level.number}: {problem}")
+        return found

@@ -1,0 +1,88 @@
+"""Tell plugins what happens in a run: they look and touch nothing, and what they raise is logged."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from photonpano.geometry import Canvas
+    from photonpano.pipeline.loop import LevelResult
+    from photonpano.registry import Observer
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Observers:
+    """The observers of one run; by default there are none.
+
+    Attributes:
+        observers: the plugins that watch.
+        directory: the run folder.
+    """
+
+    observers: tuple[Observer, ...] = ()
+    directory: Path = Path()
+
+    @contextmanager
+    def run(self, spec: Mapping[str, Any]) -> Iterator[None]:
+        """Tell that a run starts, and what ended it if the block raises."""
+        self._tell("photonpano_run_started", spec=frozen(spec))
+        try:
+            yield
+        except BaseException as error:  # an interrupt ends a run as well
+            message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            self._tell("photonpano_run_finished", record=None, error=message)
+            raise
+
+    def run_finished(self, record: Mapping[str, Any]) -> None:
+        """Tell that a run ended well."""
+        self._tell("photonpano_run_finished", record=frozen(record), error=None)
+
+    def level_finished(self, result: LevelResult) -> None:
+        """Tell of the four stages of a level."""
+        located, std_px = result.located, result.uncertainty.mean_px
+        summaries: dict[str, dict[str, float | None]] = {
+            "resample": {"groups": len(result.groups)},
+            "merge": {"exposures": len(result.groups)},
+            "locate": {"pairs": len(located.edges), "failed": len(located.failures), "located": located.n_located},
+            "interpolate": {"change_px": result.change_px, "std_px": std_px if np.isfinite(std_px) else None},
+        }
+        for stage, summary in summaries.items():
+            self._stage_finished(result.level.number, stage, result.seconds.get(stage, 0.0), summary)
+
+    def rendered(self, canvas: Canvas, seconds: float) -> None:
+        """Tell of the panorama."""
+        self._stage_finished(None, "render", seconds, {"height": canvas.height, "width": canvas.width})
+
+    def _stage_finished(self, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]) -> None:
+        self._tell("photonpano_stage_finished", level=level, stage=stage, seconds=seconds, summary=frozen(summary))
+
+    def _tell(self, hook: str, **values: Any) -> None:
+        for observer in self.observers:
+            try:
+                getattr(observer.hook, hook)(directory=self.directory, **values)
+            except (Exception, SystemExit) as error:
+                what = f"{type(error).__name__}: {error}"
+                logger.warning("%s of %s raised %s; the run goes on", hook, observer.origin, what, exc_info=True)
+
+
+NOBODY = Observers()
+"""Nobody watches."""
+
+
+def frozen(value: Any) -> Any:
+    """Return plain data that cannot be changed: mappings as read-only views of copies, lists as tuples."""
+    if isinstance(value, Mapping):
+        return MappingProxyType({key: frozen(item) for key, item in value.items()})
+    return tuple(map(frozen, value)) if isinstance(value, list | tuple) else value

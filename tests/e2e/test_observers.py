@@ -1,0 +1,113 @@
+"""Installed plugins that watch runs: they are told of runs that end well or not, and harm none."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from photonpano.cli.app import app
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from click.testing import Result
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "follow-runs.md"
+CLUMSY = """
+from photonpano import hookimpl
+
+@hookimpl
+def photonpano_run_started(spec):
+    spec["run"]["seed"] = 1
+
+@hookimpl
+def photonpano_stage_finished(level, stage):
+    if stage == "locate":
+        raise RuntimeError(f"no space at level {level}")
+
+@hookimpl
+def photonpano_run_finished(record):
+    raise SystemExit(3)
+"""
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
+    """Install a distribution of version 1.0 with one module: a folder on `sys.path` with a real `.dist-info`."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def install(name: str, code: str) -> None:
+        (tmp_path / f"{name}_hooks.py").write_text(code)
+        info = tmp_path / f"{name}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[photonpano]\n{name} = {name}_hooks\n")
+        importlib.invalidate_caches()
+
+    yield install
+    for module in [name for name in sys.modules if name in ("logger_hooks", "clumsy_hooks")]:
+        del sys.modules[module]
+
+
+@pytest.fixture
+def logger(install: Callable[[str, str], None]) -> None:
+    """The plugin of the page on following runs."""
+    (code,) = re.findall(
+        r"<!-- file: photonpano_progress.py -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+    )
+    install("logger", code)
+
+
+@pytest.fixture
+def run(small_spec: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    monkeypatch.chdir(tmp_path)
+    with (tmp_path / "scan.yaml").open("w") as file:
+        YAML().dump(small_spec | {"levels": 1}, file)
+    return lambda *arguments, **environment: CliRunner().invoke(app, ["run", "scan.yaml", *arguments], env=environment)
+
+
+def lines(name: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in Path(f"runs/{name}.progress.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.usefixtures("logger")
+def test_a_run_that_fails_is_told_as_well(run: Callable[..., Result]) -> None:
+    result = run("--set", "locate={use: direct, with: {min_agreement: 1}}")
+    assert result.exit_code == 1
+    first, *_, last = lines("scan")
+    assert (first["event"], last["event"]) == ("started", "failed")
+    assert f"LocationError: {result.stderr.removeprefix('error: ')}" == f"{last['error']}\n"
+    assert not Path("runs/scan").exists()
+
+
+@pytest.mark.usefixtures("logger")
+def test_what_one_observer_does_wrong_is_a_warning_and_changes_nothing(
+    run: Callable[..., Result], install: Callable[[str, str], None]
+) -> None:
+    install("clumsy", CLUMSY)
+    result = run("--output", "runs/watched")
+    assert result.exit_code == 0
+    started, located, finished, *_ = result.stderr.splitlines()
+    who = "of clumsy 1.0 (clumsy = clumsy_hooks) raised"
+    what = "TypeError: 'mappingproxy' object does not support item assignment"
+    assert started == f"warning: photonpano_run_started {who} {what}; the run goes on"
+    assert located == f"warning: photonpano_stage_finished {who} RuntimeError: no space at level 1; the run goes on"
+    assert finished == f"warning: photonpano_run_finished {who} SystemExit: 3; the run goes on"
+    assert [line["event"] for line in lines("watched")] == ["started", *["stage"] * 5, "done"]
+
+    alone = run("--output", "runs/alone", PHOTONPANO_DISABLE_PLUGINS="clumsy,logger")
+    assert alone.exit_code == 0
+    assert "raised" not in alone.stderr
+    assert not Path("runs/alone.progress.jsonl").exists()
+    with np.load("runs/watched/trajectory.npz") as watched, np.load("runs/alone/trajectory.npz") as unwatched:
+        np.testing.assert_array_equal(watched["homographies"], unwatched["homographies"])
+    assert json.loads(Path("runs/watched/run.json").read_text())["seed"] == 0

@@ -1,0 +1,155 @@
+"""Observers are told all, change nothing, and do no harm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import LocationError, hookimpl
+from photonpano.geometry import Canvas
+from photonpano.pipeline.loop import estimate_motion
+from photonpano.pipeline.observers import Observers, frozen
+from photonpano.pipeline.progress import Quiet
+from photonpano.registry import Catalog
+from photonpano.spec.settings import GraphSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+DIRECTORY = Path("runs/scan")
+
+
+def plugin(name: str = "watcher", **hooks: Callable[..., None]) -> ModuleType:
+    """Make a plugin with these hooks, named without their prefix."""
+    module = ModuleType(name)
+    for hook, function in hooks.items():
+        setattr(module, f"photonpano_{hook}", hookimpl(function))
+    return module
+
+
+def watching(*plugins: ModuleType) -> Observers:
+    return Observers(Catalog().including(*plugins).observers, DIRECTORY)
+
+
+@pytest.fixture
+def told() -> list[Any]:
+    return []
+
+
+@pytest.fixture
+def log(told: list[Any]) -> ModuleType:
+    """A plugin that writes down in `told` what it is told."""
+    return plugin(
+        run_started=lambda directory, spec: told.append((directory, spec)),
+        stage_finished=lambda level, stage, seconds, summary: told.append((level, stage, seconds, dict(summary))),
+        run_finished=lambda directory, record, error: told.append((directory, record, error)),
+    )
+
+
+def test_a_run_that_ends_well(told: list[Any], log: ModuleType) -> None:
+    observers = watching(log)
+    with observers.run({"version": 1}):
+        observers.rendered(Canvas(30, 40, np.eye(3)), 2.5)
+    observers.run_finished({"status": "done"})
+    assert told == [
+        (DIRECTORY, {"version": 1}),
+        (None, "render", 2.5, {"height": 30, "width": 40}),
+        (DIRECTORY, {"status": "done"}, None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (LocationError("level 1: lost"), "LocationError: level 1: lost"),
+        (ZeroDivisionError("a defect"), "ZeroDivisionError: a defect"),
+        (KeyboardInterrupt(), "KeyboardInterrupt"),
+    ],
+    ids=repr,
+)
+def test_a_run_that_fails_raises_what_it_raised(told: list[Any], log: ModuleType, error: BaseException, message: str) -> None:
+    with pytest.raises(type(error)) as caught, watching(log).run({}):
+        raise error
+    assert caught.value is error
+    assert told[1:] == [(DIRECTORY, None, message)]
+
+
+def test_the_stages_of_each_level(
+    told: list[Any], log: ModuleType, memory_source: type, make_level: Callable, pan: Callable
+) -> None:
+    source = memory_source(np.zeros((120, 40, 60)))
+    levels = [make_level(pan(0.3)), make_level(pan(0.3), number=2)]
+    results = estimate_motion(source, levels, GraphSettings(), 60, 2, Quiet(), observers=watching(log))
+    assert [(level, stage) for level, stage, _, _ in told] == [
+        (level, stage) for level in (1, 2) for stage in ("resample", "merge", "locate", "interpolate")
+    ]
+    assert [seconds for _, _, seconds, _ in told] == [
+        result.seconds[stage] for result in results for stage in ("resample", "merge", "locate", "interpolate")
+    ]
+    summaries = [summary for *_, summary in told]
+    assert summaries[:3] == [
+        {"groups": 12},
+        {"exposures": 12},
+        {"pairs": len(results[0].located.edges), "failed": 0, "located": 12},
+    ]
+    assert summaries[3] == {"change_px": None, "std_px": results[0].uncertainty.mean_px}
+    assert summaries[7] == {"change_px": results[1].change_px, "std_px": results[1].uncertainty.mean_px}
+
+
+def test_what_is_not_known_is_none(told: list[Any], log: ModuleType) -> None:
+    located = SimpleNamespace(edges=(), failures=(), n_located=1)
+    alone = SimpleNamespace(mean_px=np.inf)
+    watching(log).level_finished(
+        SimpleNamespace(
+            level=SimpleNamespace(number=1), groups=(1,), located=located, uncertainty=alone, seconds={}, change_px=None
+        )
+    )
+    assert told[-1] == (1, "interpolate", 0.0, {"change_px": None, "std_px": None})
+
+
+@pytest.mark.parametrize("error", [ValueError("no space"), SystemExit(3)], ids=repr)
+def test_what_an_observer_raises_is_logged_with_its_name_and_the_others_go_on(
+    told: list[Any], log: ModuleType, caplog: pytest.LogCaptureFixture, error: BaseException
+) -> None:
+    def fail(directory: Path) -> None:
+        raise error
+
+    observers = watching(plugin("clumsy", run_started=fail, stage_finished=fail, run_finished=fail), log)
+    with observers.run({}):
+        observers.rendered(Canvas(30, 40, np.eye(3)), 2.5)
+    observers.run_finished({})
+    assert len(told) == 3
+    assert caplog.messages == [
+        f"photonpano_{hook} of clumsy unreleased (given in Python) raised {type(error).__name__}: {error}; the run goes on"
+        for hook in ("run_started", "stage_finished", "run_finished")
+    ]
+    assert all(record.exc_info and record.exc_info[1] is error for record in caplog.records)
+
+
+def test_an_observer_that_fails_does_not_hide_what_ended_the_run(caplog: pytest.LogCaptureFixture) -> None:
+    def fail(error: str) -> None:
+        raise RuntimeError("and now this")
+
+    with pytest.raises(LocationError, match=r"^lost$"), watching(plugin(run_finished=fail)).run({}):
+        raise LocationError("lost")
+    assert len(caplog.messages) == 1
+
+
+def test_observers_cannot_change_what_they_see() -> None:
+    spec = {"run": {"seed": 3}, "levels": [{"scale": 1.0}]}
+    seen = frozen(spec)
+    assert seen == {"run": {"seed": 3}, "levels": ({"scale": 1.0},)}
+    for change in (
+        lambda: seen.update(seed=4),
+        lambda: seen["run"].__setitem__("seed", 4),
+        lambda: seen["levels"].append({}),
+        lambda: seen["levels"][0].__setitem__("scale", 2.0),
+    ):
+        with pytest.raises((TypeError, AttributeError)):
+            change()
+    spec["run"]["seed"] = 5
+    assert seen["run"]["seed"] == 3
