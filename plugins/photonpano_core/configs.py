@@ -96,7 +96,7 @@ class RobustMergeConfig(Config):
         0.5, ge=0, le=8, description="nor does one that a motion wrong by so much explains, in px of a frame"
     )
     tolerance_px: float = Field(
-        1.0, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
+        0.5, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
     )
 
 
