@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from photonpano_core.midpoint import SHORTEST, MidpointResampler
+from photonpano_core.grouping import SHORTEST
 
 if TYPE_CHECKING:
-    from photonpano import CaptureSummary, Group, StageContext
-    from photonpano_core.configs import MidpointConfig
+    from collections.abc import Callable
+
+    from photonpano import CaptureSummary, Group, Resampler, StageContext
 
 _BLUR = 0.15
 """Groups of the first level may be blurred by this share of the shorter side of a frame; twice as much spoils the result."""
@@ -28,16 +29,26 @@ _UNKNOWN = 500
 """The group size if nothing tells how fast the image moves."""
 
 
-class AutoMidpointResampler:
-    """Midpoint resampling that chooses its group size when it is first asked for groups."""
+class AutoResampler:
+    """A resampler that chooses its group size when it is first asked for groups.
 
-    def __init__(self, config: MidpointConfig, context: StageContext) -> None:
-        self._config, self._context = config, context
+    Where groups get denser from level to level, those of a dim capture get twice as long once the motion is known.
+    """
+
+    def __init__(self, context: StageContext, of_size: Callable[[int], Resampler], densifies: bool) -> None:
+        """Prepare to choose.
+
+        Args:
+            context: tells flux and speed, and is told the choice.
+            of_size: makes the resampler with a group size.
+            densifies: whether each level has twice as many groups as the one before.
+        """
+        self._context, self._of_size, self._densifies = context, of_size, densifies
         self._size: int | None = None
         self._doubled = False
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        """Return the groups of a level: see `MidpointResampler.groups`.
+        """Return the groups of a level: see `photonpano.Resampler`.
 
         Raises:
             InputError: the capture is shorter than the shortest group.
@@ -46,15 +57,14 @@ class AutoMidpointResampler:
             shorter_side = min(self._context.stream.frame_shape)
             capture = self._context.capture()
             size, reason = choose_group_size(capture, n_frames, shorter_side)
-            self._doubled = capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
+            self._doubled = self._densifies and capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
             if self._doubled:
                 reason += f"; from level {_KNOWN_FROM} on, where the motion is known, they are twice as long for more light"
             self._context.decide("group_size", size, reason)
             self._size = size
         # Groups twice as long, as dense as they would be at this level.
         twice = self._doubled and level >= _KNOWN_FROM
-        config = self._config.model_copy(update={"group_size": self._size * (2 if twice else 1)})
-        return MidpointResampler(config).groups(n_frames, level + (1 if twice else 0))
+        return self._of_size(self._size * (2 if twice else 1)).groups(n_frames, level + (1 if twice else 0))
 
 
 def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int) -> tuple[int, str]:

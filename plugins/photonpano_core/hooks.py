@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from photonpano import (
     InterpolatorContribution,
@@ -12,21 +12,33 @@ from photonpano import (
     hookimpl,
 )
 from photonpano_core.configs import (
+    ConstantGroupsConfig,
     GeodesicConfig,
+    GroupedConfig,
     LieConfig,
     LucasKanadeConfig,
     MidpointConfig,
     PhotonMleConfig,
+    RobustMergeConfig,
+    SlidingWindowConfig,
     SmoothingSplineConfig,
+    SplatConfig,
+    StratifiedConfig,
 )
-from photonpano_core.group_size import AutoMidpointResampler
-from photonpano_core.midpoint import SHORTEST, MidpointResampler, too_short
+from photonpano_core.constant_groups import ConstantGroupsResampler
+from photonpano_core.group_size import AutoResampler
+from photonpano_core.grouping import SHORTEST, too_short
+from photonpano_core.midpoint import MidpointResampler
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
+from photonpano_core.sliding_window import SlidingWindowResampler
+from photonpano_core.stratified import StratifiedResampler
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from photonpano import Interpolator, Merger, Resampler, StageContext, StreamInfo
+
+Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
 
 @hookimpl
@@ -36,25 +48,58 @@ def photonpano_sources() -> Iterator[SourceContribution[PackedNpyConfig]]:
 
 
 @hookimpl
-def photonpano_resamplers() -> Iterator[ResamplerContribution[MidpointConfig]]:
-    """Offer midpoint resampling."""
+def photonpano_resamplers() -> Iterator[ResamplerContribution[Any]]:
+    """Offer midpoint resampling, and what it is compared with."""
     yield ResamplerContribution(
         name="midpoint",
         summary="Groups of equal size; each level adds one between every two (paper, section 4)",
         config=MidpointConfig,
         build=_build_midpoint,
-        check=_check_midpoint,
+        check=_check_groups,
+    )
+    yield ResamplerContribution(
+        name="stratified",
+        summary="As many groups as midpoint has, at instants by chance, one in each stratum",
+        config=StratifiedConfig,
+        build=_build_stratified,
+        check=_check_groups,
+    )
+    yield ResamplerContribution(
+        name="sliding-window",
+        summary="A group every so many frames, at each level (the paper's comparison)",
+        config=SlidingWindowConfig,
+        build=_build_sliding_window,
+        check=_check_groups,
+    )
+    yield ResamplerContribution(
+        name="constant-groups",
+        summary="The same groups at each level (the paper's failing ablation)",
+        config=ConstantGroupsConfig,
+        build=_build_constant_groups,
+        check=_check_groups,
     )
 
 
 @hookimpl
-def photonpano_mergers() -> Iterator[MergerContribution[PhotonMleConfig]]:
-    """Offer maximum-likelihood merging."""
+def photonpano_mergers() -> Iterator[MergerContribution[Any]]:
+    """Offer maximum-likelihood merging: of everything, of what agrees, and frame by frame."""
     yield MergerContribution(
         name="photon-mle",
         summary="One maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=PhotonMleConfig,
         build=_build_photon_mle,
+    )
+    yield MergerContribution(
+        name="robust-merge",
+        summary="photon-mle without ghosts: what moves by itself counts less (Ma and others 2020)",
+        config=RobustMergeConfig,
+        build=_build_robust_merge,
+    )
+    yield MergerContribution(
+        name="splat",
+        summary="Puts each lit pixel where the motion of its own frame says: for the dark, and for fast motion",
+        config=SplatConfig,
+        build=_build_splat,
     )
 
 
@@ -88,10 +133,31 @@ def photonpano_interpolators() -> Iterator[InterpolatorContribution[Any]]:
 
 
 def _build_midpoint(config: MidpointConfig, context: StageContext) -> Resampler:
-    return AutoMidpointResampler(config, context) if config.group_size == "auto" else MidpointResampler(config)
+    return _of_size(config, context, MidpointResampler, densifies=True)
 
 
-def _check_midpoint(config: MidpointConfig, stream: StreamInfo) -> list[str]:
+def _build_stratified(config: StratifiedConfig, context: StageContext) -> Resampler:
+    return _of_size(config, context, lambda sized: StratifiedResampler(sized, context.seed), densifies=True)
+
+
+def _build_sliding_window(config: SlidingWindowConfig, context: StageContext) -> Resampler:
+    return _of_size(config, context, SlidingWindowResampler, densifies=False)
+
+
+def _build_constant_groups(config: ConstantGroupsConfig, context: StageContext) -> Resampler:
+    return _of_size(config, context, ConstantGroupsResampler, densifies=False)
+
+
+def _of_size(
+    config: Grouped, context: StageContext, resampler: Callable[[Grouped], Resampler], *, densifies: bool
+) -> Resampler:
+    """Build a resampler now, or once the capture has told its group size."""
+    if config.group_size != "auto":
+        return resampler(config)
+    return AutoResampler(context, lambda size: resampler(config.model_copy(update={"group_size": size})), densifies)
+
+
+def _check_groups(config: GroupedConfig, stream: StreamInfo) -> list[str]:
     problem = too_short(SHORTEST if config.group_size == "auto" else config.group_size, stream.n_frames)
     return [problem] if problem else []
 
@@ -100,6 +166,20 @@ def _build_photon_mle(config: PhotonMleConfig, context: StageContext) -> Merger:
     from photonpano_core.photon_mle import PhotonMleMerger
 
     return PhotonMleMerger(config, context.decide)
+
+
+def _build_robust_merge(config: RobustMergeConfig, context: StageContext) -> Merger:
+    from photonpano_core.robust_merge import RobustMerger
+
+    del context
+    return RobustMerger(config)
+
+
+def _build_splat(config: SplatConfig, context: StageContext) -> Merger:
+    from photonpano_core.splat import SplatMerger
+
+    del config, context
+    return SplatMerger()
 
 
 def _build_lucas_kanade(config: LucasKanadeConfig, context: StageContext) -> Interpolator:

@@ -29,7 +29,7 @@ FLUXES = (0.5, 0.1, 0.02)
 GROUP_SIZE = 250
 LOCATORS: dict[str, dict[str, Any]] = {"opencv-sift": {"use": "opencv-sift"}, "direct": {"use": "direct"}}
 GRAPHS: dict[str, dict[str, Any]] = {"chain": {"skips": [], "closure_overlap": None}, "full": {}}
-RESAMPLERS: dict[str, dict[str, Any]] = {"constant": {"densify": False, "endpoints": False}, "midpoint": {}}
+RESAMPLERS = {"constant": "constant-groups", "midpoint": "midpoint"}
 CAPTURE: dict[str, Any] = {
     "scene": {"kind": "street", "seed": 0},
     "path": {"kind": "random-spline", "length_px": 360, "shake": {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]}},
@@ -59,7 +59,7 @@ def measure(cube: Path, locator: str, graph: str, resampler: str) -> tuple[float
         {
             "version": 1,
             "source": {"use": "packed-npy", "with": {"path": str(cube), "frame_rate_hz": 96_800}},
-            "resample": {"use": "midpoint", "with": {"group_size": GROUP_SIZE} | RESAMPLERS[resampler]},
+            "resample": {"use": RESAMPLERS[resampler], "with": {"group_size": GROUP_SIZE}},
             "locate": LOCATORS[locator],
             "graph": GRAPHS[graph] | {"disconnected": "largest"},
             "output": {"directory": str(cube.with_suffix(".run"))},

@@ -172,8 +172,8 @@ def test_each_level_improves_and_both_ablations_are_clearly_worse(tmp_path):
     one, two = (measure(cube, "street 0", case, f"{levels} levels", levels=levels) for levels in (1, 2))
     full = measure(cube, "street 0", case)
     naive = measure(cube, "street 0", case, "naive average", merge={"with": {"compensate": False}})
-    midpoint = {"with": {"group_size": case.group_size, "densify": False}}
-    constant = measure(cube, "street 0", case, "constant groups", resample=midpoint)
+    groups = {"use": "constant-groups", "with": {"group_size": case.group_size}}
+    constant = measure(cube, "street 0", case, "constant groups", resample=groups)
     assert full["error_px"] < two["error_px"] < one["error_px"]
     assert naive["error_px"] > 2 * full["error_px"]
     assert constant["error_px"] > 2 * full["error_px"]

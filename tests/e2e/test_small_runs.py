@@ -92,7 +92,7 @@ def test_each_level_improves_on_the_one_before(run: Callable, three_levels: np.n
 
 def test_a_constant_number_of_groups_is_clearly_worse(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
     """0.5 px when this was written."""
-    ablation = run("resample.with.densify=false", "resample.with.endpoints=false")
+    ablation = run("resample.use=constant-groups")
     assert error_px(ablation.homographies) > 1.8 * error_px(three_levels)
 
 

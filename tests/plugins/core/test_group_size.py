@@ -19,9 +19,9 @@ def choice(flux: float, speed_px: float | None, n_frames: int = 10_000, how: str
     return choose_group_size(CaptureSummary(flux, speed_px, how), n_frames, 254)
 
 
-def built(stream: StreamInfo, **context: Any) -> Any:
-    (contribution,) = photonpano_resamplers()
-    return contribution.build(MidpointConfig(group_size="auto"), StageContext(stream, response=None, **context))
+def built(stream: StreamInfo, name: str = "midpoint", **context: Any) -> Any:
+    (contribution,) = (each for each in photonpano_resamplers() if each.name == name)
+    return contribution.build(contribution.config(group_size="auto"), StageContext(stream, response=None, **context))
 
 
 def test_in_the_light_motion_blur_decides() -> None:
@@ -108,6 +108,14 @@ def test_groups_of_a_dim_capture_are_doubled_once_the_motion_is_known() -> None:
     assert decided[0][2].endswith("; from level 3 on, where the motion is known, they are twice as long for more light")
 
 
+@pytest.mark.parametrize("name", ["constant-groups", "sliding-window"])
+def test_groups_that_get_no_denser_are_not_doubled(name: str) -> None:
+    """Longer ones would be fewer, or other ones than at the levels before."""
+    resampler = built(StreamInfo(2000, 254, 496, None), name, capture=lambda: CaptureSummary(0.05, 0.381, HOW))
+    assert resampler.groups(2000, 3) == resampler.groups(2000, 1)
+    assert {len(group.span) for group in resampler.groups(2000, 3)} == {100}
+
+
 def test_it_is_left_open_where_no_frames_are_read() -> None:
     resampler = built(StreamInfo(1000, 254, 496, None))
     with pytest.raises(CaptureUnreadError, match=r"^chosen from flux and speed when the capture is read$"):
@@ -115,9 +123,10 @@ def test_it_is_left_open_where_no_frames_are_read() -> None:
 
 
 def test_a_capture_shorter_than_the_shortest_group_is_refused() -> None:
-    (contribution,) = photonpano_resamplers()
-    config = MidpointConfig(group_size="auto")
-    assert contribution.check(config, StreamInfo(16, 8, 8, None)) == []
-    assert contribution.check(config, StreamInfo(15, 8, 8, None)) == [
-        "the capture has 15 frames, fewer than one group of 16; set group_size to 3 or less, so that at least four groups fit"
-    ]
+    for contribution in photonpano_resamplers():
+        config = contribution.config(group_size="auto")
+        assert contribution.check(config, StreamInfo(16, 8, 8, None)) == []
+        assert contribution.check(config, StreamInfo(15, 8, 8, None)) == [
+            "the capture has 15 frames, fewer than one group of 16; set group_size to 3 or less, so that at least four groups "
+            "fit"
+        ]

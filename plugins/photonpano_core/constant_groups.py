@@ -1,0 +1,33 @@
+"""A constant number of groups: the ablation that fails in the paper (section 4, "Re-sample")."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from photonpano_core.grouping import centred, evenly_spread, require_a_group, size_of, spans_at
+
+if TYPE_CHECKING:
+    from photonpano import Group
+    from photonpano_core.configs import ConstantGroupsConfig
+
+
+class ConstantGroupsResampler:
+    """floor(n / m) groups at every level: those of the first level of `midpoint`.
+
+    Raises:
+        ValueError: the config leaves the group size open.
+    """
+
+    def __init__(self, config: ConstantGroupsConfig) -> None:
+        self._size = size_of(config)
+
+    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+        """Return the same groups whatever the level, side by side, spread evenly from the first frame to the last.
+
+        Raises:
+            InputError: the capture has fewer frames than a group.
+        """
+        del level
+        require_a_group(self._size, n_frames)
+        starts = evenly_spread(n_frames, self._size, n_frames // self._size)
+        return centred(spans_at(starts, self._size))

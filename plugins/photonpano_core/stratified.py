@@ -1,0 +1,48 @@
+"""Stratified sampling of instants: as dense as midpoint resampling, by chance within even strata."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano_core.grouping import centred, evenly_spread, require_a_group, size_of, spans_at, with_ends
+
+if TYPE_CHECKING:
+    from photonpano import Group
+    from photonpano_core.configs import StratifiedConfig
+
+
+class StratifiedResampler:
+    """As many groups as `midpoint` has at each level, each by chance in a stratum of its own.
+
+    Groups at equal distances see a hand that trembles with that period always in the same phase, and take it for standing
+    still. Groups by chance do not.
+
+    Raises:
+        ValueError: the config leaves the group size open.
+    """
+
+    def __init__(self, config: StratifiedConfig, seed: int) -> None:
+        self._size = size_of(config)
+        self._config = config
+        self._seed = seed
+
+    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+        """Return the groups of a level, which follow from the seed, the level and the length of the capture alone.
+
+        A stratum reaches half-way to the neighbours of a group of `midpoint`. The first group starts with the capture and
+        the last ends with it, so that no frame is lost, and shorter ones follow at the ends as there. No instant comes twice.
+
+        Raises:
+            InputError: the capture has fewer frames than a group.
+        """
+        size = self._size
+        require_a_group(size, n_frames)
+        starts = evenly_spread(n_frames, size, (n_frames // size - 1) * 2 ** (level - 1) + 1)
+        if len(starts) > 2:
+            width = self._config.jitter * (starts[1] - starts[0])
+            rng = np.random.default_rng([self._seed, level])
+            starts[1:-1] += width * rng.uniform(-0.5, 0.5, len(starts) - 2)
+        spans = spans_at(starts, size)
+        return centred(with_ends(spans, n_frames, size, level) if self._config.endpoints else spans)

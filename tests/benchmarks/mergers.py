@@ -1,0 +1,140 @@
+"""Which merger to choose: the tables of docs/how-to/choose-a-merger.md.
+
+    python tests/benchmarks/mergers.py docs/how-to/choose-a-merger.md
+
+All merge the same groups along the true motion. Times are CPU times of one thread, the least of several; frames are unpacked
+and summed from a file in the page cache. PSNR is that of the flux of one exposure against what its reference instant shows.
+It takes a minute or two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano import FrameSpan, Group
+from photonpano.evaluation import FrameTrajectory
+from photonpano.geometry import translation
+from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
+from photonpano_core.packed_npy import PackedNpyConfig, PackedNpySource
+from photonpano_core.photon_mle import PhotonMleMerger
+from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.splat import SplatMerger
+from photonpano_simulator.config import StreetScene
+from photonpano_simulator.scenes import scene_flux
+
+if TYPE_CHECKING:
+    from photonpano import Merger
+
+SHAPE = (254, 496)
+SPEEDS_PX = (0.02, 0.15, 0.6)
+FLUXES = (0.005, 0.02, 0.1, 0.5)
+TIMED_FRAMES = 200
+SEEN_FRAMES = 500
+SIDE_PX, WAY_PX = 40, 100
+"""The size of the thing that moves by itself, and how far it goes within a group."""
+MERGERS: dict[str, Merger] = {
+    "photon-mle, 1 px": PhotonMleMerger(PhotonMleConfig()),
+    "photon-mle, 0.25 px": PhotonMleMerger(PhotonMleConfig(tolerance_px=0.25)),
+    "splat": SplatMerger(),
+    "robust-merge, 0.5 px": RobustMerger(RobustMergeConfig()),
+}
+
+
+def panning(speed_px: float, n_frames: int) -> FrameTrajectory:
+    """A pan to the right, and slightly down."""
+    return FrameTrajectory(np.array([translation(speed_px * frame, 0.1 * speed_px * frame) for frame in range(n_frames)]))
+
+
+def opened(folder: Path, frames: np.ndarray) -> PackedNpySource:
+    """Write frames as a capture, and open it."""
+    file = folder / "cube.npy"
+    np.save(file, np.packbits(frames, axis=-1))
+    return PackedNpySource(PackedNpyConfig(path=file))
+
+
+def seconds(merger: Merger, source: PackedNpySource, motion: FrameTrajectory) -> float:
+    """Return the CPU time of a frame."""
+    group = Group(FrameSpan(0, TIMED_FRAMES), (TIMED_FRAMES - 1) / 2)
+    times = []
+    for _ in range(7):
+        start = time.thread_time()
+        merger.merge(source, group, motion, 1.0)
+        times.append(time.thread_time() - start)
+    return min(times) / TIMED_FRAMES
+
+
+def times(folder: Path) -> list[str]:
+    """Return the rows of the table of times."""
+    rows = [f"| Flux | Speed | {' | '.join(MERGERS)} |", "| --- " * (2 + len(MERGERS)) + "|"]
+    rng = np.random.default_rng(0)
+    for flux in FLUXES:
+        frames = rng.random((TIMED_FRAMES, *SHAPE), np.float32) < -np.expm1(-flux)
+        with opened(folder, frames) as source:
+            for speed_px in SPEEDS_PX:
+                motion = panning(speed_px, TIMED_FRAMES)
+                cells = [f"{1e6 * seconds(merger, source, motion):.0f} us" for merger in MERGERS.values()]
+                rows.append(f"| {flux:g} | {speed_px:g} px | {' | '.join(cells)} |")
+    return rows
+
+
+def view(scene: np.ndarray, to_scene: np.ndarray, instant: float, moving: bool) -> np.ndarray:
+    """Return the flux that a frame sees, with or without a bright square that goes its own way."""
+    seen = cv2.warpPerspective(scene, to_scene, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    if moving:
+        left = round(150 + WAY_PX * instant / SEEN_FRAMES)
+        seen[100 : 100 + SIDE_PX, left : left + SIDE_PX] = 2.5 * scene.mean()
+    return seen
+
+
+def psnrs(folder: Path) -> list[str]:
+    """Return the rows of the table of PSNR."""
+    rows = ["| Flux | Merger | Nothing moves | Where something moves by itself |", "| --- | --- | --- | --- |"]
+    to_scene = translation(200, 150)
+    motion = panning(0.15, SEEN_FRAMES)
+    group = Group(FrameSpan(0, SEEN_FRAMES), (SEEN_FRAMES - 1) / 2)
+    passed = (slice(90, 110 + SIDE_PX), slice(110, 190 + WAY_PX + SIDE_PX))
+    inside = (slice(10, -10), slice(50, -50))
+    for flux in FLUXES[1:]:
+        scene = scene_flux(StreetScene(width=1024, height=682), flux)
+        found: dict[str, list[float]] = {name: [] for name in MERGERS}
+        for moving, where in ((False, inside), (True, passed)):
+            rng = np.random.default_rng(1)
+            frames = np.empty((SEEN_FRAMES, *SHAPE), bool)
+            for index, homography in enumerate(motion.at(np.arange(SEEN_FRAMES))):
+                lit = -np.expm1(-view(scene, to_scene @ homography, index, moving))
+                frames[index] = rng.random(SHAPE, np.float32) < lit
+            true = view(scene, to_scene @ motion.at([group.reference])[0], group.reference, moving)[where]
+            with opened(folder, frames) as source:
+                for name, merger in MERGERS.items():
+                    exposure = merger.merge(source, group, motion, 1.0)
+                    error = np.mean((exposure.flux[where] - true) ** 2)
+                    found[name].append(float(10 * np.log10(true.max() ** 2 / error)))
+        rows += [f"| {flux:g} | {name} | {still:.1f} dB | {moved:.1f} dB |" for name, (still, moved) in found.items()]
+    return rows
+
+
+def main() -> None:
+    """Measure everything, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", type=Path, help="the page whose tables are replaced")
+    page: Path = parser.parse_args().page
+    cv2.setNumThreads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        tables = {"psnr": psnrs(Path(folder)), "times": times(Path(folder))}
+    text = page.read_text(encoding="utf-8")
+    for name, rows in tables.items():
+        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+        before, rest = text.split(begin)
+        text = "\n".join([f"{before}{begin}", *rows, end]) + rest.split(end)[1]
+    page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

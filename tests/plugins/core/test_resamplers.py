@@ -1,0 +1,121 @@
+"""The resamplers beside midpoint: what they share, and what each is for."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano import FrameSpan, InputError, StageContext, StreamInfo
+from photonpano_core.configs import MidpointConfig
+from photonpano_core.hooks import photonpano_resamplers
+from photonpano_core.midpoint import MidpointResampler
+
+if TYPE_CHECKING:
+    from photonpano import Group
+
+NAMES = ("constant-groups", "sliding-window", "stratified")
+CONTRIBUTIONS = {each.name: each for each in photonpano_resamplers()}
+
+
+def groups(name: str, n_frames: int, level: int = 1, group_size: int = 100, seed: int = 0, **config: Any) -> tuple[Group, ...]:
+    contribution = CONTRIBUTIONS[name]
+    context = StageContext(StreamInfo(n_frames, 8, 8, None), response=None, seed=seed)
+    built = contribution.build(contribution.config(group_size=group_size, **config), context)
+    return tuple(built.groups(n_frames, level))
+
+
+def starts(found: tuple[Group, ...]) -> list[int]:
+    return [group.span.start for group in found]
+
+
+def midpoint(n_frames: int, level: int, group_size: int = 100, **config: bool) -> tuple[Group, ...]:
+    return MidpointResampler(MidpointConfig(group_size=group_size, **config)).groups(n_frames, level)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(group_size=st.integers(1, 300), more=st.integers(0, 1500), level=st.integers(1, 4))
+def test_any_capture_is_covered_in_order(name: str, group_size: int, more: int, level: int) -> None:
+    n_frames = group_size + more
+    found = groups(name, n_frames, level, group_size)
+    assert all(group.span.stop <= n_frames and group.reference == group.span.centre for group in found)
+    assert all(earlier.reference < later.reference for earlier, later in pairwise(found))
+    if n_frames >= 2 * group_size:
+        assert (found[0].span.start, found[-1].span.stop) == (0, n_frames)
+
+
+TOO_SHORT = (
+    "the capture has 99 frames, fewer than one group of 100; set group_size to 24 or less, so that at least four groups fit"
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_capture_shorter_than_a_group_is_refused(name: str) -> None:
+    with pytest.raises(InputError) as caught:
+        groups(name, 99)
+    assert str(caught.value) == TOO_SHORT
+    contribution = CONTRIBUTIONS[name]
+    assert contribution.check(contribution.config(group_size=100), StreamInfo(99, 8, 8, None)) == [TOO_SHORT]
+
+
+@pytest.mark.parametrize("level", [1, 2, 5])
+@pytest.mark.parametrize("n_frames", [100, 160, 460, 1000])
+def test_constant_groups_are_those_of_the_first_level(n_frames: int, level: int) -> None:
+    assert groups("constant-groups", n_frames, level) == midpoint(n_frames, 1)
+
+
+def test_windows_slide_by_half_a_group_at_every_level() -> None:
+    assert starts(groups("sliding-window", 400)) == [0, 50, 100, 150, 200, 250, 300]
+    assert groups("sliding-window", 400, 3) == groups("sliding-window", 400, 1)
+
+
+def test_windows_slide_by_the_step_or_a_little_less() -> None:
+    assert starts(groups("sliding-window", 400, step_frames=100)) == [0, 100, 200, 300]
+    assert starts(groups("sliding-window", 430, step_frames=100)) == [0, 82, 165, 248, 330]
+    assert starts(groups("sliding-window", 105, step_frames=1)) == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_step_that_shrinks_adds_groups_from_level_to_level() -> None:
+    """With a step of a group that is halved, they are those of midpoint without its ends."""
+    for level in (1, 2, 3, 4):
+        found = groups("sliding-window", 1000, level, step_frames=100, step_shrink=2)
+        assert found == midpoint(1000, level, endpoints=False)
+    assert starts(groups("sliding-window", 110, 9, step_frames=100, step_shrink=4)) == list(range(11))
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_there_is_one_group_in_each_stratum(level: int) -> None:
+    found = groups("stratified", 4000, level)
+    even = midpoint(4000, level)
+    assert len(found) == len(even)
+    half = 50 / 2 ** (level - 1)
+    offsets = [one.reference - other.reference for one, other in zip(found, even, strict=True)]
+    assert max(abs(offset) for offset in offsets) <= half + 1
+    assert max(offsets) > 0.7 * half
+    assert min(offsets) < -0.7 * half
+    assert [len(group.span) for group in found] == [len(group.span) for group in even]
+
+
+def test_the_outermost_groups_lose_no_frame() -> None:
+    assert [group.span for group in groups("stratified", 4000)[::39]] == [FrameSpan(0, 100), FrameSpan(3900, 4000)]
+
+
+def test_chance_follows_from_the_seed_and_the_level() -> None:
+    assert groups("stratified", 4000, 2, seed=1) == groups("stratified", 4000, 2, seed=1)
+    assert groups("stratified", 4000, 2, seed=1) != groups("stratified", 4000, 2, seed=2)
+    # Other chance at another level, and not the same places again.
+    first, second = starts(groups("stratified", 4000, 1)), starts(groups("stratified", 4000, 2, endpoints=False))
+    assert len({*first[1:-1]} & {*second[2:-2:2]}) < 10
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_without_jitter_they_are_those_of_midpoint(level: int) -> None:
+    for n_frames in (100, 160, 460, 1000):
+        assert groups("stratified", n_frames, level, jitter=0) == midpoint(n_frames, level)
+
+
+def test_a_stratum_of_a_frame_has_one_group() -> None:
+    assert starts(groups("stratified", 104, 4, group_size=2, endpoints=False)) == list(range(103))
