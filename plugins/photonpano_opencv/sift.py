@@ -10,9 +10,8 @@ import numpy as np
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, implausibility, normalised
-from photonpano_opencv.fitting import fit_homography
+from photonpano.locating import PointLimits, blur_against_noise, motion_from_points, stabilised_8_bit
 from photonpano_opencv.matching import match_everywhere, match_nearby, unit_descriptors
-from photonpano_opencv.viewing import blur_against_noise, stabilised_8_bit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -125,26 +124,20 @@ class SiftLocator:
                 f"(more than {least_agreeing(len(pairs), guided=False):.0f} must)",
                 evidence,
             )
-        for radius in GUIDED_RADII:
-            if reason := implausibility(homography, moving.shape):
-                return NotLocated(f"{reason}, from {len(pairs)} matches", evidence)
-            predicted = apply(homography, moving.points)
-            pairs = match_nearby(*descriptors, predicted, fixed.points, radius * config.threshold_px, GUIDED_RATIO)
-            evidence["inliers"] = float(len(pairs))
-            if len(pairs) < config.min_inliers:
-                return NotLocated(self._too_few("inliers", evidence), evidence)
-            fit = fit_homography(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]], homography)
-            homography = fit.homography
-        std_px = fit.corner_std_px(moving.shape)
-        if not std_px <= config.max_std_px:
-            return NotLocated(
-                f"{len(pairs)} inliers leave the corners of the frame uncertain by {std_px:.1f} px, "
-                f"more than max_std_px = {config.max_std_px:g}",
-                evidence,
-            )
         if reason := implausibility(homography, moving.shape):
-            return NotLocated(f"{reason}, from {len(pairs)} inliers", evidence)
-        return Located(homography, fit.information, fit.residual_px, evidence)
+            return NotLocated(f"{reason}, from {len(pairs)} matches", evidence)
+        motion: Located | NotLocated
+        for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
+            limits = PointLimits(config.min_inliers, radius * config.threshold_px, max_std_px)
+            predicted = apply(homography, moving.points)
+            pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, GUIDED_RATIO)
+            here, there, sizes = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]]
+            # Matches that were looked for within the threshold are inliers, all of them.
+            motion = motion_from_points(here, there, homography, moving.shape, limits, sizes=sizes, evidence=evidence, rounds=1)
+            if isinstance(motion, NotLocated):
+                break
+            homography = motion.homography
+        return motion
 
     def _consensus(
         self, moving: NDArray[np.float32], fixed: NDArray[np.float32], pairs: NDArray[np.intp], guided: bool

@@ -45,7 +45,7 @@ class Fit:
 
 
 def fit_homography(
-    moving: NDArray[np.float32], fixed: NDArray[np.float32], sizes: NDArray[np.float32], start: NDArray[np.float64]
+    moving: NDArray[np.floating], fixed: NDArray[np.floating], sizes: NDArray[np.floating], start: NDArray[np.float64]
 ) -> Fit:
     """Fit a homography to matches, each weighted by the inverse of its keypoint's size, and robustly against wrong ones.
 
