@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.geometry import apply, implausibility
-from photonpano.locating.fitting import fit_homography
+from photonpano.locating.fitting import MIN_NOISE_PX, fit_homography
 from photonpano.values import Located, NotLocated
 
 if TYPE_CHECKING:
@@ -27,11 +27,14 @@ class PointLimits:
         min_inliers: a pair with fewer inliers is not located; at least 5.
         threshold_px: a match is an inlier where the motion puts it this near to its partner.
         max_std_px: a motion that leaves a corner of the frame more uncertain than this is not believed.
+        min_noise_px: matches err by at least this much a coordinate, however well they agree: detectors that know whole pixels
+            only round alike.
     """
 
     min_inliers: int = 12
     threshold_px: float = 2.0
     max_std_px: float = 10.0
+    min_noise_px: float = MIN_NOISE_PX
 
 
 def motion_from_points(
@@ -80,7 +83,7 @@ def motion_from_points(
                 f"fewer than min_inliers = {limits.min_inliers}",
                 found,
             )
-        fit = fit_homography(moving[inliers], fixed[inliers], sizes[inliers], homography)
+        fit = fit_homography(moving[inliers], fixed[inliers], sizes[inliers], homography, limits.min_noise_px)
         homography = fit.homography
     std_px = fit.corner_std_px(shape)
     if not std_px <= limits.max_std_px:
