@@ -1,4 +1,4 @@
-"""Small captures and motions that many tests need: in memory, without plugins; and simulated, for whole runs."""
+"""Small captures, exposures and motions that many tests need: in memory; and simulated, for whole runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, StreamInfo
+from photonpano import FrameSpan, Group, StreamInfo, VirtualExposure
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 
@@ -73,6 +73,42 @@ def pan() -> Callable[..., KnownMotion]:
         return KnownMotion(lambda frame: translation(x_px * frame, y_px * frame))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def street() -> np.ndarray:
+    """(682, 1024) of flux, 0.5 photons per pixel and frame on average."""
+    from photonpano_simulator.config import StreetScene
+    from photonpano_simulator.scenes import scene_flux
+
+    return scene_flux(StreetScene(width=1024, height=682), 0.5)
+
+
+@pytest.fixture(scope="session")
+def photograph() -> Callable[..., VirtualExposure]:
+    """Take a virtual exposure from an image of flux: 250 frames, without motion, with photon noise."""
+    n_frames, response = 250, BinaryResponse()
+
+    def photograph(flux: np.ndarray, seed: int = 0) -> VirtualExposure:
+        counts = np.random.default_rng(seed).binomial(n_frames, -np.expm1(-flux.astype(float)))
+        weight = np.full(flux.shape, n_frames, np.float32)
+        estimate = response.flux((counts / n_frames).astype(np.float32), weight)
+        return VirtualExposure(estimate, weight, Group(FrameSpan(0, n_frames), 0), 1.0, response)
+
+    return photograph
+
+
+@pytest.fixture(scope="session")
+def seen_from(street: np.ndarray, photograph: Callable) -> Callable[..., VirtualExposure]:
+    """Take an exposure of (160, 240) px: `motion` maps its pixels to those of the exposure that the identity gives."""
+    import cv2
+
+    def seen_from(motion: np.ndarray, seed: int = 0, brightness: float = 1.0) -> VirtualExposure:
+        to_street = translation(400, 280) @ motion
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return photograph(cv2.warpPerspective(street, to_street, (240, 160), flags=flags) * brightness, seed)
+
+    return seen_from
 
 
 @pytest.fixture(scope="session")

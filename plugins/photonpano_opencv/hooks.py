@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from photonpano import LocatorContribution, hookimpl
-from photonpano_opencv.configs import DirectConfig, OpencvSiftConfig
+from photonpano_opencv.configs import DirectConfig, OpencvEccConfig, OpencvOrbConfig, OpencvSiftConfig, PhaseCorrelationConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 
 @hookimpl
-def photonpano_locators() -> Iterator[LocatorContribution[OpencvSiftConfig] | LocatorContribution[DirectConfig]]:
-    """Offer SIFT and direct alignment."""
+def photonpano_locators() -> Iterator[LocatorContribution[Any]]:
+    """Offer features, and alignment by brightness."""
     yield LocatorContribution(
         name="opencv-sift",
         summary="SIFT keypoints, ratio test, MAGSAC, and a least-squares fit of the inliers",
@@ -23,10 +23,28 @@ def photonpano_locators() -> Iterator[LocatorContribution[OpencvSiftConfig] | Lo
         build=_build_sift,
     )
     yield LocatorContribution(
+        name="opencv-orb",
+        summary="ORB keypoints, ratio test on bits, MAGSAC, and a least-squares fit of the inliers",
+        config=OpencvOrbConfig,
+        build=_build_orb,
+    )
+    yield LocatorContribution(
         name="direct",
         summary="Inverse-compositional alignment of brightness, coarse to fine, weighted by photon statistics",
         config=DirectConfig,
         build=_build_direct,
+    )
+    yield LocatorContribution(
+        name="opencv-ecc",
+        summary="Alignment that maximises the enhanced correlation coefficient, coarse to fine",
+        config=OpencvEccConfig,
+        build=_build_ecc,
+    )
+    yield LocatorContribution(
+        name="phase-correlation",
+        summary="The shift between two exposures, for cameras that turn without rolling",
+        config=PhaseCorrelationConfig,
+        build=_build_phase_correlation,
     )
 
 
@@ -36,8 +54,28 @@ def _build_sift(config: OpencvSiftConfig, context: StageContext) -> Locator:
     return SiftLocator(config, context.seed)
 
 
+def _build_orb(config: OpencvOrbConfig, context: StageContext) -> Locator:
+    from photonpano_opencv.orb import OrbLocator
+
+    return OrbLocator(config, context.seed)
+
+
 def _build_direct(config: DirectConfig, context: StageContext) -> Locator:
     from photonpano_opencv.direct import DirectLocator
 
     del context
     return DirectLocator(config)
+
+
+def _build_ecc(config: OpencvEccConfig, context: StageContext) -> Locator:
+    from photonpano_opencv.ecc import EccLocator
+
+    del context
+    return EccLocator(config)
+
+
+def _build_phase_correlation(config: PhaseCorrelationConfig, context: StageContext) -> Locator:
+    from photonpano_opencv.phase import PhaseCorrelationLocator
+
+    del context
+    return PhaseCorrelationLocator(config)

@@ -17,8 +17,14 @@ def unit_descriptors(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1)))
 
 
+def unit_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the bits of (N, D) bytes as vectors of length 1: the square of a distance is 4 / (8 D) times Hamming's."""
+    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+    return np.asarray((2 * bits - 1) / np.sqrt(max(1, bits.shape[1])), np.float32)
+
+
 def match_everywhere(moving: NDArray[np.float32], fixed: NDArray[np.float32], ratio: float) -> NDArray[np.intp]:
-    """Match unit descriptors (M, 128) and (N, 128): pairs of indices (K, 2)."""
+    """Match unit descriptors (M, D) and (N, D): pairs of indices (K, 2)."""
     if min(len(moving), len(fixed)) < 2:
         return np.zeros((0, 2), dtype=np.intp)
     similarity = moving @ fixed.T
@@ -45,8 +51,8 @@ def match_nearby(
     """Match unit descriptors among fixed keypoints within a radius of where the moving ones are predicted: pairs (K, 2).
 
     Args:
-        moving: (M, 128) descriptors.
-        fixed: (N, 128) descriptors.
+        moving: (M, D) descriptors.
+        fixed: (N, D) descriptors.
         predicted: (M, 2) where the moving keypoints should lie in the fixed image, px.
         points: (N, 2) where the fixed keypoints lie, px.
         radius_px: how far to look.

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano_opencv.matching import match_everywhere, match_nearby, unit_descriptors
+from photonpano_opencv.matching import match_everywhere, match_nearby, unit_bits, unit_descriptors
 
 counts = st.integers(0, 12)
 seeds = st.integers(0, 2**32 - 1)
@@ -34,6 +34,15 @@ def test_descriptors_become_unit_vectors_of_square_roots() -> None:
     unit = unit_descriptors(np.array([[1, 4, 4] + [0] * 125, [0] * 128], np.uint8))
     np.testing.assert_allclose(unit[0, :3], [1 / 3, 2 / 3, 2 / 3], rtol=1e-6)
     np.testing.assert_array_equal(unit[1], 0)
+
+
+@given(seed=seeds)
+def test_bits_become_unit_vectors_whose_squared_distance_is_hammings(seed: int) -> None:
+    raw = np.random.default_rng(seed).integers(0, 256, (2, 32), dtype=np.uint8)
+    first, second = unit_bits(raw)
+    differing = np.count_nonzero(np.unpackbits(raw[0]) != np.unpackbits(raw[1]))
+    np.testing.assert_allclose(np.sum((first - second) ** 2), 4 / 256 * differing, rtol=1e-5)
+    np.testing.assert_allclose(first @ first, 1, rtol=1e-6)
 
 
 @given(n_moving=counts, n_fixed=counts, seed=seeds)

@@ -9,7 +9,8 @@ import pytest
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano_opencv.configs import OpencvSiftConfig
-from photonpano_opencv.sift import SiftFeatures, SiftLocator
+from photonpano_opencv.keypoints import Keypoints
+from photonpano_opencv.sift import SiftLocator
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -154,10 +155,10 @@ def test_noise_is_not_located_near_the_motion_known_so_far(photograph: Callable,
         few(sift.register(*features, initial))
 
 
-def features(points: np.ndarray, seed: int = 0) -> SiftFeatures:
+def features(points: np.ndarray, seed: int = 0) -> Keypoints:
     """Keypoints that match one to one, each with a descriptor of its own."""
     descriptors = np.random.default_rng(seed).integers(0, 256, (len(points), 128), dtype=np.uint8)
-    return SiftFeatures(points.astype(np.float32), np.full(len(points), 4, np.float32), descriptors, SHAPE)
+    return Keypoints(points.astype(np.float32), np.full(len(points), 4, np.float32), descriptors, SHAPE)
 
 
 def test_keypoints_on_a_line_do_not_pin_the_frame_down() -> None:

@@ -345,6 +345,6 @@ def test_plugins_show_json(invoke: Callable[..., Any]) -> None:
 def test_plugins_show_of_an_unknown_name(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "show", "opencv-shift")
     assert result.exit_code == 2
-    assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'?" in result.stderr
+    assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'" in result.stderr
     wrong_kind = invoke("plugins", "show", "opencv-sift", "--kind", "source")
     assert "there is no source 'opencv-sift'; it is one of the locators" in wrong_kind.stderr

@@ -45,7 +45,11 @@ class Fit:
 
 
 def fit_homography(
-    moving: NDArray[np.float32], fixed: NDArray[np.float32], sizes: NDArray[np.float32], start: NDArray[np.float64]
+    moving: NDArray[np.floating],
+    fixed: NDArray[np.floating],
+    sizes: NDArray[np.floating],
+    start: NDArray[np.float64],
+    min_noise_px: float = MIN_NOISE_PX,
 ) -> Fit:
     """Fit a homography to matches, each weighted by the inverse of its keypoint's size, and robustly against wrong ones.
 
@@ -54,6 +58,7 @@ def fit_homography(
         fixed: (N, 2) their partners.
         sizes: (N,) diameters of the keypoints; where a keypoint lies is known in proportion.
         start: (3, 3) where to start from.
+        min_noise_px: matches err by at least this much, however well they agree.
     """
     here, there = moving.astype(np.float64), fixed.astype(np.float64)
     by_size = (np.median(sizes) / sizes).astype(np.float64)
@@ -66,7 +71,7 @@ def fit_homography(
         solution = least_squares(_residuals, p, _derivatives, method="lm", x_scale="jac", args=(here, there, weights))
         p = solution.x
         residuals = _residuals(p, here, there, by_size)
-    spread = _spread(residuals)
+    spread = max(_spread(residuals), min_noise_px)
     j = _derivatives(p, here, there, by_size)
     return Fit(from_parameters(p), j.T @ j / spread**2, spread)
 

@@ -1,0 +1,97 @@
+"""From matched points to a motion: the end of every locator that works with keypoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano.geometry import apply, implausibility
+from photonpano.locating.fitting import MIN_NOISE_PX, fit_homography
+from photonpano.values import Located, NotLocated
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from photonpano.values import Homography
+
+
+@dataclass(frozen=True, slots=True)
+class PointLimits:
+    """What matched points must fulfil to be believed.
+
+    Attributes:
+        min_inliers: a pair with fewer inliers is not located; at least 5.
+        threshold_px: a match is an inlier where the motion puts it this near to its partner.
+        max_std_px: a motion that leaves a corner of the frame more uncertain than this is not believed.
+        min_noise_px: matches err by at least this much a coordinate, however well they agree: detectors that know whole pixels
+            only round alike.
+    """
+
+    min_inliers: int = 12
+    threshold_px: float = 2.0
+    max_std_px: float = 10.0
+    min_noise_px: float = MIN_NOISE_PX
+
+
+def motion_from_points(
+    moving: NDArray[np.floating],
+    fixed: NDArray[np.floating],
+    start: Homography,
+    shape: tuple[int, int],
+    limits: PointLimits,
+    *,
+    sizes: NDArray[np.floating] | None = None,
+    evidence: Mapping[str, float] | None = None,
+    rounds: int = 2,
+) -> Located | NotLocated:
+    """Fit a motion to the matches that agree with it, by least squares, and judge it. Raises nothing.
+
+    Convention:
+        The map takes pixels of the moving image to pixels of the fixed one; points are (x, y), integers are pixel centres.
+
+    Args:
+        moving: (N, 2) points of the moving image.
+        fixed: (N, 2) their partners.
+        start: (3, 3) the motion that a consensus of the matches, such as RANSAC, found.
+        shape: (height, width) of both images.
+        limits: what it takes to be believed.
+        sizes: (N,) diameters of the keypoints, where they differ; where a keypoint lies is known in proportion.
+        evidence: what the backend counted, for the record.
+        rounds: how often inliers are chosen and fitted.
+
+    Returns:
+        `Located` with the information that the residuals give, `evidence`, and the numbers of `matches` and `inliers`; or
+        `NotLocated` where there are too few inliers, where they leave the corners of the frame uncertain, or where no camera
+        moves like that.
+    """
+    found = dict(evidence or {})
+    found.setdefault("matches", float(len(moving)))
+    if reason := implausibility(start, shape):
+        return NotLocated(f"{reason}, from {len(moving)} matches", found)
+    sizes = np.ones(len(moving)) if sizes is None else sizes
+    homography = start
+    for _ in range(rounds):
+        inliers = np.linalg.norm(apply(homography, moving) - fixed, axis=1) <= limits.threshold_px
+        found["inliers"] = float(np.count_nonzero(inliers))
+        if found["inliers"] < limits.min_inliers:
+            return NotLocated(
+                f"{found['inliers']:.0f} of {len(moving)} matches lie within {limits.threshold_px:g} px of the motion, "
+                f"fewer than min_inliers = {limits.min_inliers}",
+                found,
+            )
+        fit = fit_homography(moving[inliers], fixed[inliers], sizes[inliers], homography, limits.min_noise_px)
+        homography = fit.homography
+    std_px = fit.corner_std_px(shape)
+    if not std_px <= limits.max_std_px:
+        return NotLocated(
+            f"{found['inliers']:.0f} inliers leave the corners of the frame uncertain by {std_px:.1f} px, "
+            f"more than max_std_px = {limits.max_std_px:g}",
+            found,
+        )
+    if reason := implausibility(homography, shape):
+        return NotLocated(f"{reason}, from {found['inliers']:.0f} inliers", found)
+    return Located(homography, fit.information, fit.residual_px, found)

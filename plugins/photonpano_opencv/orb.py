@@ -1,0 +1,46 @@
+"""ORB features, matched by Hamming distance and fitted: the fastest of the classical features, and the least exact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_opencv.keypoints import KeypointMatcher, Keypoints, detected
+from photonpano_opencv.matching import unit_bits
+
+if TYPE_CHECKING:
+    from photonpano import VirtualExposure
+    from photonpano_opencv.configs import OpencvOrbConfig
+
+_NOISE_PX = math.sqrt(2 / 12)
+"""Corners are found to whole pixels: the difference of two is not known better, even where all of them round alike."""
+
+
+class OrbLocator(KeypointMatcher):
+    """Detects ORB keypoints once, and matches and fits them."""
+
+    def __init__(self, config: OpencvOrbConfig, seed: int) -> None:
+        # Hamming's distance is the square of that of vectors.
+        super().__init__(config, seed, unit_bits, math.sqrt(config.ratio), _NOISE_PX)
+        self._orb = config
+
+    def describe(self, exposure: VirtualExposure) -> Keypoints:
+        """Detect keypoints on the variance-stabilised image, where it was seen."""
+        config = self._orb
+        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        # A detector for each call: OpenCV does not promise that one may be shared by threads.
+        orb = cv2.ORB.create(
+            config.max_keypoints, config.pyramid_scale, config.pyramid_levels, fastThreshold=config.fast_threshold
+        )
+        image, mask = stabilised_8_bit(exposure, blur_px)
+        found, keypoints = detected(orb, image, mask, config.max_keypoints)
+        # OpenCV multiplies places in a coarse level by its nominal scale, as if pixel (0, 0) had its centre in the corner.
+        scales = np.array([config.pyramid_scale**keypoint.octave for keypoint in found], dtype=np.float32).reshape(-1, 1)
+        size = np.array(image.shape[::-1], dtype=np.float32)
+        centres = (keypoints.points / scales + 0.5) * (size / np.rint(size / scales)) - 0.5
+        return replace(keypoints, points=np.asarray(centres, np.float32))

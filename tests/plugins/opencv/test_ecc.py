@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import apply, corner_displacements, corners, jacobian, translation
+from photonpano_opencv.configs import OpencvEccConfig
+from photonpano_opencv.ecc import EccLocator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (160, 240)
+STILL = np.eye(3)
+LOCATOR = EccLocator(OpencvEccConfig())
+
+
+def test_the_pyramid_is_finest_first_and_ends_before_it_is_too_small(seen_from: Callable) -> None:
+    views = LOCATOR.describe(seen_from(STILL))
+    assert [view.shape for view in views] == [(160, 240), (80, 120), (40, 60)]
+    assert len(EccLocator(OpencvEccConfig(pyramid_levels=1)).describe(seen_from(STILL))) == 1
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.1])
+def test_the_information_is_that_of_the_scatter(seen_from: Callable, brightness: float) -> None:
+    # Whole pixels: between them, the fixture samples its street bluntly, and the images differ by more than noise.
+    true, frame = translation(10, -3), corners(SHAPE)
+    errors, predicted = [], []
+    for seed in range(10):
+        pair = (LOCATOR.describe(seen_from(each, 2 * seed + i, brightness)) for i, each in enumerate((true, STILL)))
+        motion = LOCATOR.register(*pair, true)
+        assert isinstance(motion, Located), motion
+        to_corners = jacobian(motion.homography, frame).reshape(8, 8)
+        predicted.append(np.trace(to_corners @ np.linalg.inv(motion.information) @ to_corners.T))
+        errors.append(np.sum((apply(motion.homography, frame) - apply(true, frame)) ** 2))
+    assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
+
+
+def test_lamps_may_flicker(seen_from: Callable) -> None:
+    """The correlation coefficient does not change with brightness; what is said of the certainty is less, then."""
+    true = translation(10, -3)
+    alike, dimmed = (
+        LOCATOR.register(LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2, brightness)), None)
+        for brightness in (1.0, 0.7)
+    )
+    for motion in (alike, dimmed):
+        assert isinstance(motion, Located), motion
+        assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
+    assert dimmed.residual_px > 2 * alike.residual_px
+
+
+def test_a_level_that_leads_nowhere_is_passed_over(seen_from: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    find = cv2.findTransformECCWithMask
+
+    def on_fine_levels_only(moving: np.ndarray, *rest: object) -> object:
+        if moving.shape != SHAPE:
+            raise cv2.error("the coarse levels see nothing")
+        return find(moving, *rest)
+
+    monkeypatch.setattr(cv2, "findTransformECCWithMask", on_fine_levels_only)
+    true = translation(10.5, -3.25)
+    motion = LOCATOR.register(LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2)), None)
+    assert isinstance(motion, Located), motion
+    assert motion.evidence["aligned_levels"] == 1
+    assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
+
+
+def test_what_opencv_raises_is_a_reason(seen_from: Callable) -> None:
+    """From a start where nothing overlaps, OpenCV raises at every level."""
+    pair = (LOCATOR.describe(seen_from(each, seed)) for seed, each in enumerate((STILL, STILL)))
+    motion = LOCATOR.register(*pair, translation(235, 0))
+    assert isinstance(motion, NotLocated)
+    assert motion.reason == "the correlation cannot be maximised: NaN encountered"

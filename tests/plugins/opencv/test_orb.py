@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonpano import Located
+from photonpano.geometry import corner_displacements, translation
+from photonpano_opencv.configs import OpencvOrbConfig
+from photonpano_opencv.orb import OrbLocator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from photonpano_opencv.keypoints import Keypoints
+
+SHAPE = (160, 240)
+
+
+def described(exposure: object, **config: object) -> Keypoints:
+    return OrbLocator(OpencvOrbConfig.model_validate(config), seed=0).describe(exposure)
+
+
+def test_keypoints_of_coarse_levels_lie_where_they_are(seen_from: Callable) -> None:
+    """Of an exposure that is turned by half a turn, they lie half a turn away, and not half a pixel beside it."""
+    exposure = seen_from(np.eye(3))
+    here = described(exposure)
+    turned = described(replace(exposure, flux=exposure.flux[::-1, ::-1].copy(), weight=exposure.weight[::-1, ::-1].copy()))
+    back = np.array([SHAPE[1] - 1, SHAPE[0] - 1]) - turned.points
+    offsets = []
+    for point, size in zip(here.points, here.sizes, strict=True):
+        distances = np.linalg.norm(back - point, axis=1)
+        distances[turned.sizes != size] = np.inf
+        if size > 31 * 1.2**2.5 and distances.min() < 2:
+            offsets.append(back[distances.argmin()] - point)
+    assert len(offsets) > 50
+    # Where OpenCV says that they are, it is half a pixel.
+    assert np.abs(np.mean(offsets, axis=0)).max() < 0.1
+
+
+def test_matches_that_round_alike_are_not_taken_for_exact(seen_from: Callable) -> None:
+    """A shift of a third of a pixel, which whole pixels do not show."""
+    locator, true = OrbLocator(OpencvOrbConfig(), seed=0), translation(0.3, -0.2)
+    motion = locator.register(locator.describe(seen_from(true, 1)), locator.describe(seen_from(np.eye(3), 2)), None)
+    assert isinstance(motion, Located)
+    assert 0.1 < corner_displacements(motion.homography, true, SHAPE).mean() < 0.6
+    assert motion.residual_px > 0.4
+
+
+def test_the_strongest_keypoints_are_kept(seen_from: Callable) -> None:
+    best = described(seen_from(np.eye(3)), max_keypoints=50)
+    assert 30 < len(best.points) <= 50
+    assert len(best.points) == len(best.sizes)
+    assert best.descriptors.shape == (len(best.points), 32)
+    assert best.shape == SHAPE

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import apply, from_parameters, generators, jacobian, translation
+from photonpano.locating import View
+from photonpano_opencv.configs import PhaseCorrelationConfig
+from photonpano_opencv.phase import PhaseCorrelationLocator, shift_between
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (160, 240)
+STILL = np.eye(3)
+LOCATOR = PhaseCorrelationLocator(PhaseCorrelationConfig())
+
+
+def waves(x_px: float, y_px: float) -> View:
+    """An image of forty waves that do not repeat in it, moved by so much: band-limited, so that it can be moved exactly."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:80, :120]
+    image = np.zeros(x.shape)
+    for fx, fy, phase in rng.uniform(-0.1, 0.1, (40, 3)) * [1, 1, 30]:
+        image += np.cos(2 * np.pi * (fx * (x - x_px) + fy * (y - y_px)) + phase)
+    return View(image.astype(np.float32), np.ones(image.shape, np.float32), 1.0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(x_px=st.floats(-8, 8), y_px=st.floats(-8, 8))
+def test_shifts_are_found_between_pixels(x_px: float, y_px: float) -> None:
+    motion = LOCATOR.register(waves(0, 0), waves(x_px, y_px), None)
+    assert isinstance(motion, Located), motion
+    np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.2)
+
+
+def test_without_contrast_there_is_no_shift() -> None:
+    flat = View(np.ones(SHAPE, np.float32), np.ones(SHAPE, np.float32), 1.0)
+    assert shift_between(flat, flat, 1.5) is None
+
+
+def test_only_the_shift_changes(seen_from: Callable) -> None:
+    turned = from_parameters([0.01, 0.004, -0.006, 0.02, 0, 0, 2e-5, -3e-5])
+    true = turned @ translation(7, -5)
+    true /= true[2, 2]
+    motion = LOCATOR.register(LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2)), turned)
+    assert isinstance(motion, Located)
+    step = np.linalg.inv(turned) @ motion.homography
+    np.testing.assert_allclose(step / step[2, 2], translation(7, -5), atol=0.05)
+    first = LOCATOR.register(LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2)), None)
+    assert isinstance(first, Located)
+    np.testing.assert_array_equal(first.homography[:, :2], STILL[:, :2])
+
+
+def test_it_says_how_well_it_knows_a_camera_that_also_turns_otherwise(seen_from: Callable) -> None:
+    """Over 20 pairs whose other six parameters are as large as its prior says, errors at the middle of the frame and at its
+    corners are as large as the information predicts, to a factor of 2.5."""
+    rng = np.random.default_rng(3)
+    points = np.array([[119.5, 79.5], [0, 0], [239, 159]])
+    errors, predicted = [], []
+    for seed in range(20):
+        p = rng.normal(0, 0.01, 8)
+        p[4:6] = 0
+        true = translation(4, 3) @ (STILL + np.tensordot(p, generators(SHAPE), 1))
+        true /= true[2, 2]
+        motion = LOCATOR.register(
+            LOCATOR.describe(seen_from(true, 2 * seed)), LOCATOR.describe(seen_from(STILL, 2 * seed + 1)), None
+        )
+        assert isinstance(motion, Located), motion
+        errors.append(np.sum((apply(motion.homography, points) - apply(true, points)) ** 2, axis=1))
+        j = jacobian(motion.homography, points)
+        predicted.append(np.trace(j @ np.linalg.inv(motion.information) @ j.transpose(0, 2, 1), axis1=1, axis2=2))
+    # The turns are a third of what the prior allows, so that they can be told from another place.
+    ratio = 3 * np.sqrt(np.mean(errors, axis=0) / np.mean(predicted, axis=0))
+    assert np.all((ratio > 0.4) & (ratio < 2.5)), ratio
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.1])
+def test_a_shift_is_known_as_well_as_it_says(seen_from: Callable, brightness: float) -> None:
+    """Of cameras that do nothing else, over 12 pairs; p5 and p6 while the rest is held."""
+    true = translation(10, -3)
+    errors, predicted = [], []
+    for seed in range(12):
+        pair = (LOCATOR.describe(seen_from(each, 2 * seed + i, brightness)) for i, each in enumerate((true, STILL)))
+        motion = LOCATOR.register(*pair, None)
+        assert isinstance(motion, Located), motion
+        errors.append(np.sum((motion.homography - true) ** 2))
+        predicted.append(np.trace(np.linalg.inv(motion.information[4:6, 4:6])))
+    assert 0.4 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2.5
+
+
+def test_a_camera_that_rolls_is_not_located(seen_from: Callable) -> None:
+    roll = from_parameters([np.cos(0.3) - 1, np.sin(0.3), -np.sin(0.3), np.cos(0.3) - 1, 25, -30, 0, 0])
+    motion = LOCATOR.register(LOCATOR.describe(seen_from(roll, 1)), LOCATOR.describe(seen_from(STILL, 2)), None)
+    assert isinstance(motion, NotLocated)
+    assert "the images agree by" in motion.reason
