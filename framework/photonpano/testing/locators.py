@@ -12,9 +12,10 @@ import pytest
 
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano.testing.captures import photographed, read_only
+from photonpano.testing.conformance import raising_nothing
 from photonpano.testing.sameness import fingerprint, in_threads
 from photonpano.testing.scenes import Scene
-from photonpano.testing.stages import StageConformance, raising_nothing, unharmed
+from photonpano.testing.stages import StageConformance, unharmed
 from photonpano.values import Located, NotLocated, StreamInfo, VirtualExposure
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def _rolled(degrees: float) -> Homography:
 
 
 MOTIONS: Mapping[str, Homography] = {
-    "sub-pixel": translation(0.3, -0.2),
+    "sub-pixel shift": translation(0.3, -0.2),
     "shift": translation(13.25, -6.5),
     "rotation": translation(4.0, -2.0) @ _rolled(3.0),
     "homography": from_parameters([0.02, 0.006, -0.01, 0.03, -6.0, 3.5, 4e-5, -6e-5]),
@@ -55,7 +56,7 @@ class LocatorConformance(StageConformance):
         contribution: what is tested.
         config: keys under `with`.
         tolerance_px: how far off a motion may be, on average over the corners of the image.
-        motions: those of "sub-pixel", "shift", "rotation" and "homography" that it can find.
+        motions: those of "sub-pixel shift", "shift", "rotation" and "homography" that it can find.
         needs_start: whether it only refines, and finds nothing that is further off than a few px.
         information_factor: by how much the errors that its information predicts may differ from those that it makes.
     """
@@ -178,7 +179,8 @@ class LocatorConformance(StageConformance):
                 pytest.skip("it has no information: all pairs count alike")
             matrix = np.asarray(found.information)
             assert matrix.shape == (8, 8), f"information is (8, 8), one row for each of p1..p8; its shape is {matrix.shape}"
-            assert np.allclose(matrix, matrix.T, rtol=1e-6), "information is symmetric, as every inverse covariance is"
+            symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
+            assert symmetric, "information is symmetric, as every inverse covariance is"
             # In px of corners, where p1..p8 have one scale.
             slopes = np.linalg.inv(jacobian(found.homography, corners(SHAPE)).reshape(8, 8))
             values = np.linalg.eigvalsh(slopes.T @ matrix @ slopes)
@@ -217,7 +219,8 @@ class LocatorConformance(StageConformance):
         exposures, initial = pair("shift"), nearby("shift")
         before = fingerprint((exposures, initial))
         self.registered(*exposures, initial)
-        assert fingerprint((exposures, initial)) == before, "the locator changes an exposure, or `initial`; copy it first"
+        same = fingerprint((exposures, initial)) == before
+        assert same, "the locator changes an exposure, or `initial`; copy it first"
         with unharmed("the locator"):
             self.registered(_unwritable(exposures[0]), _unwritable(exposures[1]), read_only(initial))
 
@@ -234,7 +237,7 @@ class LocatorConformance(StageConformance):
             "registered once more with the same descriptions": fingerprint(locator.register(moving, fixed, initial)),
             "described and registered anew": fingerprint(self.registered(*pair("shift"), initial)),
         }
-        for number, found in enumerate(in_threads(lambda: fingerprint(locator.register(moving, fixed, initial)))):
+        for number, found in enumerate(in_threads(lambda _: fingerprint(locator.register(moving, fixed, initial)))):
             others[f"in thread {number} of several at once"] = found
         wrong = [how for how, found in others.items() if found != expected]
         assert not wrong, f"the same pair must give the same bytes; {' and '.join(wrong)}, it gives others"

@@ -32,13 +32,13 @@ def fingerprint(value: Any) -> object:
     return repr(value)
 
 
-def in_threads(work: Callable[[], T]) -> list[T]:
-    """Do the same work in several threads that start together, and return what each made."""
+def in_threads(work: Callable[[int], T]) -> list[T]:
+    """Do some work in several threads that start together, each given its number, and return what each made."""
     together = Barrier(THREADS)
 
-    def start() -> T:
+    def start(number: int) -> T:
         together.wait()
-        return work()
+        return work(number)
 
     with ThreadPoolExecutor(THREADS) as pool:
-        return [job.result() for job in [pool.submit(start) for _ in range(THREADS)]]
+        return list(pool.map(start, range(THREADS)))

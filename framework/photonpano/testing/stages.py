@@ -12,7 +12,7 @@ from photonpano.testing.conformance import Conformance
 from photonpano.values import CaptureSummary, StreamInfo
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from photonpano.contributions import StageContribution
     from photonpano.values import DecisionValue
@@ -77,11 +77,3 @@ def unharmed(what: str) -> Iterator[None]:
             f"{what} fails when the arrays that it is given cannot be written to; others use them as well: copy what you "
             f"change ({type(error).__name__}: {error})"
         ) from error
-
-
-def raising_nothing(what: str, work: Callable[..., Any], *arguments: Any) -> Any:
-    """Do what must not raise, whatever the arguments."""
-    try:
-        return work(*arguments)
-    except Exception as error:
-        raise AssertionError(f"{what} must not raise; it raised {type(error).__name__}: {error}") from error
