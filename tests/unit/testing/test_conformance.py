@@ -147,7 +147,7 @@ BROKEN = [
 
 @pytest.fixture(autouse=True)
 def hook_modules(tmp_path, monkeypatch):
-    (tmp_path / "hooks_with_scipy.py").write_text("import scipy.signal\n")
+    (tmp_path / "hooks_with_scipy.py").write_text("import scipy\n")
     (tmp_path / "hooks_with_wave.py").write_text("import wave\n")
     monkeypatch.syspath_prepend(tmp_path)
 
