@@ -7,52 +7,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, StreamInfo, VirtualExposure
+from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
+from photonpano.testing import KnownMotion, MemorySource
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
-    from types import TracebackType
-
-    from numpy.typing import ArrayLike
 
     from photonpano.api import RunResult
-
-
-class MemorySource:
-    """Binary frames (n, H, W) held in memory: a `photonpano.Source`."""
-
-    def __init__(self, frames: np.ndarray, valid: np.ndarray | None = None) -> None:
-        self._frames = np.asarray(frames, dtype=np.uint8)
-        self.info = StreamInfo(*self._frames.shape, frame_rate_hz=None)
-        self.response = BinaryResponse()
-        self.valid = np.ones(self.info.frame_shape, bool) if valid is None else valid
-
-    def counts(self, span: FrameSpan) -> np.ndarray:
-        return self.frames(span).sum(axis=0, dtype=np.uint32)
-
-    def frames(self, span: FrameSpan) -> np.ndarray:
-        self.info.require(span)
-        return self._frames[span.start : span.stop]
-
-    def close(self) -> None: ...
-
-    def __enter__(self) -> MemorySource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
-
-
-class KnownMotion:
-    """A `photonpano.Trajectory` that a function of one instant gives."""
-
-    def __init__(self, at: Callable[[float], np.ndarray]) -> None:
-        self._at = at
-
-    def at(self, frame_indices: ArrayLike) -> np.ndarray:
-        return np.array([self._at(frame) for frame in np.atleast_1d(frame_indices)]).reshape(-1, 3, 3)
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import itertools
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 import tomllib
 from dataclasses import dataclass
@@ -158,6 +159,8 @@ class Reader:
                 return None
             case ["git" | "pip" | "cd", *_] | ["python3", "-m", *_]:
                 return None
+            case ["pytest", *arguments]:
+                return self.run_pytest(block, arguments, shown)
             case ["python", script, *_]:
                 assert (ROOT / script).is_file(), f"{block}: {script}"
                 return None
@@ -171,10 +174,18 @@ class Reader:
         if target is not None:
             (self.workplace / target).write_text(done.stdout, encoding="utf-8")
         elif shown.strip() and more is None:
-            flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-            same = doctest.OutputChecker().check_output(f"{shown.strip()}\n", f"{done.output.strip()}\n", flags)
-            assert same, f"{block}: {words} printed\n{done.output}\nand the page shows\n{shown}"
+            self.compare(block, words, done.output, shown)
         return None
+
+    def run_pytest(self, block: Block, arguments: list[str], shown: str) -> None:
+        command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(self.workplace), *arguments]
+        done = subprocess.run(command, cwd=self.workplace, capture_output=True, text=True, check=False)
+        self.compare(block, arguments, done.stdout, shown)
+
+    def compare(self, block: Block, words: list[str], printed: str, shown: str) -> None:
+        flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+        same = doctest.OutputChecker().check_output(f"{shown.strip()}\n", f"{printed.strip()}\n", flags)
+        assert same, f"{block}: {words} printed\n{printed}\nand the page shows\n{shown}"
 
     def install(self) -> None:
         """Do what pip does of interest: leave the metadata of the project in this folder, beside its modules."""

@@ -1,0 +1,126 @@
+"""Captures, motions and exposures in memory, with photon noise: what components are given to work on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from photonpano.photometry import BinaryResponse
+from photonpano.values import FrameSpan, Group, StreamInfo, VirtualExposure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from photonpano.protocols import Trajectory
+    from photonpano.testing.scenes import Scene
+    from photonpano.values import BoolArray, Counts, FloatArray, Homography
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+class MemorySource:
+    """Binary frames held in memory: a `photonpano.Source`."""
+
+    def __init__(self, frames: ArrayLike, valid: BoolArray | None = None) -> None:
+        """Take frames of zeros and ones, (n, H, W), and the (H, W) mask of pixels that may be used; by default all."""
+        self._frames = np.asarray(frames, dtype=np.uint8)
+        n_frames, height, width = self._frames.shape
+        self.info = StreamInfo(n_frames, height, width, frame_rate_hz=None)
+        self.response = BinaryResponse()
+        self.valid = np.ones((height, width), np.bool_) if valid is None else valid
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        return np.asarray(self._frames[span.start : span.stop].sum(axis=0, dtype=np.uint32))
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span: (n, H, W) of zeros and ones."""
+        self.info.require(span)
+        return self._frames[span.start : span.stop].copy()
+
+    def close(self) -> None:
+        """Do nothing: there is no file to let go of."""
+
+    def __enter__(self) -> MemorySource:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+class ReadOnlySource(MemorySource):
+    """The same with arrays that cannot be written to."""
+
+    def __init__(self, frames: ArrayLike, valid: BoolArray | None = None) -> None:
+        super().__init__(frames, valid)
+        self.valid = read_only(self.valid)
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        return read_only(super().counts(span))
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span: (n, H, W) of zeros and ones."""
+        return read_only(super().frames(span))
+
+
+class KnownMotion:
+    """A `photonpano.Trajectory` that a function of one instant gives."""
+
+    def __init__(self, at: Callable[[float], Homography]) -> None:
+        self._at = at
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants: (N, 3, 3)."""
+        return np.array([self._at(frame) for frame in np.atleast_1d(frame_indices)]).reshape(-1, 3, 3)
+
+
+def read_only(array: NDArray[Number]) -> NDArray[Number]:
+    """Return a copy that cannot be written to."""
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def recorded(scene: Scene, motion: Trajectory, n_frames: int, shape: tuple[int, int], seed: int = 0) -> NDArray[np.uint8]:
+    """Record a scene with a binary camera (paper, equation 2).
+
+    Args:
+        scene: what is seen.
+        motion: pixels of a frame to points of the scene.
+        n_frames: number of frames.
+        shape: (height, width) of a frame.
+        seed: the chance of the photons.
+
+    Returns:
+        (n_frames, H, W) of zeros and ones.
+    """
+    rng = np.random.default_rng(seed)
+    frames = np.empty((n_frames, *shape), np.uint8)
+    for frame, homography in zip(frames, motion.at(np.arange(n_frames)), strict=True):
+        frame[:] = rng.random(shape) < -np.expm1(-scene.view(homography, shape))
+    return frames
+
+
+def photographed(flux: FloatArray, n_frames: int = 1000, seed: int = 0, unseen: BoolArray | None = None) -> VirtualExposure:
+    """Take a virtual exposure of a camera that stands still, with the photon noise of so many binary frames.
+
+    Args:
+        flux: (H, W), photons per pixel per frame period.
+        n_frames: frames that are merged.
+        seed: the chance of the photons.
+        unseen: (H, W) pixels that are unknown.
+    """
+    response = BinaryResponse()
+    counts = np.random.default_rng(seed).binomial(n_frames, -np.expm1(-flux))
+    weight = np.full(flux.shape, n_frames, np.float32)
+    estimate = response.flux((counts / n_frames).astype(np.float32), weight)
+    if unseen is not None:
+        estimate[unseen], weight[unseen] = np.nan, 0
+    span = FrameSpan(0, n_frames)
+    return VirtualExposure(estimate, weight, Group(span, span.centre), 1.0, response)

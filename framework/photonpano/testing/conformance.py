@@ -1,0 +1,205 @@
+"""What every contribution promises, whatever its kind."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import typing
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from photonpano.registry import KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from photonpano.contributions import AnyContribution
+
+HEAVY = frozenset(
+    {
+        "PIL",
+        "av",
+        "cupy",
+        "cv2",
+        "dask",
+        "h5py",
+        "imageio",
+        "jax",
+        "kornia",
+        "matplotlib",
+        "numba",
+        "pandas",
+        "pycolmap",
+        "scipy",
+        "skimage",
+        "sklearn",
+        "tensorflow",
+        "tifffile",
+        "torch",
+        "torchvision",
+        "zarr",
+    }
+)
+"""Libraries that take long to import. numpy is not among them."""
+
+_MODULES_OF = """
+import importlib, importlib.util, json, runpy, sys
+module, file, sys.path[:] = json.loads(sys.argv[1])
+before = set(sys.modules)
+try:
+    found = importlib.util.find_spec(module)
+except ModuleNotFoundError:
+    found = None
+if found:
+    importlib.import_module(module)
+else:
+    runpy.run_path(file)
+print(json.dumps(sorted({name.partition(".")[0] for name in set(sys.modules) - before})))
+"""
+
+
+@pytest.mark.usefixtures("photonpano_one_thread_inside")
+class Conformance:
+    """Checks of names, configs and imports; the classes of the kinds add what components of the kind promise.
+
+    Attributes:
+        contribution: what is tested; set it in a subclass.
+        config: the keys under `with`. Set it on `self` in a fixture with `autouse=True` if it needs files.
+        hook_module: the module that offers the contribution; by default the one in which its `build` is defined.
+        heavy: top-level modules that must not be imported before a component is built, beside those that it requires.
+    """
+
+    kind: ClassVar[str]
+    methods: ClassVar[tuple[str, ...]]
+
+    contribution: AnyContribution
+    config: Mapping[str, Any] = {}
+    hook_module: str | None = None
+    heavy: frozenset[str] = HEAVY
+
+    def settings(self) -> Any:
+        """Return the config under test."""
+        return self.contribution.config.model_validate(dict(self.config))
+
+    def require_libraries(self) -> None:
+        """Skip a test where a library is missing that the contribution says it requires."""
+        for requirement in self.contribution.requires:
+            if importlib.util.find_spec(requirement.module) is None:
+                pytest.skip(f"{self.contribution.name} needs {requirement.module}: pip install {requirement.install}")
+
+    def test_the_record_is_of_the_kind_that_this_class_tests(self) -> None:
+        """Specs look components up by kind."""
+        wanted = KINDS[self.kind].contribution
+        assert isinstance(self.contribution, wanted), (
+            f"{type(self).__name__} tests a {self.kind}: contribution must be a {wanted.__name__}, "
+            f"got {type(self.contribution).__name__}"
+        )
+
+    def test_the_name_and_the_summary_fit_a_list(self) -> None:
+        """`photonpano plugins list` gives each a line."""
+        summary = self.contribution.summary
+        assert summary == " ".join(summary.split()), f"the summary must be one line without spaces around it, got {summary!r}"
+        assert summary, f"the summary of {self.contribution.name!r} is empty; say in a line what the component does"
+        assert not summary.endswith("."), f"the summary is a line of a list: drop the full stop of {summary!r}"
+
+    def test_the_config_is_closed_and_frozen(self) -> None:
+        """A misspelt key is an error, and components that share a config cannot change it."""
+        for model in models_in(self.contribution.config):
+            extra, frozen = model.model_config.get("extra"), model.model_config.get("frozen")
+            assert (extra, frozen) == ("forbid", True), (
+                f"{model.__name__} must be closed and frozen: derive it from photonpano.Config; "
+                f"its model_config says extra={extra!r}, frozen={frozen!r}"
+            )
+
+    def test_every_key_of_the_config_is_described(self) -> None:
+        """The description is what users see in `plugins show`, in messages and in editors."""
+        missing = [
+            f"{model.__name__}.{key}"
+            for model in models_in(self.contribution.config)
+            for key, field in model.model_fields.items()
+            if not field.description
+        ]
+        assert not missing, (
+            f"every key needs a description, with its unit: write Field(..., description='...') for {', '.join(missing)}"
+        )
+
+    def test_an_unknown_key_is_refused(self) -> None:
+        """Users misspell."""
+        try:
+            self.contribution.config.model_validate({**self.config, "no-such-key": 1})
+            problems = "nothing"
+        except ValidationError as error:
+            problems = ", ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
+        assert problems == "no-such-key: Extra inputs are not permitted", (
+            f"an unknown key must be refused, and nothing else of the config under test; pydantic finds: {problems}"
+        )
+
+    def test_the_config_comes_back_from_a_run_record(self) -> None:
+        """`run.json` holds the spec of the run, from which it can be repeated."""
+        settings = self.settings()
+        written = json.loads(json.dumps(settings.model_dump(mode="json")))
+        again = raising_nothing(
+            f"reading the config from the record {written}", self.contribution.config.model_validate, written
+        )
+        assert again == settings, (
+            f"a config that is written as JSON must be read as the same config; {settings!r} was written as {written} "
+            f"and became {again!r}"
+        )
+
+    def test_the_hook_module_imports_nothing_heavy(self) -> None:
+        """It is imported whenever plugins are listed; libraries are imported in `build`."""
+        module = self.hook_module or self.contribution.build.__module__
+        heavy = self.heavy | {requirement.module.partition(".")[0] for requirement in self.contribution.requires}
+        imported = sorted(modules_of(module) & heavy)
+        assert not imported, (
+            f"importing {module} imports {', '.join(imported)}; move that import into the function `build`, or into a module "
+            "that `build` imports"
+        )
+
+    def require_methods(self, component: object) -> None:
+        """Require what a component of the kind must have."""
+        missing = [name for name in self.methods if not hasattr(component, name)]
+        assert not missing, (
+            f"what build() returns must be a {self.kind}; {type(component).__name__} has no {' and no '.join(missing)}"
+        )
+
+
+def raising_nothing(what: str, work: Callable[..., Any], *arguments: Any) -> Any:
+    """Do what must not raise, whatever the arguments."""
+    try:
+        return work(*arguments)
+    except Exception as error:
+        raise AssertionError(f"{what} must not raise; it raised {type(error).__name__}: {error}") from error
+
+
+def models_in(config: type[BaseModel]) -> list[type[BaseModel]]:
+    """Return a config and the models of the mappings in it, each once."""
+    found = [config]
+    for model in found:  # which grows meanwhile
+        found += [each for field in model.model_fields.values() for each in _models(field.annotation) if each not in found]
+    return found
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in typing.get_args(annotation):
+        yield from _models(argument)
+
+
+@cache
+def modules_of(module: str) -> frozenset[str]:
+    """Return the top-level modules that a fresh interpreter imports with a module; one that is on no path is run as a file."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    argument = json.dumps([module, file, sys.path])
+    done = subprocess.run([sys.executable, "-c", _MODULES_OF, argument], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (
+        f"{module}, which offers the contribution, cannot be imported in a fresh interpreter; set hook_module if it is another "
+        f"one:\n{done.stderr}"
+    )
+    return frozenset(json.loads(done.stdout.splitlines()[-1]))

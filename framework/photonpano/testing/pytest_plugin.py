@@ -1,0 +1,25 @@
+"""Loaded by pytest wherever photonpano is installed: failed checks of the kit show the values that were compared.
+
+Everybody's pytest imports this module, so it imports nothing but pytest.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+for _name in ("conformance", "stages", "sources", "resamplers", "mergers", "locators", "interpolators"):
+    pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
+
+
+@pytest.fixture(scope="class")
+def photonpano_one_thread_inside() -> Iterator[None]:
+    """Keep OpenCV and BLAS from starting threads of their own, as a run does."""
+    from photonpano.pipeline.threads import one_thread_inside
+
+    with one_thread_inside():
+        yield

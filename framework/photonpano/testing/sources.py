@@ -1,0 +1,302 @@
+"""What sources promise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import pytest
+
+from photonpano.contributions import SourceContext
+from photonpano.errors import InputError
+from photonpano.testing.conformance import Conformance, raising_nothing
+from photonpano.testing.sameness import fingerprint, in_threads
+from photonpano.values import FrameSpan, StreamInfo
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from photonpano.contributions import SourceContribution
+    from photonpano.protocols import Source
+
+_MOST_FRAMES = 200
+"""Of a longer capture, the first and the last half of these are looked at."""
+
+
+class SourceConformance(Conformance):
+    """Checks of a source.
+
+    Attributes:
+        contribution: what is tested.
+        config: the keys of a small capture, or those beside what `write` returns.
+        frame_shape: (height, width) of the frames that `write` is given; choose an odd width, if the format can.
+        n_frames: their number.
+        bit_depth: their bits a pixel.
+        wrong: keys that, on top of the config, make it wrong in a way that `check` must tell, such as a missing file.
+    """
+
+    kind: ClassVar[str] = "source"
+    methods: ClassVar[tuple[str, ...]] = ("info", "response", "valid", "counts", "frames", "close", "__enter__", "__exit__")
+
+    contribution: SourceContribution[Any]
+    frame_shape: tuple[int, int] = (18, 27)
+    n_frames: int = 75
+    bit_depth: int = 1
+    wrong: Sequence[Mapping[str, Any]] = ()
+
+    def write(self, frames: NDArray[np.generic], folder: Path) -> Mapping[str, Any]:
+        """Write frames as a capture, and return the keys that open it; override it for a source that reads files.
+
+        Args:
+            frames: (n_frames, *frame_shape), uint8, or uint16 for a bit depth of more than 8.
+            folder: where to put files; it is empty.
+        """
+        del frames, folder
+        return {}
+
+    def known_frames(self) -> NDArray[np.generic]:
+        """Return the frames that `write` is given."""
+        shape = (self.n_frames, *self.frame_shape)
+        values = np.random.default_rng(0).integers(0, 2**self.bit_depth, shape)
+        return values.astype(np.uint8 if self.bit_depth <= 8 else np.uint16)
+
+    @pytest.fixture(autouse=True)
+    def _capture(self, tmp_path: Path) -> None:
+        self.prepare(tmp_path)
+
+    def prepare(self, folder: Path) -> None:
+        """Write the capture under test."""
+        self.config = {**self.config, **self.write(self.known_frames(), folder)}
+
+    def opened(self) -> Source:
+        """Open the capture under test; close it by `with`."""
+        self.require_libraries()
+        return self.contribution.build(self.settings(), SourceContext(seed=0, threads=2))
+
+    def test_it_has_what_a_source_has(self) -> None:
+        """`photonpano.Source` lists it."""
+        with self.opened() as source:
+            self.require_methods(source)
+
+    def test_info_tells_what_the_frames_are_like(self) -> None:
+        """Memory is planned, and other components are built, from what `info` says before any frame is read."""
+        with self.opened() as source:
+            info = source.info
+            assert isinstance(info, StreamInfo), f"info is a StreamInfo, got a {type(info).__name__}"
+            sizes = {type(size).__name__ for size in (info.n_frames, info.height, info.width)}
+            assert sizes == {"int"}, f"sizes are Python's int, for the record of a run; got {', '.join(sorted(sizes))}"
+            shape, wanted = source.frames(_first(source)).shape, (len(_first(source)), *info.frame_shape)
+            assert shape == wanted, f"info promises {wanted} for {len(_first(source))} frames; frames() returns {shape}"
+            values = source.frames(_first(source))
+            highest = 1 if info.kind == "binary" else 2**info.bit_depth - 1
+            assert values.dtype.kind in "u", f"frames are unsigned integers, got {values.dtype}"
+            assert values.max() <= highest, (
+                f"info promises {info.kind} frames of {info.bit_depth} bits, so at most {highest}; there is a {values.max()}"
+            )
+
+    def test_valid_is_a_mask_of_a_frame(self) -> None:
+        """It is false for pixels that must not be used."""
+        with self.opened() as source:
+            mask, info = source.valid, source.info
+            assert mask.shape == info.frame_shape, f"valid is a mask of {info.frame_shape}, got {mask.shape}"
+            assert mask.dtype == np.bool_, f"valid is bool, got {mask.dtype}"
+            some = bool(mask.any())
+            assert some, "valid is false everywhere: no pixel could be used; it is true for pixels that may be"
+
+    def test_counts_are_uint32_of_a_frame(self) -> None:
+        """Sums of many frames fit, and are added without a cast."""
+        with self.opened() as source:
+            counts, info = source.counts(_first(source)), source.info
+            assert counts.shape == info.frame_shape, f"counts() of {info.frame_shape} frames returns {counts.shape}"
+            assert counts.dtype == np.uint32, f"counts() returns uint32, got {counts.dtype}"
+
+    def test_counts_are_the_sum_of_the_frames(self) -> None:
+        """Of any span, one frame included."""
+        with self.opened() as source:
+            for span in _spans(source):
+                difference = _difference(source.counts(span), source.frames(span).sum(axis=0, dtype=np.uint32))
+                assert not difference, f"counts(span) must be the sum of frames(span); for {span}, {difference}"
+
+    def test_spans_neither_overlap_nor_leave_gaps(self) -> None:
+        """A span is half-open: `[start, stop)`."""
+        with self.opened() as source:
+            for span in _spans(source):
+                if len(span) == 1:
+                    continue
+                middle = (span.start + span.stop) // 2
+                parts = FrameSpan(span.start, middle), FrameSpan(middle, span.stop)
+                difference = _difference(source.counts(parts[0]) + source.counts(parts[1]), source.counts(span))
+                assert not difference, (
+                    f"a span holds its first frame and not the one at its stop; counts of {parts[0]} and of {parts[1]} must "
+                    f"add up to those of {span}, but {difference}"
+                )
+
+    def test_a_frame_is_the_same_in_any_span(self) -> None:
+        """Frame i of the capture is frame i - start of a span."""
+        with self.opened() as source:
+            for span in _spans(source):
+                together = source.frames(span)
+                for index in sorted({0, len(span) // 2, len(span) - 1}):
+                    frame = span.start + index
+                    difference = _difference(together[index], source.frames(FrameSpan(frame, frame + 1))[0])
+                    assert not difference, (
+                        f"frames(span)[i] is frame span.start + i; frame {frame} of {span} is not the one alone: {difference}"
+                    )
+
+    def test_it_reads_the_frames_that_were_written(self) -> None:
+        """Rows, columns and bits are where they were, and no frame is missing."""
+        if type(self).write is SourceConformance.write:
+            pytest.skip("write() is not overridden: the frames of this source are not known")
+        known = self.known_frames()
+        with self.opened() as source:
+            shape = (source.info.n_frames, *source.info.frame_shape)
+            assert shape == known.shape, f"frames of {known.shape} (frames, height, width) were written; info says {shape}"
+            read = source.frames(source.info.span)
+            wrong = [index for index in range(len(known)) if _difference(read[index], known[index])]
+            assert not wrong, (
+                f"{len(wrong)} of {len(known)} frames differ from what was written; in frame {wrong[0]}, "
+                f"{_difference(read[wrong[0]], known[wrong[0]])}"
+            )
+
+    def test_a_span_beyond_the_capture_is_an_input_error(self) -> None:
+        """Frames that do not exist are not invented, nor left out in silence."""
+        with self.opened() as source:
+            n_frames = source.info.n_frames
+            for span in (FrameSpan(n_frames - 1, n_frames + 1), FrameSpan(n_frames, n_frames + 1)):
+                for method in (source.counts, source.frames):
+                    outcome = _outcome_of(method, span)
+                    assert outcome == "InputError", (
+                        f"{method.__name__}() of {span} of a capture with {n_frames} frames must raise InputError, as "
+                        f"`self.info.require(span)` does; it {outcome}"
+                    )
+
+    def test_what_was_returned_does_not_change(self) -> None:
+        """It belongs to the caller, who may keep it and write to it."""
+        with self.opened() as source:
+            span = _first(source)
+            for method in (source.counts, source.frames):
+                first = method(span)
+                kept = first.copy()
+                method(_last(source))
+                difference = _difference(first, kept)
+                assert not difference, f"{method.__name__}() overwrites what it returned: return a new array"
+                if first.flags.writeable:
+                    first[...] = 0
+                difference = _difference(method(span), kept)
+                assert not difference, (
+                    f"after a caller wrote to what {method.__name__}() had returned, it returns something else: return a copy"
+                )
+
+    def test_several_threads_read_what_one_does(self) -> None:
+        """Groups are merged at the same time."""
+        with self.opened() as source:
+            spans = _spans(source)
+
+            def read(first: int) -> dict[FrameSpan, object]:
+                """Begin with another span in each thread."""
+                order = spans[first:] + spans[:first]
+                return {span: fingerprint((source.counts(span), source.frames(span))) for span in order}
+
+            expected = read(0)
+            for found in raising_nothing("reading in several threads at once", in_threads, read):
+                wrong = [str(span) for span in spans if found[span] != expected[span]]
+                assert not wrong, (
+                    f"when several threads read at once, {', '.join(wrong)} come out differently; do they share a position "
+                    "in a file, or a buffer?"
+                )
+
+    def test_opened_again_it_gives_the_same_bytes(self) -> None:
+        """A run can be repeated; chance derives from the seed of the context."""
+        seen = []
+        for chance in (1, 2):
+            np.random.seed(chance)  # noqa: NPY002  what a source must not depend on
+            with self.opened() as source:
+                seen.append([fingerprint((source.info, source.valid, source.frames(span))) for span in _spans(source)])
+        assert seen[0] == seen[1], "the same config and seed must give the same frames; opened again, the source gives others"
+
+    def test_the_response_turns_flux_into_counts_and_back(self) -> None:
+        """`response.flux(response.mean_count(flux))` is the flux."""
+        with self.opened() as source:
+            flux, frames = np.array([0.0, 0.01, 0.3, 1.0, 2.0, np.nan], np.float32), 10_000
+            again = source.response.flux(source.response.mean_count(flux), frames)
+            undone = np.allclose(again, flux, rtol=1e-3, atol=1e-5, equal_nan=True)
+            assert undone, (
+                f"response.flux must undo response.mean_count, and keep NaN; {flux.tolist()} becomes {again.tolist()}"
+            )
+            lit = source.response.flux(source.response.mean_count(np.array([1e9], np.float32)), frames).tolist()
+            assert np.isfinite(lit[0]), f"a pixel that is always lit must have a finite flux, got {lit}"
+
+    def test_with_gives_the_source_and_hides_no_error(self) -> None:
+        """`with build(...) as source:` is how runs use it."""
+        hidden = True
+        try:
+            with self.opened() as entered:
+                self.require_methods(entered)
+                raise LookupError("an error of the caller")
+        except LookupError:
+            hidden = False
+        assert not hidden, "__exit__ must not return True: an error that was raised inside of `with` has disappeared"
+
+    def test_check_finds_no_problem_with_the_config_under_test(self) -> None:
+        """Problems are sentences; an empty sequence says that the capture can be opened."""
+        problems = self.contribution.check(self.settings())
+        assert not isinstance(problems, str), f"check() returns a sequence of sentences, got the text {problems!r}"
+        assert not list(problems), f"the capture under test can be opened, but check() says: {'; '.join(problems)}"
+
+    def test_check_finds_what_is_wrong(self) -> None:
+        """What `photonpano check` lets pass should not fail at the start of a run."""
+        for keys in self.wrong:
+            settings = self.contribution.config.model_validate({**self.config, **keys})
+            assert list(self.contribution.check(settings)), f"check() finds nothing wrong with {dict(keys)}"
+            outcome = _outcome_of(lambda each: self.contribution.build(each, SourceContext()), settings)
+            assert outcome == "InputError", f"opening a capture with {dict(keys)} must raise InputError; it {outcome}"
+
+
+def _outcome_of(work: Any, argument: Any) -> str:
+    try:
+        result = work(argument)
+    except InputError:
+        return "InputError"
+    except Exception as error:
+        return f"raised {type(error).__name__}: {error}"
+    return f"returned a {type(result).__name__}"
+
+
+def _first(source: Source) -> FrameSpan:
+    return FrameSpan(0, min(source.info.n_frames, 5))
+
+
+def _last(source: Source) -> FrameSpan:
+    return FrameSpan(max(0, source.info.n_frames - 5), source.info.n_frames)
+
+
+def _spans(source: Source) -> list[FrameSpan]:
+    """Return spans at both ends and between, of one frame and of many."""
+    stop = source.info.n_frames
+    half = min(stop, _MOST_FRAMES // 2)
+    middle = half // 2
+    return [
+        FrameSpan(0, 1),
+        FrameSpan(stop - 1, stop),
+        FrameSpan(middle, middle + 1),
+        FrameSpan(0, half),
+        FrameSpan(half // 3, max(2 * half // 3, half // 3 + 1)),
+        FrameSpan(stop - half, stop),
+    ]
+
+
+def _difference(found: NDArray[np.generic], expected: NDArray[np.generic]) -> str:
+    """Say where two arrays differ; nothing if they do not."""
+    if found.shape != expected.shape:
+        return f"shapes are {found.shape} and {expected.shape}"
+    places = np.argwhere(found != expected)
+    if not len(places):
+        return ""
+    row, column = places[0][-2:]
+    return (
+        f"{len(places)} pixels differ, first the one at row {row}, column {column}: "
+        f"{found[tuple(places[0])]} instead of {expected[tuple(places[0])]}"
+    )

@@ -1,0 +1,33 @@
+"""Every component that comes with photonpano is held to what the conformance kit asks of others."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from photonpano import discover
+from photonpano.testing.conformance import Conformance
+
+PLUGINS = Path(__file__).parents[1] / "plugins"
+OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.plugin == "photonpano"]
+
+
+@pytest.fixture(scope="module")
+def tested() -> set[tuple[str, str]]:
+    """Return kind and name of what has a subclass of the kit that pytest collects."""
+    found = set()
+    for path in PLUGINS.glob("*/test_conformance.py"):
+        spec = importlib.util.spec_from_file_location(f"conformance_of_{path.parent.name}", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        for name, value in vars(module).items():
+            if name.startswith("Test") and isinstance(value, type) and issubclass(value, Conformance):
+                found.add((value.contribution.kind, value.contribution.name))
+    return found
+
+
+@pytest.mark.parametrize(("kind", "name"), OURS)
+def test_our_own_components_are_held_to_the_kit(kind: str, name: str, tested: set[tuple[str, str]]) -> None:
+    assert (kind, name) in tested, f"add a subclass of {kind.capitalize()}Conformance to tests/plugins/*/test_conformance.py"

@@ -1,0 +1,67 @@
+"""The components of this plugin keep what every component of their kinds promises."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano import discover
+from photonpano.testing import InterpolatorConformance, MergerConformance, ResamplerConformance, SourceConformance
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CATALOG = discover()
+
+
+class TestPackedNpy(SourceConformance):
+    contribution = CATALOG.find("source", "packed-npy").contribution
+    wrong = ({"path": "there-is-no-such-file.npy"}, {"width": 33}, {"bad_pixels": "there-is-no-such-file.npy"})
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        np.save(folder / "capture.npy", np.packbits(frames, axis=-1))
+        bad = np.zeros(frames.shape[1:], bool)
+        bad[3, 4] = True
+        np.save(folder / "bad.npy", bad)
+        return {"path": folder / "capture.npy", "width": frames.shape[2], "bad_pixels": folder / "bad.npy"}
+
+
+class TestMidpoint(ResamplerConformance):
+    contribution = CATALOG.find("resampler", "midpoint").contribution
+    config = {"group_size": 100}
+
+
+class TestMidpointAuto(TestMidpoint):
+    config = {}
+
+
+class TestConstantNumber(TestMidpoint):
+    config = {"group_size": 100, "densify": False, "endpoints": False}
+
+
+class TestPhotonMle(MergerConformance):
+    contribution = CATALOG.find("merger", "photon-mle").contribution
+    config = {"tolerance_px": 0.5}
+
+
+class TestNaiveAverage(TestPhotonMle):
+    config = {"compensate": False}
+    compensates = False
+
+
+class TestLucasKanade(InterpolatorConformance):
+    contribution = CATALOG.find("interpolator", "lucas-kanade").contribution
+
+
+class TestGeodesic(InterpolatorConformance):
+    contribution = CATALOG.find("interpolator", "geodesic").contribution
+
+
+class TestLie(InterpolatorConformance):
+    contribution = CATALOG.find("interpolator", "lie").contribution
+
+
+class TestSmoothingSpline(InterpolatorConformance):
+    contribution = CATALOG.find("interpolator", "smoothing-spline").contribution
+    tolerance_px = 3.0

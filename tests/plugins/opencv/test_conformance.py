@@ -1,0 +1,18 @@
+"""The locators of this plugin keep what every locator promises."""
+
+from __future__ import annotations
+
+from photonpano import discover
+from photonpano.testing import LocatorConformance
+
+CATALOG = discover()
+
+
+class TestOpencvSift(LocatorConformance):
+    contribution = CATALOG.find("locator", "opencv-sift").contribution
+    tolerance_px = 0.3
+
+
+class TestDirect(LocatorConformance):
+    contribution = CATALOG.find("locator", "direct").contribution
+    tolerance_px = 0.1

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group, InputError
+from photonpano.testing import ResamplerConformance
+from photonpano.testing.conformance import Conformance
+from photonpano.testing.stages import StageConformance
+
+
+class Honest:
+    """Groups of 100 frames, one after the other."""
+
+    def __init__(self, context):
+        self.asked = itertools.count()
+
+    def groups(self, n_frames, level):
+        if n_frames < 100:
+            raise InputError(f"{n_frames} frames are too few")
+        spans = (FrameSpan(start, start + 100) for start in range(0, n_frames - 99, 100))
+        return tuple(Group(span, span.centre) for span in spans)
+
+
+class AGenerator(Honest):
+    def groups(self, n_frames, level):
+        return (group for group in super().groups(n_frames, level))
+
+
+class Backwards(Honest):
+    def groups(self, n_frames, level):
+        return super().groups(n_frames, level)[::-1]
+
+
+class Twice(Honest):
+    def groups(self, n_frames, level):
+        return (groups := super().groups(n_frames, level))[:1] + groups
+
+
+class Beyond(Honest):
+    def groups(self, n_frames, level):
+        return (*super().groups(n_frames, level), Group(FrameSpan(n_frames - 50, n_frames + 50), n_frames))
+
+
+class SeenFromElsewhere(Honest):
+    def groups(self, n_frames, level):
+        groups = super().groups(n_frames, level)
+        object.__setattr__(groups[-1], "reference", n_frames + 5.0)
+        return groups
+
+
+class NumbersOfNumpy(Honest):
+    def groups(self, n_frames, level):
+        return tuple(
+            Group(FrameSpan(np.int64(group.span.start), group.span.stop), group.reference)
+            for group in super().groups(n_frames, level)
+        )
+
+
+class Forgetful(Honest):
+    def groups(self, n_frames, level):
+        return super().groups(n_frames, level)[: -1 if next(self.asked) else None]
+
+
+class ShortIsADefect(Honest):
+    def groups(self, n_frames, level):
+        return super().groups(n_frames, level) if n_frames >= 100 else (Group(FrameSpan(0, n_frames // 2), 0),)
+
+
+class NothingForShort(Honest):
+    def groups(self, n_frames, level):
+        return super().groups(n_frames, level) if n_frames >= 100 else ()
+
+
+BROKEN = [
+    (
+        "test_groups_are_a_tuple_that_is_not_empty",
+        AGenerator,
+        "returns a tuple of Group; at level 1 of 2000 frames it is a gener",
+    ),
+    (
+        "test_groups_come_in_the_order_of_their_reference_instants",
+        Backwards,
+        r"at level 1 of 2000 frames, 1949.5 is followed by",
+    ),
+    ("test_groups_come_in_the_order_of_their_reference_instants", Twice, r"49.5 is followed by 49.5"),
+    ("test_groups_lie_inside_the_capture", Beyond, "a group reaches beyond the last frame: frames 1950 to 2049"),
+    ("test_the_reference_instant_lies_inside_the_span", SeenFromElsewhere, "it is 2005.0 of frames 1900 to 1999"),
+    (
+        "test_spans_are_whole_python_numbers",
+        NumbersOfNumpy,
+        "spans hold Python's int; at level 1 of 2000 frames there is int64",
+    ),
+    ("test_the_same_question_has_the_same_answer", Forgetful, r"groups\(2000, 1\) must depend on nothing but its arguments"),
+    ("test_a_short_capture_gives_groups_or_an_input_error", ShortIsADefect, r"with 1 frames, groups\(\) raised ValueError"),
+    ("test_a_short_capture_gives_groups_or_an_input_error", NothingForShort, "with 1 frames there is no group"),
+    ("test_check_foresees_that_a_capture_is_too_short", Honest, "check.. says nothing, groups.. raises InputError: 1 frames"),
+]
+
+
+@pytest.mark.parametrize(("check", "broken", "words"), BROKEN)
+def test_it_is_caught(check, broken, words, catches):
+    catches(ResamplerConformance, check, broken, words)
+
+
+def test_every_check_catches_something(checks_of):
+    assert checks_of(ResamplerConformance, StageConformance) == {check for check, *_ in BROKEN}
+
+
+def test_an_honest_one_passes(checks_of, complaint):
+    def foreseen(config, stream):
+        return ["too short"] if stream.n_frames < 100 else []
+
+    for check in checks_of(ResamplerConformance, Conformance):
+        assert complaint(ResamplerConformance, check, Honest, record={"check": foreseen}) is None, check

@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan
+from photonpano.photometry import BinaryResponse
+from photonpano.testing import MemorySource, SourceConformance
+from photonpano.testing.conformance import Conformance
+
+FRAMES = SourceConformance().known_frames()
+
+
+class Honest(MemorySource):
+    def __init__(self, context):
+        super().__init__(FRAMES.copy())
+
+
+class HasNoMask(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        del self.valid
+
+
+class PromisesMore(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        self.info = replace(self.info, width=32)
+
+
+class NotBinary(Honest):
+    def frames(self, span):
+        return super().frames(span) * 3
+
+
+class BadPixels(Honest):
+    """Its mask is true for pixels that must not be used."""
+
+    def __init__(self, context):
+        super().__init__(context)
+        self.valid = ~self.valid
+
+
+class NarrowCounts(Honest):
+    def counts(self, span):
+        return super().counts(span).astype(np.uint16)
+
+
+class CountsOneMore(Honest):
+    """Takes a span for a closed one."""
+
+    def counts(self, span):
+        return super().counts(FrameSpan(span.start, min(span.stop + 1, self.info.n_frames)))
+
+
+class CountsFromTheEnd(Honest):
+    """Frames of a span come backwards."""
+
+    def frames(self, span):
+        return super().frames(span)[::-1]
+
+
+class SwapsRows(Honest):
+    def frames(self, span):
+        return super().frames(span)[:, ::-1]
+
+
+class GivesWhatThereIs(Honest):
+    def counts(self, span):
+        self.info.require(FrameSpan(0, 1))
+        return self._frames[span.start : span.stop].sum(axis=0, dtype=np.uint32)
+
+
+class LendsItsFrames(Honest):
+    def frames(self, span):
+        self.info.require(span)
+        return self._frames[span.start : span.stop]
+
+
+class ReusesItsBuffer(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        self.buffer = np.zeros(self.info.frame_shape, np.uint32)
+
+    def counts(self, span):
+        self.buffer[:] = super().counts(span)
+        return self.buffer
+
+
+class SharesAPosition(Honest):
+    def frames(self, span):
+        self.position = span.start
+        time.sleep(2e-3)
+        return super().frames(FrameSpan(self.position, self.position + len(span)))
+
+
+class LeftToChance(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        self.valid = np.random.random(self.info.frame_shape) > 0.1  # noqa: NPY002  the fault
+
+
+class Doubled(BinaryResponse):
+    def flux(self, mean_count, frames):
+        return 2 * super().flux(mean_count, frames)
+
+
+class Unbounded(BinaryResponse):
+    def flux(self, mean_count, frames):
+        with np.errstate(divide="ignore"):
+            return -np.log1p(-mean_count)
+
+
+class AnswersDoubled(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        self.response = Doubled()
+
+
+class AnswersUnbounded(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        self.response = Unbounded()
+
+
+class HidesErrors(Honest):
+    def __exit__(self, kind, error, trace):
+        return True
+
+
+def finds_fault(config):
+    return ["there is no file capture.npy"]
+
+
+def written(self, frames, folder):
+    return {}
+
+
+BROKEN = [
+    ("test_it_has_what_a_source_has", HasNoMask, "HasNoMask has no valid", {}),
+    ("test_info_tells_what_the_frames_are_like", PromisesMore, r"promises \(5, 18, 32\) .* returns \(5, 18, 27\)", {}),
+    ("test_info_tells_what_the_frames_are_like", NotBinary, "promises binary frames of 1 bits, so at most 1; there is a 3", {}),
+    ("test_valid_is_a_mask_of_a_frame", BadPixels, "false everywhere", {}),
+    ("test_counts_are_uint32_of_a_frame", NarrowCounts, "uint32, got uint16", {}),
+    (
+        "test_counts_are_the_sum_of_the_frames",
+        CountsOneMore,
+        r"for frames 0 to 0, \d+ pixels differ, first the one at row 0",
+        {},
+    ),
+    (
+        "test_spans_neither_overlap_nor_leave_gaps",
+        CountsOneMore,
+        "counts of frames 0 to 36 and of frames 37 to 74 must add up",
+        {},
+    ),
+    ("test_a_frame_is_the_same_in_any_span", CountsFromTheEnd, "frame 0 of frames 0 to 74 is not the one alone", {}),
+    ("test_it_reads_the_frames_that_were_written", SwapsRows, "75 of 75 frames differ", {"write": written}),
+    (
+        "test_a_span_beyond_the_capture_is_an_input_error",
+        GivesWhatThereIs,
+        r"counts\(\) of frames 74 to 75 .* it returned a nd",
+        {},
+    ),
+    ("test_what_was_returned_does_not_change", LendsItsFrames, "after a caller wrote to what frames.. had returned", {}),
+    ("test_what_was_returned_does_not_change", ReusesItsBuffer, "counts.. overwrites what it returned", {}),
+    (
+        "test_several_threads_read_what_one_does",
+        SharesAPosition,
+        "reading in several threads at once must not raise|come out differently",
+        {},
+    ),
+    ("test_opened_again_it_gives_the_same_bytes", LeftToChance, "opened again, the source gives others", {}),
+    ("test_the_response_turns_flux_into_counts_and_back", AnswersDoubled, "response.flux must undo response.mean_count", {}),
+    ("test_the_response_turns_flux_into_counts_and_back", AnswersUnbounded, r"finite flux, got \[inf\]", {}),
+    ("test_with_gives_the_source_and_hides_no_error", HidesErrors, "__exit__ must not return True", {}),
+    (
+        "test_check_finds_no_problem_with_the_config_under_test",
+        Honest,
+        "can be opened, but check.. says: there is no file capture.npy",
+        {"record": {"check": finds_fault}},
+    ),
+    ("test_check_finds_what_is_wrong", Honest, "check.. finds nothing wrong with {}", {"wrong": ({},)}),
+    (
+        "test_check_finds_what_is_wrong",
+        Honest,
+        "opening a capture with {} must raise InputError; it returned a Honest",
+        {"wrong": ({},), "record": {"check": finds_fault}},
+    ),
+]
+
+
+@pytest.mark.parametrize(("check", "broken", "words", "more"), BROKEN)
+def test_it_is_caught(check, broken, words, more, catches):
+    catches(SourceConformance, check, broken, words, **more)
+
+
+def test_every_check_catches_something(checks_of):
+    assert checks_of(SourceConformance, Conformance) == {check for check, *_ in BROKEN}
+
+
+@pytest.mark.parametrize("bit_depth", [1, 10])
+def test_an_honest_one_passes(bit_depth, checks_of, complaint):
+    def build(context):
+        source = MemorySource(FRAMES.copy())
+        if bit_depth > 1:
+            source._frames = subject.known_frames()
+            source.info = replace(source.info, kind="intensity", bit_depth=bit_depth)
+        return source
+
+    subject = type("Deep", (SourceConformance,), {"bit_depth": bit_depth, "write": written})()
+    for check in checks_of(SourceConformance, Conformance):
+        assert complaint(type(subject), check, build) is None, check
