@@ -59,7 +59,7 @@ class KorniaFeaturesConfig(MatchConfig):
     max_keypoints: int = Field(2000, ge=16, le=100_000, description="the strongest keypoints of an exposure that are kept")
     upright: bool = Field(
         True,
-        description="keypoints have no orientation of their own, as is right for cameras that roll by less than some 15 degrees",
+        description="keypoints have no orientation of their own, which suits cameras that roll by less than some 15 degrees",
     )
     matcher: Literal["smnn", "adalam"] = Field(
         "smnn", description="smnn asks for mutual nearest neighbours, adalam also for neighbours that move alike"

@@ -121,35 +121,43 @@ class _Descent:
     ) -> NDArray[np.float64] | str:
         """Return the homography at the end of the descent, in px of the layer, or why there is none."""
         tolerance_px = config.converged_px * (_COARSE_TOLERANCE if coarse else 1)
+        root: torch.Tensor | None = None
         for _ in range(_ROUNDS):
-            before, found = homography, self._round(homography, tolerance_px, config.max_iterations)
-            if found is None:
+            weights = self._weights(homography)
+            root = self._root_of_curvature(weights) if root is None else root
+            if root is None:
                 return "where the images overlap, if they do, there is no texture"
-            homography = found
+            before, homography = homography, self._round(homography, weights, root, tolerance_px, config.max_iterations)
             if reason := implausibility(homography, self._moving.shape, config.min_overlap):
                 return f"the alignment diverges: {reason}"
             if corner_displacements(homography, before, self._moving.shape).max() < tolerance_px:
                 break
         return homography
 
-    def _round(self, start: NDArray[np.float64], tolerance_px: float, max_iterations: int) -> NDArray[np.float64] | None:
-        """Minimise half the weighted sum of squared differences; weights are those of the start. None without texture."""
-        there = self._fixed.seen_from(start)
+    def _weights(self, homography: NDArray[np.float64]) -> torch.Tensor:
+        """Return the inverse variances of the differences between pixels, 0 where one of them was not seen."""
+        there = self._fixed.seen_from(homography)
         both = self._moving.seen & there.seen
         weight = np.zeros(both.shape, np.float32)
         weight[both] = 1 / (1 / self._moving.weight[both] + 1 / there.weight[both])
-        weights = images_on(self._device, weight)
-        curvature = self._curvature(weights)
-        root, failed = torch.linalg.cholesky_ex(curvature)
-        if failed:
-            return None
+        return images_on(self._device, weight)
+
+    def _round(
+        self,
+        start: NDArray[np.float64],
+        weights: torch.Tensor,
+        root: torch.Tensor,
+        tolerance_px: float,
+        max_iterations: int,
+    ) -> NDArray[np.float64]:
+        """Minimise half the weighted sum of squared differences, and return the homography where it is least."""
+        origin = torch.tensor(self._unit @ start @ inverse(self._unit), device=self._device)
+        unit_loss = 2 * self._loss(origin, weights)
+        if unit_loss == 0:
+            return start
         # In these parameters the curvature of the scene is the identity, and the loss is 1/2 at the start: L-BFGS, whose first
         # step is that of gradient descent, then begins with about the step of Gauss and Newton.
-        origin = torch.tensor(self._normal(start), device=self._device)
-        unit_loss = 2 * self._loss(origin, weights)
         basis = torch.linalg.inv(root).T * torch.sqrt(unit_loss)
-        if not (unit_loss > 0 and torch.isfinite(basis).all()):
-            return None
         q = torch.zeros(len(self._free), dtype=torch.float64, device=self._device, requires_grad=True)
         optimizer = torch.optim.LBFGS(
             [q],
@@ -168,14 +176,7 @@ class _Descent:
         optimizer.step(closure)
         with torch.no_grad():
             found = (origin @ self._step(basis @ q)).cpu().numpy()
-        return normalised(inverse(self._unit) @ found @ self._unit) if np.isfinite(found).all() else None
-
-    def _normal(self, homography: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a homography of pixels in kornia's coordinates: pixels of the moving image to those of the fixed one.
-
-        That is the direction of kornia's warper, too: it asks where a pixel of what it makes is to be looked up.
-        """
-        return np.asarray(self._unit @ homography @ inverse(self._unit))
+        return normalised(inverse(self._unit) @ found @ self._unit) if np.isfinite(found).all() else np.asarray(found)
 
     def _step(self, p: torch.Tensor) -> torch.Tensor:
         """Return the homography of the free parameters, in kornia's coordinates."""
@@ -185,20 +186,30 @@ class _Descent:
         return torch.stack([1 + p1, p3, p5, p2, 1 + p4, p6, p7, p8, one]).reshape(3, 3)
 
     def _loss(self, to_fixed: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Return half the weighted sum of squared differences.
+
+        Args:
+            to_fixed: (3, 3), the moving image to the fixed one, in kornia's coordinates. That is the direction of the warper,
+                too, which asks where a pixel of what it makes is to be looked up.
+            weights: (1, 1, H, W).
+        """
         self.evaluations += 1
         warped = self._warper(self._there, to_fixed[None].to(torch.float32))
         return (weights * (warped - self._here) ** 2).sum(dtype=torch.float64) / 2
 
-    def _curvature(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return the curvature of the loss with respect to the free parameters, from the moving image."""
+    def _root_of_curvature(self, weights: torch.Tensor) -> torch.Tensor | None:
+        """Return the Cholesky factor of the curvature of the loss, from the moving image; None without texture."""
         height, width = self._moving.shape
         along = spatial_gradient(self._here, mode="diff")[0, 0]
         gx, gy = along[0] * (width / 2), along[1] * (height / 2)
         x = torch.arange(width, device=self._device) * self._unit[0, 0] + self._unit[0, 2]
         y = torch.arange(height, device=self._device)[:, None] * self._unit[1, 1] + self._unit[1, 2]
         inwards = gx * x + gy * y
-        slopes = torch.stack([gx * x, gy * x, gx * y, gy * y, gx, gy, -inwards * x, -inwards * y])[self._free].flatten(1)
-        return ((slopes * weights.flatten()) @ slopes.T).to(torch.float64)
+        slopes = torch.stack([gx * x, gy * x, gx * y, gy * y, gx, gy, -inwards * x, -inwards * y])[self._free]
+        # Row by row: the sums of a product of matrices depend on the number of threads that MKL was given.
+        rows = [(slopes * (weights[0, 0] * slope)).sum(dim=(1, 2), dtype=torch.float64) for slope in slopes]
+        root, failed = torch.linalg.cholesky_ex(torch.stack(rows))
+        return None if failed else root
 
     def _corner_px(self, basis: NDArray[np.float64]) -> float:
         """Return how far a unit step of one of the scaled parameters moves a corner at most, in px."""

@@ -3,13 +3,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import cv2
-import numpy as np
 import pytest
 
 from photonpano.geometry import translation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    import numpy as np
 
     from photonpano import VirtualExposure
 

@@ -97,14 +97,13 @@ def test_no_code_in_a_file_is_run(tmp_path: Path) -> None:
     assert refused(path) == f"{path} holds no weights that torch can read: UnpicklingError"
 
 
-def test_a_network_that_has_learned_nothing_locates_nothing(build: Callable, shot: Callable) -> None:
-    """The real network is asked, and every match it is the least bit certain of is looked at."""
-    locator = build(min_confidence=0)
+def test_a_network_that_has_learned_nothing_is_certain_of_nothing(build: Callable, shot: Callable) -> None:
+    """The real network is asked."""
+    locator = build()
     pair = [locator.describe(shot(STILL, seed)) for seed in range(2)]
-    for initial in (None, STILL):
-        motion = locator.register(*pair, initial)
-        assert isinstance(motion, NotLocated), motion
-        assert motion.evidence["matches"] >= 0
+    assert locator.register(*pair, None) == NotLocated("0 matches, fewer than min_inliers = 12", {"matches": 0})
+    uncertain = build(min_confidence=0).register(*pair, None)
+    assert uncertain.evidence["matches"] > 12
 
 
 def knows(true: np.ndarray, monkeypatch: pytest.MonkeyPatch, wrong: int = 0) -> None:
@@ -138,7 +137,7 @@ def test_its_matches_are_those_of_pixel_centres(
     motion = locator.register(moving, fixed, initial)
     assert isinstance(motion, Located), motion
     assert corner_displacements(motion.homography, TRUE, SHAPE).max() < 0.001
-    assert 100 < motion.evidence["inliers"] <= motion.evidence["matches"]
+    assert 40 < motion.evidence["inliers"] <= motion.evidence["matches"]
 
 
 def test_what_was_not_seen_is_not_matched(build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
