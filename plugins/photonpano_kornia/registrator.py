@@ -220,7 +220,9 @@ class _Descent:
 
 def _shifted(moving: View, fixed: View) -> NDArray[np.float64]:
     """Return the shift between two images by masked cross-correlation (Padfield 2012), in px of the finest layer."""
-    (down, right), *_ = phase_cross_correlation(fixed.image, moving.image, reference_mask=fixed.seen, moving_mask=moving.seen)
+    (down, right), *_ = phase_cross_correlation(  # type: ignore[no-untyped-call]
+        fixed.image, moving.image, reference_mask=fixed.seen, moving_mask=moving.seen
+    )
     return rescaled(translation(float(right), float(down)), moving.pixel)
 
 

@@ -37,6 +37,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "translation": GROUPS,
     "smoothing-spline": GROUPS,
     "fallback": GROUPS,
+    "kornia": GROUPS,
     "demo": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "revisits": SMALL_STREET
@@ -47,6 +48,8 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
 """Specs to run, and what makes them small."""
+NEEDS = {"kornia": ("kornia", "torch")}
+"""Libraries of extras, without which a spec is not run."""
 
 
 def photonpano(*arguments: str | Path, **overrides: Any) -> str:
@@ -89,6 +92,8 @@ def test_captures_can_be_simulated(name, examples, tmp_path):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_specs_run(name, examples, tmp_path):
+    for library in NEEDS.get(name, ()):
+        pytest.importorskip(library)
     photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **RUNS[name])
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     groups = [level["groups"] for level in record["levels"]]

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile")
+HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia")
 
 
 def imported_by(statement: str) -> set[str]:
@@ -25,6 +25,7 @@ def test_the_package_imports_nothing_at_all() -> None:
     "statement",
     [
         "import photonpano_core.hooks",
+        "import photonpano_kornia.hooks",
         "import photonpano_opencv.hooks",
         "import photonpano_simulator.hooks",
         "from photonpano.registry import discover; discover()",
