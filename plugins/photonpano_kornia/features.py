@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled, match_adalam, match_smnn
+from scipy.spatial.distance import cdist
 
 from photonpano.geometry import apply
 from photonpano.locating import blur_against_noise, stabilised_8_bit
@@ -103,9 +104,8 @@ class FeatureLocator:
         distances = torch.cdist(here, there)
         near = None
         if guide is not None:
-            offsets = apply(guide, moving.points)[:, None] - fixed.points
-            near = np.einsum("mni,mni->mn", offsets, offsets) <= self._config.search_px**2
-            distances[torch.tensor(~near, device=self._device)] = _FAR
+            near = cdist(apply(guide, moving.points), fixed.points) <= self._config.search_px
+            distances.masked_fill_(torch.tensor(~near, device=self._device), _FAR)
         if self._config.matcher == "smnn":
             _, pairs = match_smnn(here, there, self._config.ratio, distances)
         else:

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
     from photonpano import Locator, StageContext, StreamInfo
 
-REQUIRES = (Requirement("torch", "photonpano[kornia]"), Requirement("kornia", "photonpano[kornia]"))
+REQUIRES = (Requirement("kornia", "photonpano[kornia]"),)
+"""kornia is never without torch."""
 
 
 @hookimpl
