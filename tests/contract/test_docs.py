@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import doctest
-import importlib
+import importlib.util
 import itertools
 import re
 import shlex
@@ -46,6 +46,7 @@ class Block:
 
     <!-- file: NAME -->         it is that file, for the blocks after it
     <!-- test: fragment -->     YAML that is a part of a spec
+    <!-- test: needs LIBRARY -->  a fragment that is checked where the library is installed
     <!-- test: parse -->        commands that are parsed and not run
     <!-- test: with ARGS -->    commands that are run with more arguments, so that they print something else
     <!-- test: setup ... -->    Python that prepares the blocks after it, and that readers need not see
@@ -132,7 +133,10 @@ class Reader:
 
     def check_spec(self, block: Block) -> None:
         text: Any = block.text
-        if block.marker == "test: fragment":
+        library = block.argument("test: needs")
+        if library and importlib.util.find_spec(library) is None:
+            return
+        if library or block.marker == "test: fragment":
             text = {"version": 1, "source": {"use": "simulator"}, **YAML(typ="safe").load(block.text)}
         parse_spec(text, directory=self.workplace)
 

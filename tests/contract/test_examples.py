@@ -38,6 +38,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "translation": GROUPS,
     "smoothing-spline": GROUPS,
     "fallback": GROUPS,
+    "kornia": GROUPS,
     "demo": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "splat": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
@@ -51,6 +52,8 @@ RUNS: dict[str, dict[str, Any]] = {
 """Specs to run, and what makes them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Those whose levels have no more groups than the first."""
+NEEDS = {"kornia": "kornia"}
+"""The libraries without which a spec is not run."""
 
 
 def photonpano(*arguments: str | Path, **overrides: Any) -> str:
@@ -93,6 +96,8 @@ def test_captures_can_be_simulated(name, examples, tmp_path):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_specs_run(name, examples, tmp_path):
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
     photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **RUNS[name])
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     groups = [level["groups"] for level in record["levels"]]

@@ -34,6 +34,7 @@ def test_the_package_imports_nothing_at_all() -> None:
     "statement",
     [
         "import photonpano_core.hooks",
+        "import photonpano_kornia.hooks",
         "import photonpano_opencv.hooks",
         "import photonpano_simulator.hooks",
         "from photonpano.registry import discover; discover()",

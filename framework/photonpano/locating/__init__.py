@@ -2,7 +2,7 @@
 
 from photonpano.locating.fitting import MIN_NOISE_PX, Fit, fit_homography
 from photonpano.locating.images import ImageLimits, motion_from_images
-from photonpano.locating.points import PointLimits, motion_from_points
+from photonpano.locating.points import PointLimits, least_agreeing, motion_from_points
 from photonpano.locating.viewing import View, blur_against_noise, stabilised_8_bit, view_of
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "View",
     "blur_against_noise",
     "fit_homography",
+    "least_agreeing",
     "motion_from_images",
     "motion_from_points",
     "stabilised_8_bit",

@@ -1,0 +1,1 @@
+"""Locators built on kornia and torch."""

@@ -1,0 +1,117 @@
+"""SIFT keypoints as kornia finds them, matched by SMNN or AdaLAM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled, match_adalam, match_smnn
+from scipy.spatial.distance import cdist
+
+from photonpano.geometry import apply
+from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_kornia.consensus import Matches, motion_of
+from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from photonpano import Located, NotLocated, VirtualExposure
+    from photonpano_kornia.configs import KorniaFeaturesConfig
+
+_FAR = 1e3
+"""The distance between the descriptors of keypoints that lie too far apart; those of others differ by 2 at most."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiftFeatures:
+    """Keypoints of one exposure.
+
+    Attributes:
+        frames: (N, 2, 3) float32, kornia's local affine frames: the last column is the place, the others its surroundings.
+        descriptors: (N, 128) float16, RootSIFT.
+        shape: (height, width) of the exposure.
+    """
+
+    frames: NDArray[np.float32]
+    descriptors: NDArray[np.float16]
+    shape: tuple[int, int]
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(N, 2) places; as everywhere in kornia's features, pixel centres are integers."""
+        return self.frames[:, :, 2].astype(np.float64)
+
+    @property
+    def sizes(self) -> NDArray[np.float64]:
+        """(N,) diameters of the keypoints in px."""
+        return np.asarray(np.sqrt(np.abs(np.linalg.det(self.frames[:, :, :2].astype(np.float64)))))
+
+
+class FeatureLocator:
+    """Detects once, matches, finds a consensus, and fits all inliers."""
+
+    def __init__(self, config: KorniaFeaturesConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+        self._device = device_of(config.device)
+
+    def describe(self, exposure: VirtualExposure) -> SiftFeatures:
+        """Detect keypoints on the variance-stabilised image, where it was seen."""
+        config = self._config
+        image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px)
+        if not mask.any():
+            return SiftFeatures(np.zeros((0, 2, 3), np.float32), np.zeros((0, 128), np.float16), mask.shape)
+        with one_thread(), torch.inference_mode():
+            # A detector for each call: kornia does not promise that one may be shared by threads.
+            sift = SIFTFeatureScaleSpace(
+                config.max_keypoints, config.upright, device=self._device, descriptor_backend="pyramid"
+            )
+            frames, _, descriptors = sift(images_on(self._device, image) / 255, images_on(self._device, mask) > 0)
+            # kornia returns as many as were asked for, and leaves those empty that it did not find.
+            filled = laf_is_filled(frames)[0]
+            return SiftFeatures(
+                frames[0, filled].cpu().numpy(), descriptors[0, filled].half().cpu().numpy(), (mask.shape[0], mask.shape[1])
+            )
+
+    def register(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+        """Match and fit; see `photonpano.Locator`.
+
+        Returns:
+            `NotLocated` with the numbers that decided when too few keypoints match or agree, when they leave the corners of the
+            frame uncertain, or when no camera moves like that.
+        """
+        evidence = {"keypoints_moving": float(len(moving.frames)), "keypoints_fixed": float(len(fixed.frames))}
+        with one_thread(), torch.inference_mode():
+            return motion_of(self._tries(moving, fixed, initial), moving.shape, self._config, self._seed, evidence)
+
+    def _tries(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Iterator[Matches]:
+        """Match near where the motion known so far puts keypoints; then, should that not do, everywhere."""
+        for guide in [initial, None] if initial is not None else [None]:
+            pairs = self._matched(moving, fixed, guide)
+            here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
+            yield Matches(here, there, guide is not None, moving.sizes[pairs[:, 0]])
+
+    def _matched(self, moving: SiftFeatures, fixed: SiftFeatures, guide: NDArray[np.float64] | None) -> NDArray[np.intp]:
+        """Return the pairs of indices (K, 2) of keypoints that match."""
+        if min(len(moving.frames), len(fixed.frames)) < 2:
+            return np.zeros((0, 2), dtype=np.intp)
+        here, there = (torch.tensor(each.descriptors, dtype=torch.float32, device=self._device) for each in (moving, fixed))
+        distances = torch.cdist(here, there)
+        near = None
+        if guide is not None:
+            near = cdist(apply(guide, moving.points), fixed.points) <= self._config.search_px
+            distances.masked_fill_(torch.tensor(~near, device=self._device), _FAR)
+        if self._config.matcher == "smnn":
+            _, pairs = match_smnn(here, there, self._config.ratio, distances)
+        else:
+            frames = (torch.tensor(each.frames, device=self._device)[None] for each in (moving, fixed))
+            # AdaLAM draws its samples from the global generator.
+            with seeded(self._seed, self._device):
+                _, pairs = match_adalam(here, there, *frames, hw1=moving.shape, hw2=fixed.shape, dm=distances)
+        found = np.asarray(pairs.cpu().numpy(), np.intp)
+        return found if near is None else found[near[found[:, 0], found[:, 1]]]

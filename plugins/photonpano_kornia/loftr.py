@@ -1,0 +1,103 @@
+"""LoFTR: matches without keypoints, learned from photographs (Sun et al. 2021)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from photonpano import NotLocated
+from photonpano.geometry import apply
+from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_kornia.consensus import Matches, motion_of
+from photonpano_kornia.runtime import device_of, images_on, one_thread
+from photonpano_kornia.weights import loftr_from
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from photonpano import Located, VirtualExposure
+    from photonpano_kornia.configs import KorniaLoftrConfig
+
+_SMALLEST_SIDE = 32
+"""An image has at least so many px, which are four cells of those that LoFTR matches first."""
+
+
+class Picture(NamedTuple):
+    """An exposure as LoFTR sees it. The maps that the network makes of it would take fifty times the memory.
+
+    Attributes:
+        image: (H, W) uint8; where nothing was seen, the mean of what was.
+        seen: (H, W) bool.
+    """
+
+    image: NDArray[np.uint8]
+    seen: NDArray[np.bool_]
+
+
+class LoftrLocator:
+    """Asks the network for matches, finds a consensus, and fits all inliers."""
+
+    def __init__(self, config: KorniaLoftrConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+        self._device = device_of(config.device)
+        self._network = loftr_from(
+            config.weights,
+            self._device,
+            corrected_positions=config.corrected_positions,
+            min_confidence=config.min_confidence,
+        )
+
+    def describe(self, exposure: VirtualExposure) -> Picture:
+        """Return the exposure on the scale on which photon noise is uniform, in 8 bits."""
+        blur_px = self._config.blur_px
+        image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure) if blur_px == "auto" else blur_px)
+        seen = mask > 0
+        if seen.any():
+            image[~seen] = np.uint8(image[seen].mean())
+        return Picture(image, seen)
+
+    def register(self, moving: Picture, fixed: Picture, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+        """Match and fit; see `photonpano.Locator`.
+
+        Returns:
+            `NotLocated` with the numbers that decided when too few points match or agree, when they leave the corners of the
+            frame uncertain, or when no camera moves like that.
+        """
+        if min(moving.image.shape) < _SMALLEST_SIDE:
+            height, width = moving.image.shape
+            return NotLocated(f"LoFTR needs images of {_SMALLEST_SIDE} px and more, these have {height} x {width}")
+        if not (moving.seen.any() and fixed.seen.any()):
+            return NotLocated("nothing was seen")
+        with one_thread(), torch.inference_mode():
+            here, there = self._matched(moving, fixed)
+            shape = (moving.image.shape[0], moving.image.shape[1])
+            return motion_of(self._tries(here, there, initial), shape, self._config, self._seed, {})
+
+    def _tries(
+        self, here: NDArray[np.float64], there: NDArray[np.float64], initial: NDArray[np.float64] | None
+    ) -> Iterator[Matches]:
+        """Give the matches near where the motion known so far puts them; then, should those not do, all."""
+        if initial is not None:
+            near = np.linalg.norm(apply(initial, here) - there, axis=1) <= self._config.search_px
+            yield Matches(here[near], there[near], guided=True)
+        yield Matches(here, there, guided=False)
+
+    def _matched(self, moving: Picture, fixed: Picture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the points of both images, (N, 2) each, that LoFTR thinks are the same, where both were seen."""
+        images = (images_on(self._device, each.image) / 255 for each in (moving, fixed))
+        answer = self._network(dict(zip(("image0", "image1"), images, strict=True)))
+        # LoFTR was trained with the centre of the first pixel at (0.5, 0.5).
+        here, there = (answer[key].cpu().numpy().astype(np.float64) - 0.5 for key in ("keypoints0", "keypoints1"))
+        counts = _seen_at(moving.seen, here) & _seen_at(fixed.seen, there)
+        return here[counts], there[counts]
+
+
+def _seen_at(seen: NDArray[np.bool_], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points (N, 2) lie on pixels that were seen; those outside count as the nearest pixel."""
+    columns, rows = (np.clip(np.rint(points[:, axis]).astype(int), 0, seen.shape[1 - axis] - 1) for axis in (0, 1))
+    return np.asarray(seen[rows, columns])

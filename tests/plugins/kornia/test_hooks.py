@@ -1,0 +1,59 @@
+"""What is told of the plugin, whether its libraries are installed or not."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from photonpano import PluginError, SpecError, StreamInfo, discover, parse_spec
+from photonpano.cli.app import app
+from photonpano_kornia.configs import KorniaLoftrConfig
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NAMES = ("kornia-features", "kornia-loftr", "kornia-registrator")
+
+
+@pytest.fixture
+def not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name in {"torch", "kornia"} else find(name, *rest)
+    )
+
+
+@pytest.mark.usefixtures("not_installed")
+def test_without_its_libraries_it_is_listed_with_what_to_install() -> None:
+    shown = CliRunner().invoke(app, ["plugins", "list", "--kind", "locator"], prog_name="photonpano").stdout
+    for name in NAMES:
+        assert re.search(rf"^locator +{name} .*\[not installed: photonpano\[kornia\]\]", shown, re.MULTILINE), shown
+    with pytest.raises(PluginError, match=r'needs kornia, which is not installed: pip install "photonpano\[kornia\]"'):
+        discover().get("locator", NAMES[0])
+
+
+@pytest.mark.usefixtures("not_installed")
+def test_without_its_libraries_a_spec_that_names_it_is_wrong() -> None:
+    with pytest.raises(SpecError, match="pip install"):
+        parse_spec({"version": 1, "source": {"use": "simulator"}, "locate": {"use": NAMES[0]}})
+
+
+def test_weights_that_are_not_there_are_a_problem_of_the_spec(tmp_path: Path) -> None:
+    contribution = discover().find("locator", "kornia-loftr").contribution
+    stream = StreamInfo(100, 64, 96, frame_rate_hz=None)
+    weights = tmp_path / "loftr.ckpt"
+    config = contribution.config(weights=weights)
+    assert contribution.check(config, stream) == (
+        f"there is no file {weights} with weights for LoFTR; nothing is downloaded, so get one and name it",
+    )
+    weights.touch()
+    assert contribution.check(config, stream) == ()
+
+
+def test_weights_count_from_the_folder_of_the_spec(tmp_path: Path) -> None:
+    config = KorniaLoftrConfig.model_validate({"weights": "loftr.ckpt"}, context={"directory": tmp_path})
+    assert config.weights == tmp_path / "loftr.ckpt"

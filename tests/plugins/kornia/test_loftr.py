@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from photonpano import InputError, Located, NotLocated
+from photonpano.geometry import apply, corner_displacements, from_parameters
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+torch = pytest.importorskip("torch")
+kornia = pytest.importorskip("kornia")
+
+from photonpano_kornia.configs import KorniaLoftrConfig  # noqa: E402
+from photonpano_kornia.loftr import LoftrLocator  # noqa: E402
+from photonpano_kornia.weights import loftr_from  # noqa: E402
+
+SHAPE = (120, 176)
+STILL = np.eye(3)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def weights() -> dict[str, torch.Tensor]:
+    """Weights of a network that has learned nothing."""
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        return kornia.feature.LoFTR(pretrained=None).state_dict()
+
+
+@pytest.fixture(scope="module")
+def file(weights: dict[str, torch.Tensor], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "loftr.ckpt"
+    torch.save({"state_dict": {f"matcher.{name}": tensor for name, tensor in weights.items()}, "epoch": 3}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def build(file: Path) -> Callable[..., LoftrLocator]:
+    return lambda **config: LoftrLocator(KorniaLoftrConfig(weights=file, **config), seed=0)
+
+
+def test_the_network_has_the_weights_of_the_file(weights: dict[str, torch.Tensor], file: Path, tmp_path: Path) -> None:
+    """As a checkpoint of its authors' has them, and bare; the generator of random numbers stays as it was."""
+    bare = tmp_path / "bare.pt"
+    torch.save(weights, bare)
+    before = torch.get_rng_state()
+    for path in (file, bare):
+        network = loftr_from(path, CPU, corrected_positions=False, min_confidence=0.4)
+        assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
+        assert not network.training
+        assert network.coarse_matching.thr == 0.4
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_positions_are_encoded_as_the_weights_were_trained(file: Path) -> None:
+    encodings = [
+        loftr_from(file, CPU, corrected_positions=corrected, min_confidence=0.2).pos_encoding.pe for corrected in (False, True)
+    ]
+    assert not torch.equal(*encodings)
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        loftr_from(path, CPU, corrected_positions=False, min_confidence=0.2)
+    return str(caught.value)
+
+
+def test_a_file_with_something_else_in_it_is_refused(weights: dict[str, torch.Tensor], tmp_path: Path) -> None:
+    path = tmp_path / "weights.pt"
+    assert refused(path) == f"there is no file {path} with weights for LoFTR"
+    path.write_bytes(b"not weights")
+    assert refused(path) == f"{path} holds no weights that torch can read: UnpicklingError"
+    torch.save({"a": 1, "b": "text"}, path)
+    assert refused(path) == f"{path} does not hold the weights of LoFTR: expected tensors by their names, or under state_dict"
+    first, *others = weights
+    few = {name: torch.zeros(1) for name in others[:3]}
+    torch.save(few, path)
+    lacks = f"it lacks {len(weights) - 3} of {len(weights)} tensors, such as {first}"
+    assert refused(path) == f"{path} does not hold the weights of LoFTR: {lacks}"
+    small = {name: torch.zeros(()) for name in weights}
+    torch.save(small, path)
+    shape = f"{first} has the shape (), expected {tuple(weights[first].shape)}"
+    assert refused(path) == f"{path} does not hold the weights of LoFTR: {shape}"
+    torch.save(small | {"depth.head": torch.zeros(1)}, path)
+    unknown = f"1 of its {len(weights) + 1} tensors are none of LoFTR's, such as depth.head"
+    assert refused(path) == f"{path} does not hold the weights of LoFTR: {unknown}"
+
+
+def test_no_code_in_a_file_is_run(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pt"
+    torch.save(pytest.approx, path)
+    assert refused(path) == f"{path} holds no weights that torch can read: UnpicklingError"
+
+
+def test_a_network_that_has_learned_nothing_is_certain_of_nothing(build: Callable, shot: Callable) -> None:
+    """The real network is asked."""
+    locator = build()
+    pair = [locator.describe(shot(STILL, seed)) for seed in range(2)]
+    assert locator.register(*pair, None) == NotLocated("0 matches, fewer than min_inliers = 12", {"matches": 0})
+    uncertain = build(min_confidence=0).register(*pair, None)
+    assert uncertain.evidence["matches"] > 12
+
+
+def knows(true: np.ndarray, monkeypatch: pytest.MonkeyPatch, wrong: int = 0) -> None:
+    """Make of LoFTR a network that knows the motion: it matches its coarse cells, whose coordinates end in half pixels."""
+
+    def forward(self: object, data: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        assert data["image0"].shape == data["image1"].shape == (1, 1, *SHAPE)
+        assert 0 <= data["image0"].min() <= data["image0"].max() <= 1
+        rows, columns = np.mgrid[0 : SHAPE[0] : 8, 0 : SHAPE[1] : 8]
+        cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+        partners = apply(true, cells - 0.5) + 0.5
+        partners[:wrong] = np.random.default_rng(0).uniform((0, 0), (175, 119), (wrong, 2))
+        inside = np.all((partners >= 0) & (partners <= [175, 119]), axis=1)
+        points = {"keypoints0": cells[inside], "keypoints1": partners[inside]}
+        return {name: torch.tensor(each, dtype=torch.float32) for name, each in points.items()}
+
+    monkeypatch.setattr(kornia.feature.LoFTR, "forward", forward)
+
+
+TRUE = from_parameters([0.12, 0.05, -0.05, 0.1, 9.0, -4.0, 1e-4, -5e-5])
+
+
+@pytest.mark.parametrize("initial", [None, TRUE, STILL], ids=["unknown", "known", "far off"])
+def test_its_matches_are_those_of_pixel_centres(
+    build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch, initial: np.ndarray | None
+) -> None:
+    """Half a pixel would move the corners by 0.1 px here. A third of the matches is wrong."""
+    knows(TRUE, monkeypatch, wrong=100)
+    locator = build()
+    moving, fixed = (locator.describe(shot(STILL, seed)) for seed in range(2))
+    motion = locator.register(moving, fixed, initial)
+    assert isinstance(motion, Located), motion
+    assert corner_displacements(motion.homography, TRUE, SHAPE).max() < 0.001
+    assert 40 < motion.evidence["inliers"] <= motion.evidence["matches"]
+
+
+def test_what_was_not_seen_is_not_matched(build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    knows(STILL, monkeypatch)
+    locator, half = build(), shot(STILL)
+    half.flux[:, :88], half.weight[:, :88] = np.nan, 0
+    moving, fixed = locator.describe(half), locator.describe(shot(STILL, 1))
+    assert np.ptp(moving.image[:, :88]) == 0
+    motion = locator.register(moving, fixed, None)
+    assert isinstance(motion, Located)
+    assert motion.evidence["matches"] == 15 * 11
+    half.flux[:], half.weight[:] = np.nan, 0
+    assert locator.register(fixed, locator.describe(half), None) == NotLocated("nothing was seen")
+
+
+def test_tiny_images_are_refused(build: Callable, photograph: Callable) -> None:
+    locator = build()
+    tiny = locator.describe(photograph(np.full((20, 40), 0.5)))
+    assert locator.register(tiny, tiny, None).reason == "LoFTR needs images of 32 px and more, these have 20 x 40"
+    assert sum(each.nbytes for each in tiny) == 2 * 20 * 40

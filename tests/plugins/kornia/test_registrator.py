@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from photonpano import NotLocated
+from photonpano.geometry import apply, inverse, rescaling, translation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+torch = pytest.importorskip("torch")
+kornia = pytest.importorskip("kornia")
+
+from photonpano_kornia.configs import KorniaRegistratorConfig  # noqa: E402
+from photonpano_kornia.registrator import RegistratorLocator, unit_square  # noqa: E402
+
+STILL = np.eye(3)
+
+
+def locator(**config: object) -> RegistratorLocator:
+    return RegistratorLocator(KorniaRegistratorConfig.model_validate(config))
+
+
+def test_pixels_are_where_the_warper_of_kornia_thinks_they_are() -> None:
+    """An image of its own coordinates, seen through a homography, shows what the homography maps pixels to."""
+    height, width = 20, 30
+    homography = translation(2.25, 1.5) @ np.diag([0.8, 0.7, 1]) + np.array([[0, 0.02, 0], [0.01, 0, 0], [1e-4, 2e-4, 0]])
+    y, x = np.mgrid[:height, :width].astype(float)
+    unit = unit_square((height, width))
+    warper = kornia.geometry.HomographyWarper(height, width, align_corners=False)
+    coordinates = torch.tensor(np.stack([x, y])[None], dtype=torch.float64)
+    to_image = torch.tensor(unit @ homography @ inverse(unit))[None]
+    seen = warper(coordinates, to_image)[0].numpy().reshape(2, -1).T
+    np.testing.assert_allclose(seen, apply(homography, np.stack([x.ravel(), y.ravel()], axis=1)), atol=1e-4)
+
+
+def test_the_edges_of_an_image_stay_when_it_is_halved() -> None:
+    """Half a pixel: the layers of a pyramid share the coordinates of kornia."""
+    halved = unit_square((40, 60)) @ rescaling(0.5) @ inverse(unit_square((80, 120)))
+    np.testing.assert_allclose(halved, STILL, atol=1e-12)
+
+
+def test_the_pyramid_is_finest_first_and_ends_before_it_is_too_small(shot: Callable) -> None:
+    views = locator().describe(shot(STILL))
+    assert [view.shape for view in views] == [(120, 176), (60, 88), (30, 44)]
+    assert len(locator(pyramid_levels=1).describe(shot(STILL))) == 1
+
+
+def test_it_says_why_images_do_not_match(shot: Callable) -> None:
+    one = locator()
+    motion = one.register(one.describe(shot(translation(0, 250), 1)), one.describe(shot(STILL, 2)), STILL)
+    assert isinstance(motion, NotLocated)
+    assert "diverges" in motion.reason or "agree by" in motion.reason
