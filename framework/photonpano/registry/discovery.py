@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from importlib.metadata import EntryPoint, entry_points
 
+from photonpano import __version__
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
-from photonpano.registry.catalog import BrokenPlugin, Catalog, Entry, make_entry, ordered
+from photonpano.registry.catalog import BrokenPlugin, Catalog, make_entry, ordered
+from photonpano.registry.chain import CHAIN
 from photonpano.registry.plugins import contributions_of
 
 
 def discover() -> Catalog:
-    """Load every plugin in the entry-point group `photonpano` and collect what they offer.
+    """Load every plugin in the entry-point group `photonpano` and collect what they and the framework offer.
 
     Never raises for what a plugin does wrong: see `Catalog.broken`. A plugin is taken whole or not at all.
     """
-    rows: list[Entry] = []
+    rows = [make_entry(CHAIN, PROJECT, __version__, "built in")]
     broken: list[BrokenPlugin] = []
     for entry_point in entry_points(group=PROJECT):
         plugin, version = _distribution(entry_point)
