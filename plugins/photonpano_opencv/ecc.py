@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import cv2
@@ -79,7 +80,16 @@ class EccLocator:
             )
         except cv2.error as error:
             # What OpenCV does where it does not converge, in the midst of images that are right.
-            return f"the correlation cannot be maximised: {error.err.rstrip('.')}"
+            return f"the correlation cannot be maximised: {_sentence_of(error)}"
         homography = np.asarray(found, np.float64)
         reason = implausibility(homography, moving.shape, config.min_overlap)
         return f"the alignment diverges: {reason}" if reason else normalised(homography)
+
+
+def _sentence_of(error: cv2.error) -> str:
+    """Return what OpenCV says, without its own files and functions.
+
+    From the text: the attributes of the exception belong to its class, and are those of whichever thread failed last.
+    """
+    found = re.search(r"error: \([^)]*\) (.*?)\.? in function", str(error))
+    return found[1] if found else str(error)

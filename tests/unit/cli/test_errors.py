@@ -44,7 +44,8 @@ def test_all_problems_of_a_spec_each_on_a_line(folder: Path, invoke: Callable[..
     [
         (
             SOURCE + "locate: {use: opencv-shift}\n",
-            "spec.yaml:3:15: locate.use: there is no locator 'opencv-shift'; did you mean 'opencv-sift'?\n",
+            "spec.yaml:3:15: locate.use: there is no locator 'opencv-shift'; "
+            "did you mean 'opencv-sift', 'opencv-orb' or 'opencv-ecc'?\n",
         ),
         (SOURCE + "level: 3\n", "spec.yaml:3:1: level: unknown key; did you mean 'levels'?\n"),
     ],

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonpano import Located, NotLocated
@@ -81,6 +81,7 @@ def test_a_start_that_no_camera_makes_is_refused(start: np.ndarray, reason: str)
     assert lost(motion_from_points(*matches(), start, SHAPE, LIMITS)).reason == f"{reason}, from 120 matches"
 
 
+@settings(deadline=None)
 @given(count=st.integers(0, 30), seed=st.integers(0, 2**32 - 1), degenerate=st.booleans())
 def test_no_points_make_it_raise(count: int, seed: int, degenerate: bool) -> None:
     """Also where all of them lie in one place; what is located has an information that can be inverted."""

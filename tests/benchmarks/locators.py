@@ -1,0 +1,176 @@
+"""How exact, how reliable and how fast every locator is: the table of docs/how-to/choose-a-locator.md.
+
+    python tests/benchmarks/locators.py docs/how-to/choose-a-locator.md [--scenes 2] [--fluxes 0.5 0.1 0.02]
+
+Every locator that is installed and needs no key registers the same pairs of virtual exposures, of the built-in street: groups
+of 250 frames of 254x496 pixels, one and two group lengths apart, while a camera that trembles pans over 25 px in each. Groups
+are merged as at level 1, where they are blurred and nothing tells where to start; and as at the last, along the true motion,
+with a start that puts every corner wrong by 2 px. Times are those of one thread, to describe the exposures and to register the
+pairs, for each pair.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+from pydantic import ValidationError
+
+from photonpano import FrameSpan, Group, Located, PhotonpanoError, StageContext, discover, open_source, parse_spec
+from photonpano.evaluation import FrameTrajectory
+from photonpano.geometry import apply, corner_displacements, corners, inverse, normalised
+from photonpano_core.configs import PhotonMleConfig
+from photonpano_core.photon_mle import PhotonMleMerger
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from photonpano import Locator, VirtualExposure
+    from photonpano.registry import Catalog
+
+SHAPE = (254, 496)
+GROUP_SIZE = 250
+GROUPS = 6
+WRONG_PX = 2.0
+BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+
+
+class Views(NamedTuple):
+    """Exposures of one capture, and where they truly lie.
+
+    Attributes:
+        exposures: one for each group.
+        to_plane: (N, 3, 3), their pixels to a common plane.
+        context: for locators of this capture.
+    """
+
+    exposures: list[VirtualExposure]
+    to_plane: np.ndarray
+    context: StageContext
+
+    def pairs(self) -> Iterator[tuple[int, int, np.ndarray]]:
+        """Yield which exposure is moving, which is fixed, and the true motion between them."""
+        for apart in (1, 2):
+            for fixed in range(len(self.exposures) - apart):
+                moving = fixed + apart
+                yield moving, fixed, inverse(self.to_plane[fixed]) @ self.to_plane[moving]
+
+
+class Figures(NamedTuple):
+    """How one locator did on one kind of exposures: median error of those that were found, share that was not, time."""
+
+    error_px: float
+    lost: float
+    ms: float
+
+    def __str__(self) -> str:
+        error = "-" if np.isnan(self.error_px) else f"{self.error_px:.3f} px"
+        return f"{error} | {self.lost:.0%} | {self.ms:.0f} ms"
+
+
+def views(flux: float, seed: int, compensated: bool) -> Views:
+    """Simulate a capture, and merge its groups."""
+    simulator: dict[str, Any] = {
+        "scene": {"kind": "street", "seed": seed},
+        "path": {
+            "kind": "random-spline",
+            "seed": seed,
+            "length_px": 25 * GROUPS,
+            "shake": {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]},
+        },
+        "flux": flux,
+        "n_frames": GROUP_SIZE * GROUPS,
+        "frame_shape": SHAPE,
+    }
+    merger = PhotonMleMerger(PhotonMleConfig(compensate=compensated))
+    with open_source(parse_spec({"version": 1, "source": {"use": "simulator", "with": simulator}})) as source:
+        trajectory = FrameTrajectory(source.truth()["homographies"])  # type: ignore[attr-defined]  # simulators know it
+        spans = (FrameSpan(start, start + GROUP_SIZE) for start in range(0, source.info.n_frames, GROUP_SIZE))
+        groups = [Group(span, span.centre) for span in spans]
+        exposures = [merger.merge(source, group, trajectory, 1.0) for group in groups]
+        context = StageContext(source.info, source.response)
+    return Views(exposures, trajectory.at([group.reference for group in groups]), context)
+
+
+def available(catalog: Catalog, context: StageContext) -> Iterator[tuple[str, Locator]]:
+    """Yield the locators that can be built here without any key."""
+    for entry in catalog.rows:
+        if entry.kind != "locator":
+            continue
+        try:
+            locator = catalog.get("locator", entry.name).contribution
+            yield entry.name, locator.build(locator.config(), context)
+        except (PhotonpanoError, ValidationError) as error:
+            print(f"{entry.name} is left out: {str(error).splitlines()[0]}", file=sys.stderr)
+
+
+def nearly(true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a motion that puts every corner of the frame wrong by 2 px, in any direction."""
+    angles = rng.uniform(0, 2 * np.pi, 4)
+    wrong = apply(true, corners(SHAPE)) + WRONG_PX * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return normalised(cv2.getPerspectiveTransform(corners(SHAPE).astype(np.float32), wrong.astype(np.float32)))
+
+
+def measure(locator: Locator, captures: Sequence[Views], known: bool) -> Figures:
+    """Register all pairs, from a start that is nearly right if the motion is known, or from nowhere."""
+    errors, lost, seconds = [], 0, 0.0
+    rng = np.random.default_rng(0)
+    for capture in captures:
+        began = time.perf_counter()
+        features = [locator.describe(exposure) for exposure in capture.exposures]
+        seconds += time.perf_counter() - began
+        for moving, fixed, true in capture.pairs():
+            start = nearly(true, rng) if known else None
+            began = time.perf_counter()
+            motion = locator.register(features[moving], features[fixed], start)
+            seconds += time.perf_counter() - began
+            if isinstance(motion, Located):
+                errors.append(corner_displacements(motion.homography, true, SHAPE).mean())
+            else:
+                lost += 1
+    pairs = len(errors) + lost
+    return Figures(float(np.median(errors)) if errors else np.nan, lost / pairs, 1000 * seconds / pairs)
+
+
+def table(fluxes: Sequence[float], scenes: int) -> list[str]:
+    """Return the rows in Markdown: one for each locator and flux, for blurred and for compensated exposures."""
+    rows = [
+        "| Flux | Locator | Blurred: error | lost | a pair | Compensated: error | lost | a pair |",
+        "| --- " * 8 + "|",
+    ]
+    catalog = discover()
+    for flux in fluxes:
+        kinds = [[views(flux, seed, compensated) for seed in range(scenes)] for compensated in (False, True)]
+        for name, locator in available(catalog, kinds[0][0].context):
+            # The first pair pays for what is compiled or loaded.
+            measure(locator, [Views(kinds[1][0].exposures[:2], *kinds[1][0][1:])], known=True)
+            blurred, compensated = (
+                measure(locator, captures, known) for captures, known in zip(kinds, (False, True), strict=True)
+            )
+            rows.append(f"| {flux:g} | {name} | {blurred} | {compensated} |")
+            print(rows[-1], file=sys.stderr, flush=True)
+    return rows
+
+
+def main() -> None:
+    """Measure everything, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", type=Path, help="the page whose table is replaced")
+    parser.add_argument("--scenes", type=int, default=2, help="how many streets")
+    parser.add_argument("--fluxes", type=float, nargs="+", default=[0.5, 0.1, 0.02], help="photons per pixel and frame")
+    arguments = parser.parse_args()
+    page: Path = arguments.page
+    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+    _, after = rest.split(END)
+    cv2.setNumThreads(1)
+    rows = "\n".join(table(arguments.fluxes, arguments.scenes))
+    page.write_text(f"{before}{BEGIN}\n{rows}\n{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
