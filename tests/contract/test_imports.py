@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile")
+HEAVY = ("cv2", "numba", "pycolmap", "scipy", "skimage", "matplotlib", "tifffile")
 
 
 def imported_by(statement: str) -> set[str]:
@@ -24,6 +24,7 @@ def test_the_package_imports_nothing_at_all() -> None:
 @pytest.mark.parametrize(
     "statement",
     [
+        "import photonpano_colmap.hooks",
         "import photonpano_core.hooks",
         "import photonpano_opencv.hooks",
         "import photonpano_simulator.hooks",
