@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import version as version_of
 
-from photonpano import __version__
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
 from photonpano.registry.catalog import BrokenPlugin, Catalog, make_entry, ordered
@@ -17,7 +17,7 @@ def discover() -> Catalog:
 
     Never raises for what a plugin does wrong: see `Catalog.broken`. A plugin is taken whole or not at all.
     """
-    rows = [make_entry(CHAIN, PROJECT, __version__, "built in")]
+    rows = [make_entry(CHAIN, PROJECT, version_of(PROJECT), "built in")]
     broken: list[BrokenPlugin] = []
     for entry_point in entry_points(group=PROJECT):
         plugin, version = _distribution(entry_point)
