@@ -37,6 +37,8 @@ def test_every_dependency_is_pinned_to_a_version_that_it_allows() -> None:
     pinned = pins()
     for line in [*project["dependencies"], *optional, *PROJECT["build-system"]["requires"]]:
         requirement = Requirement(line)
+        if requirement.name == project["name"]:  # an extra that is part of another
+            continue
         assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)]), line
 
 

@@ -69,8 +69,8 @@ def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog:
     (level,) = rescued.record["levels"]
     # Of the pairs of six groups, 1-0, 2-1, ..., 2-0, 3-1, ..., 4-0 and 5-1, all with group 0 or 3.
     assert level["located_by"] == {"forgetful": 4, "opencv-sift": 7}
-    rescued = [(each["moving"][0] // 50, each["fixed"][0] // 50, each["by"]) for each in level["rescued"]]
-    assert sorted(rescued) == [
+    by_sift = [(each["moving"][0] // 50, each["fixed"][0] // 50, each["by"]) for each in level["rescued"]]
+    assert sorted(by_sift) == [
         (moving, fixed, "opencv-sift") for moving, fixed in [(1, 0), (2, 0), (3, 1), (3, 2), (4, 0), (4, 3), (5, 3)]
     ]
     assert (level["pairs"], level["located"], level["failures"]) == (11, 6, [])
