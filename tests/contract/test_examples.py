@@ -39,6 +39,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "smoothing-spline": GROUPS,
     "fallback": GROUPS,
     "kornia": GROUPS,
+    "chain": GROUPS,
+    "colmap": GROUPS,
     "demo": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "splat": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
@@ -52,8 +54,8 @@ RUNS: dict[str, dict[str, Any]] = {
 """Specs to run, and what makes them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Those whose levels have no more groups than the first."""
-NEEDS = {"kornia": "kornia"}
-"""The libraries without which a spec is not run."""
+NEEDS = {"colmap": "pycolmap", "kornia": "kornia"}
+"""Libraries that may be missing; the specs that need them are run where they are installed."""
 
 
 def photonpano(*arguments: str | Path, **overrides: Any) -> str:

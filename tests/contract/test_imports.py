@@ -33,6 +33,7 @@ def test_the_package_imports_nothing_at_all() -> None:
 @pytest.mark.parametrize(
     "statement",
     [
+        "import photonpano_colmap.hooks",
         "import photonpano_core.hooks",
         "import photonpano_kornia.hooks",
         "import photonpano_opencv.hooks",

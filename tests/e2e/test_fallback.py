@@ -69,8 +69,13 @@ def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog:
     (level,) = rescued.record["levels"]
     # Of the pairs of six groups, 1-0, 2-1, ..., 2-0, 3-1, ..., 4-0 and 5-1, all with group 0 or 3.
     assert level["located_by"] == {"forgetful": 4, "opencv-sift": 7}
+    by_sift = [(each["moving"][0] // 50, each["fixed"][0] // 50, each["by"]) for each in level["rescued"]]
+    assert sorted(by_sift) == [
+        (moving, fixed, "opencv-sift") for moving, fixed in [(1, 0), (2, 0), (3, 1), (3, 2), (4, 0), (4, 3), (5, 3)]
+    ]
     assert (level["pairs"], level["located"], level["failures"]) == (11, 6, [])
     assert sift.record["levels"][0]["located_by"] == {"opencv-sift": 11}
+    assert sift.record["levels"][0]["rescued"] == []
     located = [each for each in rescued.record["plugins"] if each["stage"] == "locate"]
     assert [(each["use"], each["plugin"], each["version"]) for each in located] == [
         ("forgetful", "toys", "1.2"),
@@ -78,6 +83,18 @@ def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog:
     ]
     recorded = parse_spec(json.loads(json.dumps(rescued.record["spec"])), catalog=catalog)
     assert [each.contribution.name for each in recorded.levels[0].fallbacks] == ["opencv-sift"]
+
+
+def test_a_chain_is_its_first_locator_with_the_others_as_fallbacks(small_spec: dict[str, Any], catalog: Catalog) -> None:
+    forgetful = {"use": "forgetful", "with": {"every": 3}}
+    chain = {"use": "chain-of-backends", "with": {"backends": [forgetful, "opencv-sift"]}}
+    with_chain, with_fallback = (
+        run(small_spec | {"locate": section}, catalog) for section in (chain, forgetful | {"fallback": "opencv-sift"})
+    )
+    np.testing.assert_array_equal(with_chain.homographies, with_fallback.homographies)
+    (level,), (expected,) = with_chain.record["levels"], with_fallback.record["levels"]
+    assert (level["located_by"], level["rescued"]) == (expected["located_by"], expected["rescued"])
+    assert with_chain.record["spec"] == with_fallback.record["spec"]
 
 
 def test_what_nobody_locates_lists_what_each_said(small_spec: dict[str, Any], catalog: Catalog) -> None:

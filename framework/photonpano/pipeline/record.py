@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from photonpano.pipeline.loop import LevelResult
-    from photonpano.spec.plan import Plan
+    from photonpano.spec.plan import Choice, Plan
     from photonpano.values import FloatArray, Group, StreamInfo
 
 UNCERTAIN_PX = 0.5
@@ -39,22 +40,30 @@ def source_record(stream: StreamInfo) -> dict[str, Any]:
 def plugin_records(plan: Plan) -> list[dict[str, str]]:
     """Say who provided each stage, each component once."""
     seen: dict[tuple[str, str], dict[str, str]] = {}
-    chosen: list[tuple[str, Any]] = [("source", plan.source)]
-    for level in plan.levels:
-        chosen += [("resample", level.resample), ("merge", level.merge), ("locate", level.locate)]
-        chosen += [*(("locate", choice) for choice in level.fallbacks), ("interpolate", level.interpolate)]
-    for stage, choice in chosen:
+    for stage, choice in _choices(plan):
         name = choice.contribution.name
         seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.plugin, "version": choice.version}
     return list(seen.values())
 
 
-def library_versions() -> dict[str, str]:
+def library_versions(plan: Plan) -> dict[str, str]:
     """Return the versions of Python and of the libraries that the result depends on."""
     versions = {"python": sys.version.split()[0]}
-    for name in _LIBRARIES:
-        versions[name] = importlib.metadata.version(name)
+    required = [requirement.module for _, choice in _choices(plan) for requirement in choice.contribution.requires]
+    for name in dict.fromkeys((*_LIBRARIES, *required)):
+        # A library may be imported under another name than it is installed under.
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
     return versions
+
+
+def _choices(plan: Plan) -> Iterator[tuple[str, Choice[Any]]]:
+    """Yield the sections of a spec with what they choose, level by level."""
+    yield "source", plan.source
+    for level in plan.levels:
+        yield from (("resample", level.resample), ("merge", level.merge), ("locate", level.locate))
+        yield from (("locate", choice) for choice in level.fallbacks)
+        yield "interpolate", level.interpolate
 
 
 def level_record(result: LevelResult) -> dict[str, Any]:
@@ -70,6 +79,7 @@ def level_record(result: LevelResult) -> dict[str, Any]:
         "located_by": {
             locator.name: sum(edge.locator == locator.name for edge in located.edges) for locator in result.level.locators
         },
+        "rescued": list(_rescued(result)),
         "failures": list(_failures(result)),
         "revisits": {
             "pairs": located.n_revisits,
@@ -166,6 +176,13 @@ def peak_memory_bytes() -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _rescued(result: LevelResult) -> Iterator[dict[str, Any]]:
+    for edge in result.located.edges:
+        if edge.locator not in ("", result.level.locators[0].name):
+            moving, fixed = result.groups[edge.moving].span, result.groups[edge.fixed].span
+            yield {"moving": [moving.start, moving.stop], "fixed": [fixed.start, fixed.stop], "by": edge.locator}
 
 
 def _failures(result: LevelResult) -> Iterator[dict[str, Any]]:

@@ -121,7 +121,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
         "seed": plan.run.seed,
         "source": source_record(stream),
         "plugins": plugin_records(plan),
-        "libraries": library_versions(),
+        "libraries": library_versions(plan),
         "decisions": [asdict(decision) for decision in decisions],
         "levels": [level_record(result) for result in results],
         "panorama": {

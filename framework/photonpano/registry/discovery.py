@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import version as version_of
 
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
 from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, make_entry, ordered
+from photonpano.registry.chain import CHAIN
 from photonpano.registry.observers import Observer
 from photonpano.registry.plugins import contributions_of, observation_of
 from photonpano.registry.switch import DISABLE, Switch
@@ -16,13 +18,13 @@ logger = logging.getLogger(__name__)
 
 
 def discover() -> Catalog:
-    """Load every plugin in the entry-point group `photonpano` and collect what they offer.
+    """Load every plugin in the entry-point group `photonpano` and collect what they and the framework offer.
 
     Never raises for what a plugin does wrong: see `Catalog.broken`. A plugin is taken whole or not at all. One that the
     environment variable `PHOTONPANO_DISABLE_PLUGINS` names, by its distribution or its entry point, is not even imported: see
     `Catalog.disabled`. Names there that are no plugin's are logged as a warning.
     """
-    rows: list[Entry] = []
+    rows = [make_entry(CHAIN, PROJECT, version_of(PROJECT), "built in")]
     broken: list[BrokenPlugin] = []
     disabled: list[DisabledPlugin] = []
     observers: list[Observer] = []

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic.json_schema import models_json_schema
 
+from photonpano.registry.chain import CHAIN, ChainConfig
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.wording import TolerantJsonSchema
 from photonpano.spec.resolution import DEFAULT_FALLBACK, DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
@@ -40,8 +41,12 @@ def json_schema(catalog: Catalog) -> Schema:
         own = [entry for entry in entries if entry.kind == kind.name]
         sections[kind.section] = _component(kind, own, schemas, DEFAULTS.get(kind.section))
         overrides[kind.section] = _component(kind, own, schemas, None)
-    locators = overrides["locate"] | {"type": "object", "required": ["use"]}
-    definitions["fallback"] = _fallback(locators)
+    single = [entry for entry in entries if entry.kind == "locator" and entry.contribution is not CHAIN]
+    locator = _component(KINDS["locator"], single, schemas, None) | {"type": "object", "required": ["use"]}
+    one = {"anyOf": [locator["properties"]["use"], locator]}
+    definitions["fallback"] = {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}
+    if ChainConfig in schemas:
+        definitions[_definition(schemas[ChainConfig])]["properties"]["backends"]["items"] = one
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
@@ -78,8 +83,13 @@ def _schemas(models: list[type[BaseModel]]) -> tuple[dict[type[BaseModel], Schem
     definitions: dict[str, Schema] = schema["$defs"]
     schemas = {model: references[model, "validation"] for model in unique}
     for reference in schemas.values():
-        definitions[reference["$ref"].rpartition("/")[2]]["type"] = SECTION
+        definitions[_definition(reference)]["type"] = SECTION
     return schemas, definitions
+
+
+def _definition(reference: Schema) -> str:
+    """Return the name of the definition that a reference points to."""
+    return str(reference["$ref"]).rpartition("/")[2]
 
 
 def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema], default: str | None) -> Schema:
@@ -101,9 +111,3 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
-
-
-def _fallback(locator: Schema) -> Schema:
-    """Return the schema of the locators to which lost pairs are offered: one or a list, each a name or a mapping."""
-    one = {"anyOf": [locator["properties"]["use"], locator]}
-    return {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}

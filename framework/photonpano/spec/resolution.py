@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import PluginError, SpecError
+from photonpano.registry.chain import CHAIN
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.suggestions import listed
+from photonpano.spec.chain import NO_PART, spelled_out
 from photonpano.spec.checks import STAGES, complaints
 from photonpano.spec.plan import Choice, LevelPlan, Plan
 from photonpano.spec.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
@@ -148,9 +150,20 @@ class _Resolver:
             entry = self.entry(kind, value, content.get("use", default))
         known = ("use", "with", "fallback") if section == "locate" else ("use", "with")
         self.known_keys(content, known, entry.contribution.config.model_fields if entry else ())
+        if entry is not None and entry.contribution is CHAIN:
+            return self.chain(section, value, keys, base)
         choice = self.choice(entry, keys, base) if entry else None
         fallbacks = self.fallbacks(value, content, choice, base) if section == "locate" else ()
         return _Selection(entry, keys, choice, fallbacks)
+
+    def chain(self, section: str, value: Value, keys: Value, base: _Selection | None) -> _Selection:
+        """Resolve a section that uses the chain of locators: the first is chosen, and the others are its fallbacks."""
+        spelled = spelled_out(value, keys, self.directory, self.problems)
+        if spelled is None:
+            return _Selection(None, keys, None)
+        chosen, first = spelled
+        self.remember(first, value.place.where)
+        return self.select(section, chosen, base)
 
     def fallbacks(
         self, value: Value, content: dict[str, Value], first: Choice[Any] | None, base: _Selection | None
@@ -206,6 +219,9 @@ class _Resolver:
             self.problems.append(item.place.problem(f"expected {expected}, got {given(item.content)}"))
             return None
         entry = self.entry(kind, item, content.get("use"))
+        if entry is not None and entry.contribution is CHAIN:
+            self.problems.append(item.head.problem(NO_PART))
+            return None
         if nested := content.get("fallback"):
             message = "a fallback has none of its own; list all of them, in the order in which they are tried"
             self.problems.append(nested.head.problem(message))
@@ -240,7 +256,7 @@ class _Resolver:
     def entry(self, kind: Kind, value: Value, use: Value | None) -> Entry | None:
         """Look up the component that a section names; None if it names none, or one that there is not."""
         if use is None:
-            known = listed(self.catalog.names(kind.name)) or "none"
+            known = listed(name for name in self.catalog.names(kind.name) if name != CHAIN.name) or "none"
             self.problems.append(value.head.problem(f"required: the name of the {kind.name}; known: {known}", "use"))
             return None
         if not isinstance(use.content, str):

@@ -2,6 +2,7 @@
 
 import pytest
 
+import photonpano
 from photonpano import PluginError
 from photonpano.registry import BrokenPlugin, DisabledPlugin, discover
 
@@ -32,6 +33,11 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
     ]
     assert catalog.get("source", "toy-camera").contribution.summary == "A toy"
     assert of_toys(catalog.broken) == []
+
+
+def test_the_framework_offers_the_chain_itself():
+    entry = discover().get("locator", "chain-of-backends")
+    assert (entry.plugin, entry.entry_point, entry.version) == ("photonpano", "built in", photonpano.__version__)
 
 
 @pytest.mark.parametrize(

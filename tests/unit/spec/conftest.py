@@ -17,6 +17,7 @@ from photonpano import (
 )
 from photonpano.registry import Catalog
 from photonpano.registry.catalog import make_entry
+from photonpano.registry.chain import CHAIN
 
 
 class PackedNpyConfig(Config):
@@ -116,6 +117,7 @@ CONTRIBUTIONS = [
         requires=(Requirement("no_such_library", "photonpano[kornia]"),),
     ),
     LocatorContribution(name="moody", summary="Toy", config=MoodyConfig, build=unbuilt),
+    CHAIN,
     InterpolatorContribution(name="smoothing-spline", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
     InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
 ]

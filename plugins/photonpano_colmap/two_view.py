@@ -1,0 +1,150 @@
+"""Locator `pycolmap-two-view`: what COLMAP does with a pair of images, for homographies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import normalised
+from photonpano.locating import PointLimits, blur_against_noise, motion_from_points, stabilised_8_bit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano import VirtualExposure
+    from photonpano_colmap.configs import PycolmapTwoViewConfig
+
+CENTRE_OF_FIRST_PIXEL = 0.5
+"""In COLMAP pixel centres lie at halves; here they are integers."""
+MAX_TRIALS = 10_000
+"""RANSAC finds a motion with which a fifth of the matches agree in half as many; chance is not to take longer."""
+_SEEDS = 2**31
+"""The library takes seeds below this."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Keypoints of one exposure, the largest first.
+
+    Attributes:
+        points: (N, 2) float64, pixel centres are integers.
+        sizes: (N,) float64, scales of the keypoints in px; their positions err in proportion.
+        keypoints: the points and scales as the library wants them. What it does with them is the same wherever the origin
+            is, so they are ours.
+        descriptors: of the library too, (N, 128) uint8.
+        shape: (height, width) of the exposure.
+    """
+
+    points: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    keypoints: pycolmap.FeatureKeypoints
+    descriptors: pycolmap.FeatureDescriptors
+    shape: tuple[int, int]
+
+
+class TwoViewLocator:
+    """Extracts once, matches near where the motion is known or everywhere, finds a consensus, and fits all inliers.
+
+    The library's threads are not used, since the framework has its own. It holds the interpreter's lock while it extracts and
+    matches, so that pairs do not overlap in time.
+    """
+
+    def __init__(self, config: PycolmapTwoViewConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed % _SEEDS
+        # It would tell on stderr of every extractor and matcher that is made.
+        pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, int(pycolmap.logging.WARNING))
+
+    def describe(self, exposure: VirtualExposure) -> Features:
+        """Detect keypoints on the variance-stabilised image, and keep the largest where it was seen."""
+        config = self._config
+        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        image, mask = stabilised_8_bit(exposure, blur_px)
+        options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+        options.sift.max_num_features = config.max_keypoints
+        options.sift.peak_threshold = config.peak_threshold / max(1.0, blur_px)
+        # A place with two orientations would be matched twice, and count twice.
+        options.sift.max_num_orientations = 1
+        # One for each call: the library does not promise that an extractor may be shared by threads.
+        extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        found, descriptors = extractor.extract_from_uint8_array(image)
+        places = np.array([(each.x, each.y, each.compute_scale()) for each in found], dtype=np.float64).reshape(-1, 3)
+        places[:, :2] -= CENTRE_OF_FIRST_PIXEL
+        x, y = (np.clip(np.rint(places[:, axis]).astype(np.intp), 0, image.shape[1 - axis] - 1) for axis in (0, 1))
+        # The library stops counting at the end of a scale, so there may be more than asked for.
+        largest = np.argsort(-places[:, 2], kind="stable")
+        kept = largest[mask[y, x][largest] > 0][: config.max_keypoints]
+        keypoints = [found[int(index)] for index in kept]
+        for keypoint in keypoints:
+            keypoint.x -= CENTRE_OF_FIRST_PIXEL
+            keypoint.y -= CENTRE_OF_FIRST_PIXEL
+        return Features(
+            points=places[kept, :2],
+            sizes=places[kept, 2],
+            keypoints=pycolmap.FeatureKeypoints(keypoints),
+            descriptors=pycolmap.FeatureDescriptors(descriptors.type, descriptors.data[kept]),
+            shape=(image.shape[0], image.shape[1]),
+        )
+
+    def register(self, moving: Features, fixed: Features, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+        """Match and fit; see `photonpano.Locator`.
+
+        Returns:
+            `NotLocated` with the numbers that decided when too few keypoints match or agree, when they leave the corners of the
+            frame uncertain, or when no camera moves like that.
+        """
+        if initial is not None:
+            motion = self._motion(moving, fixed, self._matched_nearby(moving, fixed, initial))
+            if isinstance(motion, Located):
+                return motion
+        # No motion is known yet, or it is further off than the search reaches.
+        return self._motion(moving, fixed, self._matched_everywhere(moving, fixed))
+
+    def _matcher(self) -> pycolmap.FeatureMatcher:
+        options = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+        options.sift.max_ratio = self._config.ratio
+        options.sift.cross_check = True
+        # The approximate one is no faster for so few keypoints.
+        options.sift.cpu_brute_force_matcher = True
+        return pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
+
+    def _matched_everywhere(self, moving: Features, fixed: Features) -> NDArray[np.intp]:
+        """Return the indices of matches: (K, 2)."""
+        pairs = self._matcher().match(moving.keypoints, moving.descriptors, fixed.keypoints, fixed.descriptors)
+        return np.asarray(pairs, np.intp).reshape(-1, 2)
+
+    def _matched_nearby(self, moving: Features, fixed: Features, initial: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return the indices of matches near where a motion puts them: (K, 2)."""
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.PLANAR
+        geometry.H = initial
+        # It must be given a camera, which plays no part where the geometry is a homography.
+        height, width = moving.shape
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.0, width, height)
+        first, second = ((each.keypoints, each.descriptors, camera) for each in (moving, fixed))
+        self._matcher().match_guided(self._config.search_px, *first, *second, geometry)
+        return np.asarray(geometry.inlier_matches, np.intp).reshape(-1, 2)
+
+    def _motion(self, moving: Features, fixed: Features, pairs: NDArray[np.intp]) -> Located | NotLocated:
+        """Find the homography that most pairs agree on, and fit it to these."""
+        config = self._config
+        limits = PointLimits(config.min_inliers, config.threshold_px, config.max_std_px)
+        counts = {"keypoints_moving": len(moving.points), "keypoints_fixed": len(fixed.points), "matches": len(pairs)}
+        evidence = {name: float(count) for name, count in counts.items()}
+        if len(pairs) < limits.min_inliers:
+            return NotLocated(
+                f"{len(pairs)} matches, fewer than min_inliers = {limits.min_inliers} "
+                f"({len(moving.points)} and {len(fixed.points)} keypoints)",
+                evidence,
+            )
+        here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
+        options = pycolmap.RANSACOptions(max_error=limits.threshold_px, max_num_trials=MAX_TRIALS, random_seed=self._seed)
+        consensus = pycolmap.estimate_homography_matrix(here, there, options)
+        if consensus is None or not consensus["H"][2, 2]:
+            return NotLocated(f"no motion explains any of {len(pairs)} matches", evidence)
+        start, sizes = normalised(consensus["H"]), moving.sizes[pairs[:, 0]]
+        return motion_from_points(here, there, start, moving.shape, limits, sizes=sizes, evidence=evidence)

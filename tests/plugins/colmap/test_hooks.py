@@ -1,0 +1,18 @@
+"""What is told of the plugin where its library is missing."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from photonpano import discover
+
+if TYPE_CHECKING:
+    import pytest
+
+
+def test_without_the_library_it_is_listed_and_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert discover().find("locator", "pycolmap-two-view").unavailable == (
+        "the locator 'pycolmap-two-view' needs pycolmap, which is not installed: pip install \"photonpano[colmap]\""
+    )
