@@ -26,7 +26,7 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
     """
     from photonpano.api import open_source
     from photonpano.cli.wording import capture_words
-    from photonpano.pipeline.components import foreseen_groups
+    from photonpano.pipeline.components import foreseen_groups, scale_of
     from photonpano.pipeline.pairs import pairs_of
     from photonpano.registry import discover
     from photonpano.spec import load_spec
@@ -37,13 +37,14 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
     with open_source(plan) as source:
         capture = capture_words(source.info)
         for number, groups in enumerate(foreseen_groups(plan, source), start=1):
+            scale = f"at scale {scale_of(plan, number, source.info.frame_shape):g}"
             if isinstance(groups, str):
-                predictions.append(f"level {number}: groups are {groups}")
+                predictions.append(f"level {number}: groups are {groups}; {scale}")
                 continue
             sizes = sorted({len(group.span) for group in groups})
             frames = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
             pairs = len(pairs_of(groups, plan.graph.skips))
-            predictions.append(f"level {number}: {len(groups)} groups of {frames} frames, {pairs} pairs")
+            predictions.append(f"level {number}: {len(groups)} groups of {frames} frames, {pairs} pairs, {scale}")
     if plan.until_converged:
         predictions = [f"up to {len(plan.levels)} levels, until the motion has settled", *predictions[:FORETOLD]]
         predictions.append("each further level: about twice the groups and pairs of the one before")

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from photonpano.spec.plan import Choice, Plan
     from photonpano.values import DecisionValue, Group
 
+HALVED_LEVELS = 2
+"""So many levels, at most, are located at half size unless the spec says otherwise."""
+LARGE_FRAME_PX = 192
+"""Smaller sides than this are not halved: a pyramid needs pixels."""
 ContextT = TypeVar("ContextT")
 ComponentT = TypeVar("ComponentT")
 
@@ -107,7 +111,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     return tuple(
         Level(
             number,
-            level.scale,
+            scale_of(plan, number, source.info.frame_shape),
             component(level.resample),
             component(level.merge),
             tuple(
@@ -119,6 +123,24 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
         )
         for number, level in enumerate(plan.levels, start=1)
     )
+
+
+def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:
+    """Return the scale of a level's exposures.
+
+    Where the spec leaves it open, the first two levels are located at half size, as long as frames are large and a later level
+    refines what they find: a quarter of the pixels tells nearly as much of motion that is still known to a pixel or so.
+
+    Args:
+        plan: which levels there are.
+        number: of the level, from 1.
+        frame_shape: (height, width) of a frame.
+    """
+    scale = plan.levels[number - 1].scale
+    if scale != "auto":
+        return scale
+    refined = number <= HALVED_LEVELS and number < len(plan.levels)
+    return 0.5 if refined and min(frame_shape) >= LARGE_FRAME_PX else 1.0
 
 
 def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]:

@@ -97,7 +97,8 @@ def estimate_motion(
         progress.note(_summary(results[-1]))
         observers.level_finished(results[-1])
         known = trajectory
-        if until_converged and results[-1].converged:
+        # What was located at half size only prepares for what is not.
+        if until_converged and results[-1].converged and level.scale == levels[-1].scale:
             break
     return results
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -43,7 +43,7 @@ class Choice(Generic[ContributionT]):
 
 @dataclass(frozen=True, slots=True)
 class LevelPlan:
-    """The components of one level, and the scale of its exposures (pixels per pixel of a frame).
+    """The components of one level, and the scale of its exposures (pixels per pixel of a frame, or auto).
 
     Pairs that `locate` loses are offered to the `fallbacks`, in order.
     """
@@ -53,7 +53,7 @@ class LevelPlan:
     locate: Choice[LocatorContribution[Any]]
     fallbacks: tuple[Choice[LocatorContribution[Any]], ...]
     interpolate: Choice[InterpolatorContribution[Any]]
-    scale: float
+    scale: float | Literal["auto"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,11 @@ from photonpano.contributions import Config, SpecPath
 class LevelSettings(Config):
     """What a level says of itself, beside the stages that it overrides."""
 
-    scale: float = Field(1.0, ge=0.05, le=4, description="pixels of the level's exposures per pixel of a frame")
+    scale: Literal["auto"] | Annotated[float, Field(ge=0.05, le=4)] = Field(
+        "auto",
+        description="pixels of the level's exposures per pixel of a frame; auto takes 0.5 at the first two levels, which later "
+        "ones refine, and 1 at the last, at any further one, and where frames are small",
+    )
 
 
 class GraphSettings(Config):

@@ -109,9 +109,9 @@ def test_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> Non
     comments = printed.partition("levels: until-converged")[0].splitlines()[-5:]
     assert comments == [
         "# up to 8 levels, until the motion has settled",
-        "# level 1: 4 groups of 50 frames, 5 pairs",
-        "# level 2: 9 groups of 25 to 50 frames, 20 pairs",
-        "# level 3: 17 groups of 12 to 50 frames, 54 pairs",
+        "# level 1: 4 groups of 50 frames, 5 pairs, at scale 1",
+        "# level 2: 9 groups of 25 to 50 frames, 20 pairs, at scale 1",
+        "# level 3: 17 groups of 12 to 50 frames, 54 pairs, at scale 1",
         "# each further level: about twice the groups and pairs of the one before",
     ]
     assert parse_spec(printed).document == load_spec("capture.yaml", ["levels=until-converged"]).document
@@ -122,7 +122,7 @@ def test_what_depends_on_the_frames_is_left_open(folder: Path, invoke: Callable[
     check = invoke("check", *arguments).stdout.splitlines()
     assert check[1:] == ["groups are chosen from flux and speed when the capture is read"]
     printed = invoke("explain", *arguments).stdout
-    assert "  # level 1: groups are chosen from flux and speed when the capture is read\n" in printed
+    assert "  # level 1: groups are chosen from flux and speed when the capture is read; at scale 1\n" in printed
     assert "    group_size: auto  # --set\n" in printed
     assert parse_spec(printed).document == load_spec("capture.yaml", arguments[2:]).document
 
@@ -152,8 +152,8 @@ def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[...,
     assert "max_iterations: 7" in lines
     assert "seed: 3  # --set" in lines
     assert f"directory: {folder}/runs/capture  # default" in lines
-    assert "# level 1: 4 groups of 50 frames, 5 pairs" in lines
-    assert "# level 2: 9 groups of 25 to 50 frames, 20 pairs" in lines
+    assert "# level 1: 4 groups of 50 frames, 5 pairs, at scale 1" in lines
+    assert "# level 2: 9 groups of 25 to 50 frames, 20 pairs, at scale 1" in lines
 
 
 def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder: Path, invoke: Callable[..., Any]) -> None:

@@ -22,7 +22,7 @@ from photonpano import (
     StageContext,
     StreamInfo,
 )
-from photonpano.pipeline.components import build_levels, build_source, foreseen_groups
+from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.registry import Catalog
 from photonpano.registry.catalog import make_entry
 from photonpano.spec import Plan, parse_spec
@@ -178,3 +178,18 @@ def test_the_response_reaches_every_stage() -> None:
     stages: list[Any] = [level.resampler, level.merger, level.locators[0].component, level.interpolator]
     responses: set[Response] = {stage.context.response for stage in stages}
     assert responses == {source.response}
+
+
+@pytest.mark.parametrize(
+    ("levels", "shape", "scales"),
+    [
+        (1, (254, 496), [1]),
+        (2, (254, 496), [0.5, 1]),
+        (4, (254, 496), [0.5, 0.5, 1, 1]),
+        (3, (191, 496), [1, 1, 1]),
+        ([{"scale": 2}, {}, {}], (254, 496), [2, 0.5, 1]),
+    ],
+)
+def test_levels_that_later_ones_refine_are_located_at_half_size(levels: Any, shape: tuple[int, int], scales: list[float]) -> None:
+    plan = parse_spec({"version": 1, "source": {"use": "simulator"}, "levels": levels})
+    assert [scale_of(plan, number, shape) for number in range(1, len(scales) + 1)] == scales

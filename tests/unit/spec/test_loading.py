@@ -28,12 +28,12 @@ def test_minimal_spec_is_complete(catalog):
     assert names == ["midpoint", "photon-mle", "direct", "smoothing-spline"]
     assert [choice.contribution.name for choice in level.fallbacks] == ["opencv-sift"]
     assert (plan.source.plugin, plan.source.version) == ("photonpano", "0.1.0")
-    assert {level.scale for level in plan.levels} == {1.0}
+    assert {level.scale for level in plan.levels} == {"auto"}
 
 
 def test_levels_without_overrides_share_their_choices(catalog):
     plan = parse_spec(MINIMAL | {"levels": [{"scale": 0.5}, {}]}, catalog=catalog)
-    assert [level.scale for level in plan.levels] == [0.5, 1.0]
+    assert [level.scale for level in plan.levels] == [0.5, "auto"]
     assert plan.levels[0].locate is plan.levels[1].locate
 
 
