@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from photonpano.cli.arguments import Overrides, Spec
 
 if TYPE_CHECKING:
+    from photonpano.protocols import Source
     from photonpano.registry import Catalog
     from photonpano.spec import Plan
 
@@ -16,7 +17,13 @@ FORETOLD = 3
 """How many levels are described of a plan whose number of levels is open."""
 
 
-def explain(spec: Spec, overrides: Overrides = None) -> None:
+def explain(
+    spec: Spec,
+    overrides: Overrides = None,
+    forecast: Annotated[
+        bool, typer.Option("--forecast", help="Try the middle of the capture, and predict time and memory of the run.")
+    ] = False,
+) -> None:
     """Print a spec as it will run, with all defaults.
 
     The output is a spec itself. Its comments say which plugin gives each stage, what is a default, and how many groups and
@@ -45,11 +52,33 @@ def explain(spec: Spec, overrides: Overrides = None) -> None:
             frames = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
             pairs = len(pairs_of(groups, plan.graph.skips))
             predictions.append(f"level {number}: {len(groups)} groups of {frames} frames, {pairs} pairs, {scale}")
+        expected = _forecast(plan, source) if forecast else []
     if plan.until_converged:
         predictions = [f"up to {len(plan.levels)} levels, until the motion has settled", *predictions[:FORETOLD]]
         predictions.append("each further level: about twice the groups and pairs of the one before")
     typer.echo(f"# {spec} as it will run, on {capture}")
     typer.echo("\n".join(_Writer(plan, catalog, predictions).lines()))
+    for line in expected:
+        typer.echo(f"# {line}")
+
+
+def _forecast(plan: "Plan", source: "Source") -> list[str]:
+    """Return what a run is expected to take, or why the trial failed."""
+    from photonpano.errors import PhotonpanoError
+    from photonpano.pipeline.forecast import forecast
+    from photonpano.report.wording import duration, memory
+
+    try:
+        found = forecast(plan, source)
+    except PhotonpanoError as error:
+        return ["the trial in the middle of the capture failed, as the run may:", *str(error).splitlines()]
+    threads = "1 thread" if found.threads == 1 else f"{found.threads} threads"
+    each = ", ".join(f"{name}: {duration(seconds)}" for name, seconds in found.seconds.items())
+    height, width = found.canvas
+    return [
+        f"forecast from a trial on {found.tried}: about {duration(sum(found.seconds.values()))} with {threads} ({each})",
+        f"memory: about {memory(found.memory_bytes)}, for a panorama of about {width} x {height} px if no place is seen twice",
+    ]
 
 
 class _Writer:

@@ -137,6 +137,20 @@ def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) 
     assert parse_spec(result.stdout).document == expected
 
 
+def test_explain_forecasts_time_and_memory(folder: Path, invoke: Callable[..., Any]) -> None:
+    lines = invoke("explain", "capture.yaml", "--forecast", "--set", "resample.with.group_size=10").stdout.splitlines()
+    assert re.fullmatch(r"# forecast from a trial on frames 40 to 159: about .* with \d+ threads? \(level 1: .*\)", lines[-2])
+    assert re.fullmatch(r"# memory: about .* MiB, for a panorama of about \d+ x \d+ px if no place is seen twice", lines[-1])
+
+
+def test_a_trial_that_fails_says_why(folder: Path, invoke: Callable[..., Any]) -> None:
+    dark = ("--set", "source.with.flux=1e-6", "--set", "resample.with.group_size=10")
+    lines = invoke("explain", "capture.yaml", "--forecast", *dark).stdout.splitlines()
+    start = lines.index("# the trial in the middle of the capture failed, as the run may:")
+    assert "level 1" in lines[start + 1]
+    assert all(line.startswith("# ") for line in lines[start:])
+
+
 def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
     changed = "locate: {with: {max_iterations: 7}}\nlevels: [{locate: {}}, {}]"
     spec = (folder / "capture.yaml").read_text().replace("levels: 1", changed)

@@ -190,6 +190,8 @@ def test_the_response_reaches_every_stage() -> None:
         ([{"scale": 2}, {}, {}], (254, 496), [2, 0.5, 1]),
     ],
 )
-def test_levels_that_later_ones_refine_are_located_at_half_size(levels: Any, shape: tuple[int, int], scales: list[float]) -> None:
+def test_levels_that_later_ones_refine_are_located_at_half_size(
+    levels: Any, shape: tuple[int, int], scales: list[float]
+) -> None:
     plan = parse_spec({"version": 1, "source": {"use": "simulator"}, "levels": levels})
     assert [scale_of(plan, number, shape) for number in range(1, len(scales) + 1)] == scales

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError
+from photonpano.pipeline.components import build_source
+from photonpano.pipeline.forecast import TRIAL_GROUPS, PartOfSource, forecast
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from photonpano.testing import MemorySource
+
+
+def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[MemorySource]) -> None:
+    frames = np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8)
+    part = PartOfSource(memory_source(frames), FrameSpan(2, 7))
+    assert part.info.n_frames == 5
+    np.testing.assert_array_equal(part.counts(FrameSpan(1, 4)), frames[3:6].sum(axis=0))
+    np.testing.assert_array_equal(part.frames(FrameSpan(0, 5)), frames[2:7])
+    with pytest.raises(InputError, match="the capture has 5 frames"):
+        part.counts(FrameSpan(3, 6))
+
+
+def test_a_trial_tells_time_memory_and_canvas(small_spec: dict[str, Any]) -> None:
+    plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 20}}, "levels": 2})
+    with build_source(plan) as source:
+        found = forecast(plan, source)
+        n_frames = source.info.n_frames
+    assert len(found.tried) == 20 * TRIAL_GROUPS < n_frames
+    assert abs(found.tried.centre - (n_frames - 1) / 2) <= 1
+    assert set(found.seconds) == {"level 1", "level 2", "panorama"}
+    assert min(found.seconds.values()) > 0
+    assert found.memory_bytes > 30 * 2**20
+    # The camera pans by 60 px over the capture, and trembles.
+    assert 190 < found.canvas[1] < 290
+    assert 128 <= found.canvas[0] < 220
