@@ -47,7 +47,11 @@ class RenderSettings(Config):
         "middle", description="the frame whose plane the panorama lies in: first, middle, last, or a frame index"
     )
     tolerance_px: float = Field(
-        0.25, gt=0, le=8, description="frames are summed before they are warped while they move less than this, in px"
+        0.125,
+        gt=0,
+        le=8,
+        description="frames are summed before they are warped while they move less than this, in px; 0.25 costs 0.07 dB of a "
+        "sharp scene in good light, and half the time",
     )
     white_quantile: float = Field(0.995, gt=0, le=1, description="the quantile of flux that becomes white in panorama.png")
 
