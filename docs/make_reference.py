@@ -101,7 +101,7 @@ def command(names: Sequence[str]) -> str:
         default = parameter.default if isinstance(parameter.default, bool) and parameter.secondary_opts else None
         remark = "" if default is None else f" Default: `{flags[0] if default else flags[1]}`."
         rows.append([", ".join(f"`{flag}`" for flag in flags), f"{parameter.help}{remark}"])
-    return table(["Argument or option", "Meaning"], rows)
+    return table(["Argument or option", "Meaning"], rows) if rows else "It takes no arguments."
 
 
 def hook(name: str) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numba
+from numba.core import event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 Function = TypeVar("Function", bound="Callable[..., object]")
 
@@ -23,6 +25,33 @@ def compiled(function: Function) -> Function:
         return cast("Function", _jit(True)(function))
     except RuntimeError:  # nowhere to keep it: neither beside the module nor in a home
         return cast("Function", _jit(False)(function))
+
+
+@contextmanager
+def told_once(tell: Callable[[], None]) -> Iterator[None]:
+    """Call `tell` if something is compiled within the block that is not on the disk yet, before the first of it."""
+    listener = _Once(tell)
+    register: Callable[[str, object], None] = event.register
+    unregister: Callable[[str, object], None] = event.unregister
+    register("numba:compile", listener)
+    try:
+        yield
+    finally:
+        unregister("numba:compile", listener)
+
+
+class _Once(event.Listener):
+    def __init__(self, tell: Callable[[], None]) -> None:
+        self._tell: Callable[[], None] | None = tell
+
+    def on_start(self, event: object) -> None:
+        del event
+        if self._tell is not None:
+            tell, self._tell = self._tell, None
+            tell()
+
+    def on_end(self, event: object) -> None:
+        del event
 
 
 def _jit(cache: bool) -> Callable[[Function], object]:

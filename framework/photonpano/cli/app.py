@@ -15,6 +15,7 @@ from photonpano.cli.plugins import plugins
 from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
+from photonpano.cli.warm_up import warm_up
 
 
 class _Commands(TyperGroup):
@@ -35,7 +36,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, explain, simulate, evaluate, schema):
+for command in (run, check, explain, simulate, evaluate, schema, warm_up):
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

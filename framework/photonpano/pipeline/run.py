@@ -5,10 +5,12 @@ from __future__ import annotations
 import datetime
 import time
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from photonpano.compiling import told_once
 from photonpano.errors import InputError
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_levels, origin_of
@@ -43,6 +45,9 @@ if TYPE_CHECKING:
 
 _PROBES = 16
 _PROBE_FRAMES = 16
+
+
+COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +97,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
         raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
     decisions: list[Decision] = []
     levels = build_levels(plan, source, decisions)
-    with one_thread_inside():
+    with one_thread_inside(), told_once(partial(progress.note, COMPILING)):
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged, observers)
     if plan.until_converged:
         decisions.append(levels_decision(results))

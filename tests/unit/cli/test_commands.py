@@ -190,6 +190,10 @@ def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder
     assert "    - use: direct  # photonpano 0.1.0, --set\n" in named
 
 
+def test_warm_up_says_when_it_is_done(invoke: Callable[..., Any]) -> None:
+    assert re.fullmatch(r"ready, after \d+ s\n", invoke("warm-up").stdout)
+
+
 def test_schema(folder: Path, invoke: Callable[..., Any]) -> None:
     printed = json.loads(invoke("schema").stdout)
     assert {"version", "source", "levels"} <= set(printed["properties"])

@@ -50,6 +50,7 @@ def test_there_are_these_commands() -> None:
         "simulate",
         "evaluate",
         "schema",
+        "warm-up",
         "plugins list",
         "plugins show",
     }
