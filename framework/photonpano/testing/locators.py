@@ -98,8 +98,8 @@ class LocatorConformance(StageConformance):
         found = self.registered(*pair(motion, self.shape), initial)
         assert isinstance(found, Located | NotLocated), f"register() returns Located or NotLocated, got {found!r:.80}"
         assert isinstance(found, Located), (
-            f"a {motion} {_started(initial)} must be found, at {self._error(STILL, MOTIONS[motion]):.1f} px on average; the locator "
-            f"says NotLocated: {found.reason}"
+            f"a {motion} {_started(initial)} must be found, at {self._error(STILL, MOTIONS[motion]):.1f} px on average; "
+            f"the locator says NotLocated: {found.reason}"
         )
         return found
 

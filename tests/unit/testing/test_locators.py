@@ -257,6 +257,6 @@ def test_what_finds_no_motion_is_held_to_the_rest_if_it_says_so(complaint):
     check = "test_the_map_is_a_homography_with_h33_of_1"
     with pytest.raises(pytest.skip.Exception, match="motions"):
         complaint(LocatorConformance, check, Unscaled, motions=())
-    assert (
-        complaint(LocatorConformance, "test_two_places_that_differ_are_not_located", Honest, motions=(), shape=(48, 64)) is None
-    )
+    check = "test_two_places_that_differ_are_not_located"
+    assert complaint(LocatorConformance, check, Honest, motions=(), shape=(48, 64)) is None
+    assert "must not be located" in complaint(LocatorConformance, check, StandsStill, motions=(), shape=(48, 64))
