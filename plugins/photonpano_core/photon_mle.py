@@ -11,6 +11,7 @@ import numpy as np
 from photonpano import VirtualExposure
 from photonpano.geometry import inverse, rescaling
 from photonpano.merging import Chunk, SharedCounts, accumulate, chunks_of, clipped
+from photonpano_core.exposures import scaled_shape
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,7 +45,7 @@ class PhotonMleMerger:
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge a group; see `photonpano.Merger`."""
-        shape = _scaled_shape(source.info.frame_shape, scale)
+        shape = scaled_shape(source.info.frame_shape, scale)
         if trajectory is None or not self._config.compensate:
             still = Chunk(group.span, np.eye(3))
             photons = accumulate(source, [still], rescaling(scale), shape)
@@ -83,8 +84,3 @@ class _Along:
     trajectory: Trajectory
     chunks: tuple[Chunk, ...]
     counts: SharedCounts
-
-
-def _scaled_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
-    height, width = shape
-    return max(1, round(height * scale)), max(1, round(width * scale))

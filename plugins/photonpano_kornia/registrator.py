@@ -164,7 +164,8 @@ class _Descent:
             [q],
             max_iter=max_iterations,
             tolerance_grad=0,
-            tolerance_change=tolerance_px / self._corner_px(basis.cpu().numpy()),
+            # torch compares the same number with how much a step would lower the loss, which is the square of its length.
+            tolerance_change=(tolerance_px / self._corner_px(basis.cpu().numpy())) ** 2,
             line_search_fn="strong_wolfe",
         )
 

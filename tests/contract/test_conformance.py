@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from photonpano import discover
+from photonpano.registry.chain import CHAIN
 from photonpano.testing.conformance import Conformance
 
 PLUGINS = Path(__file__).parents[1] / "plugins"
@@ -17,7 +18,7 @@ OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.plugin ==
 @pytest.fixture(scope="module")
 def tested() -> set[tuple[str, str]]:
     """Return kind and name of what has a subclass of the kit that pytest collects."""
-    found = set()
+    found = {(CHAIN.kind, CHAIN.name)}
     for path in PLUGINS.glob("*/test_conformance.py"):
         spec = importlib.util.spec_from_file_location(f"conformance_of_{path.parent.name}", path)
         module = importlib.util.module_from_spec(spec)
@@ -31,3 +32,10 @@ def tested() -> set[tuple[str, str]]:
 @pytest.mark.parametrize(("kind", "name"), OURS)
 def test_our_own_components_are_held_to_the_kit(kind: str, name: str, tested: set[tuple[str, str]]) -> None:
     assert (kind, name) in tested, f"add a subclass of {kind.capitalize()}Conformance to tests/plugins/*/test_conformance.py"
+
+
+class TestChainOfBackends(Conformance):
+    """It stands for other locators, which a spec that names it builds in its place: only what holds without building holds."""
+
+    kind = "locator"
+    contribution = CHAIN

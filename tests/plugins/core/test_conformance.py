@@ -36,8 +36,31 @@ class TestMidpointAuto(TestMidpoint):
     config = {}
 
 
-class TestConstantNumber(TestMidpoint):
-    config = {"group_size": 100, "densify": False, "endpoints": False}
+class TestStratified(ResamplerConformance):
+    contribution = CATALOG.find("resampler", "stratified").contribution
+    config = {"group_size": 100}
+
+
+class TestStratifiedAuto(TestStratified):
+    config = {}
+
+
+class TestSlidingWindow(ResamplerConformance):
+    contribution = CATALOG.find("resampler", "sliding-window").contribution
+    config = {"group_size": 100}
+
+
+class TestSlidingWindowAuto(TestSlidingWindow):
+    config = {}
+
+
+class TestConstantGroups(ResamplerConformance):
+    contribution = CATALOG.find("resampler", "constant-groups").contribution
+    config = {"group_size": 100}
+
+
+class TestConstantGroupsAuto(TestConstantGroups):
+    config = {}
 
 
 class TestPhotonMle(MergerConformance):
@@ -48,6 +71,14 @@ class TestPhotonMle(MergerConformance):
 class TestNaiveAverage(TestPhotonMle):
     config = {"compensate": False}
     compensates = False
+
+
+class TestRobustMerge(MergerConformance):
+    contribution = CATALOG.find("merger", "robust-merge").contribution
+
+
+class TestSplat(MergerConformance):
+    contribution = CATALOG.find("merger", "splat").contribution
 
 
 class TestLucasKanade(InterpolatorConformance):

@@ -16,3 +16,22 @@ class TestOpencvSift(LocatorConformance):
 class TestDirect(LocatorConformance):
     contribution = CATALOG.find("locator", "direct").contribution
     tolerance_px = 0.1
+
+
+class TestOpencvEcc(LocatorConformance):
+    contribution = CATALOG.find("locator", "opencv-ecc").contribution
+    tolerance_px = 0.1
+
+
+class TestOpencvOrb(LocatorConformance):
+    contribution = CATALOG.find("locator", "opencv-orb").contribution
+    tolerance_px = 0.8
+
+
+class TestPhaseCorrelation(LocatorConformance):
+    contribution = CATALOG.find("locator", "phase-correlation").contribution
+    tolerance_px = 0.1
+    motions = ("sub-pixel shift", "shift")
+    free = (4, 5)
+    # Frequencies count alike, also those that hold little but noise: a fifth as exact as the photons would allow.
+    information_factor = 8.0

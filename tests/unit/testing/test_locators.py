@@ -101,6 +101,15 @@ class Boasts(Honest):
         return replace(found, information=found.information * 1e4)
 
 
+class LeavesSixAlone(Honest):
+    """Finds shifts, and says that the other six may be anything that cameras do."""
+
+    def changed(self, found):
+        information = np.zeros((8, 8))
+        information[4:6, 4:6] = np.linalg.inv(np.linalg.inv(found.information)[4:6, 4:6])
+        return replace(found, homography=translation(*found.homography[:2, 2]), information=information + 1e3 * np.eye(8))
+
+
 class Covariance(Honest):
     """Gives the covariance in place of its inverse."""
 
@@ -235,3 +244,19 @@ def test_what_needs_a_start_passes_if_it_says_so(complaint):
 def test_what_finds_shifts_alone_passes_if_it_says_so(complaint):
     check = "test_a_known_motion_is_found"
     assert complaint(LocatorConformance, check, ShiftsAlone, motions=("shift",), tolerance_px=1.0) is None
+
+
+def test_what_estimates_a_few_parameters_answers_for_these_if_it_says_so(complaint):
+    check = "test_information_is_the_inverse_covariance_of_what_was_found"
+    assert "and it predicts" in str(complaint(LocatorConformance, check, LeavesSixAlone, motions=("shift",)))
+    assert complaint(LocatorConformance, check, LeavesSixAlone, motions=("shift",), free=(4, 5)) is None
+    assert "and it predicts" in str(complaint(LocatorConformance, check, Boasts, motions=("shift",), free=(4, 5)))
+
+
+def test_what_finds_no_motion_is_held_to_the_rest_if_it_says_so(complaint):
+    check = "test_the_map_is_a_homography_with_h33_of_1"
+    with pytest.raises(pytest.skip.Exception, match="motions"):
+        complaint(LocatorConformance, check, Unscaled, motions=())
+    check = "test_two_places_that_differ_are_not_located"
+    assert complaint(LocatorConformance, check, Honest, motions=(), shape=(48, 64)) is None
+    assert "must not be located" in complaint(LocatorConformance, check, StandsStill, motions=(), shape=(48, 64))
