@@ -8,7 +8,7 @@ from importlib.metadata import version as version_of
 
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
-from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, make_entry, ordered
+from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, make_entry, ordered
 from photonpano.registry.chain import CHAIN
 from photonpano.registry.observers import Observer
 from photonpano.registry.plugins import contributions_of, observation_of
