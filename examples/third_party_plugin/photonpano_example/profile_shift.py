@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated, VirtualExposure
-from photonpano.geometry import normalised, translation
+from photonpano.geometry import apply, translation
 from photonpano.locating import ImageLimits, View, motion_from_images, view_of
 from photonpano_example.profiles import offset, profile
 
@@ -26,15 +26,17 @@ class ProfileShift:
         return view_of(exposure, self.blur_px)
 
     def register(self, moving: View, fixed: View, initial: NDArray[np.float64] | None) -> Located | NotLocated:
-        """Shift `moving` onto `fixed`, from where `initial` puts it; see `photonpano.Locator`."""
-        homography = np.eye(3) if initial is None else initial
+        """Shift `moving` onto `fixed`, from where `initial` puts its middle; see `photonpano.Locator`."""
+        middle = (np.array([moving.shape[::-1]]) - 1) / 2
+        x, y = (0.0, 0.0) if initial is None else (apply(initial, middle) - middle)[0]
         furthest = int(self.reach * max(moving.shape))
         for _ in range(ROUNDS):
-            there = fixed.seen_from(homography)
+            there = fixed.seen_from(translation(x, y))
             both = moving.seen & there.seen
-            x, y = (offset(profile(moving.image, both, axis), profile(there.image, both, axis), furthest) for axis in (0, 1))
-            homography = normalised(homography @ translation(x, y))
-            furthest = NEAR_PX
-            if max(abs(x), abs(y)) < CONVERGED_PX:
+            right, down = (
+                offset(profile(moving.image, both, axis), profile(there.image, both, axis), furthest) for axis in (0, 1)
+            )
+            x, y, furthest = x + right, y + down, NEAR_PX
+            if max(abs(right), abs(down)) < CONVERGED_PX:
                 break
-        return motion_from_images(moving, fixed, homography, ImageLimits(), free=TRANSLATION)
+        return motion_from_images(moving, fixed, translation(x, y), ImageLimits(), free=TRANSLATION)
