@@ -5,7 +5,8 @@ A plugin is a module with these hooks, named in the entry-point group `photonpan
     [project.entry-points.photonpano]
     my-plugin = "my_plugin.hooks"
 
-The hook module imports no heavy library; the component does so when it is built.
+The hook module imports no heavy library; the component does so when it is built. `examples/third_party_plugin` is such a
+distribution, and `docs/tutorial/first-plugin.md` writes it step by step.
 """
 
 from __future__ import annotations
@@ -66,11 +67,13 @@ def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[
 
     Example:
         ```python
-        from photonpano import Config, FrameSpan, Group, ResamplerContribution, hookimpl
+        from photonpano import Config, FrameSpan, Group, InputError, ResamplerContribution, hookimpl
 
 
         class Halves:
             def groups(self, n_frames, level):
+                if n_frames < 2:
+                    raise InputError("a capture of one frame has no halves")
                 half = n_frames // 2
                 spans = (FrameSpan(0, half), FrameSpan(half, n_frames))
                 return tuple(Group(span, span.centre) for span in spans)
@@ -87,6 +90,7 @@ def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[
                 summary="Two groups, whatever the level",
                 config=HalvesConfig,
                 build=lambda config, context: Halves(),
+                check=lambda config, stream: ["a capture of one frame has no halves"] if stream.n_frames < 2 else [],
             )
         ```
     """

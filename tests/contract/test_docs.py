@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "pipelines" / "README.md"]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "examples").glob("*/README.md"))]
 REFERENCE = ROOT / "docs" / "reference"
 BLOCK = re.compile(
     r"(?:^<!-- (?P<marker>(?:test|file):[^\n]*?) *-->\n+)?^```(?P<language>\w+)\n(?P<text>.*?)^```$"
@@ -103,11 +103,16 @@ def workplace(tmp_path, monkeypatch) -> Path:
     """A folder of its own, from which modules are imported and plugins discovered."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    modules = set(sys.modules)
     yield tmp_path
-    for name in set(sys.modules) - modules:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
+    forget_modules(tmp_path)
+
+
+def forget_modules(folder: Path) -> None:
+    """Have the modules of a folder imported anew."""
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", "")).startswith(str(folder)):
             del sys.modules[name]
+    importlib.invalidate_caches()
 
 
 class Reader:
@@ -122,7 +127,7 @@ class Reader:
             path = self.workplace / file
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(block.text, encoding="utf-8")
-            importlib.invalidate_caches()
+            forget_modules(self.workplace)
         if block.language == "yaml":
             self.check_spec(block)
         elif block.language == "python" and not file:
@@ -238,6 +243,17 @@ def test_links_and_pictures_exist(page):
 def slug(heading: str) -> str:
     """Return the anchor that GitHub gives a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_the_tutorial_of_a_plugin_ends_with_the_example():
+    """Blocks that are files of the example, in their last state, are those files; and none is missing but the README."""
+    example = ROOT / "examples" / "third_party_plugin"
+    written = {}
+    for block in blocks_of(ROOT / "docs" / "tutorial" / "first-plugin.md"):
+        if file := block.argument("file:"):
+            written[file] = block.text
+    kept = [path for pattern in ("*.toml", "*.yaml", "*/*.py") for path in example.glob(pattern)]
+    assert written == {path.relative_to(example).as_posix(): path.read_text(encoding="utf-8") for path in kept}
 
 
 def test_every_page_can_be_reached_from_the_index():

@@ -15,6 +15,7 @@ from photonpano import FrameSpan, Group, PluginError, api, hookspecs, registry
 from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.spec import parse_spec
+from photonpano.testing import ResamplerConformance
 
 HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}
 KINDS = {
@@ -110,6 +111,13 @@ def test_the_example_of_a_resampler_gives_two_groups() -> None:
     (contribution,) = contributions_of(example_of("photonpano_resamplers"))
     groups = contribution.build(contribution.config(), None).groups(100, 1)
     assert [str(group) for group in groups] == ["frames 0 to 49", "frames 50 to 99"]
+
+
+class TestHalves(ResamplerConformance):
+    """The example of a resampler keeps what resamplers promise, also for a capture of one frame."""
+
+    contribution = contributions_of(example_of("photonpano_resamplers"))[0]
+    hook_module = "photonpano.hookspecs"
 
 
 def test_the_example_of_a_locator_finds_nothing_and_says_so() -> None:

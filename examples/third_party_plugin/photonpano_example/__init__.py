@@ -1,0 +1,1 @@
+"""A plugin for photonpano: a merger and a locator."""
