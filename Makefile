@@ -34,7 +34,7 @@ test: $(INSTALLED)
 	$(STEP) 'import-linter'
 	@$(BIN)/lint-imports --no-logo
 	$(STEP) 'pytest'
-	@$(BIN)/pytest
+	@$(BIN)/pytest -n auto
 
 demo: $(INSTALLED)
 	@mkdir -p demo

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 SHAPE = (254, 496)
 PX_A_FRAME = 0.02
 GROUP_SIZE = 500
+BLOCK_BYTES = 2**20
 THREADS = 2
 PROGRAM = [sys.executable, "-c", "from photonpano.cli import main; main()"]
 
@@ -93,6 +95,19 @@ def sums(cube: Path) -> list[str]:
             naive = length * frame_bytes / 1e9 / seconds(unpacked)
             rows.append(f"| {length} | {naive:.2f} GB/s | {rates[0]:.1f} GB/s | {rates[1]:.1f} GB/s |")
     return rows
+
+
+def reading(cube: Path) -> float:
+    """Return the rate of nothing but reading a cube from the page cache by all threads, bytes a second: the physical limit."""
+    size = cube.stat().st_size
+    blocks = range(size // BLOCK_BYTES)
+
+    def read(index: int) -> object:
+        buffer = bytearray(BLOCK_BYTES)
+        with cube.open("rb", buffering=0) as file:
+            return os.preadv(file.fileno(), [buffer], index * BLOCK_BYTES)
+
+    return len(blocks) * BLOCK_BYTES / seconds(partial(spread, read, blocks, THREADS))
 
 
 def warped_one_by_one(source: Source, span: FrameSpan, to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,8 +192,8 @@ def stages(record: dict[str, Any]) -> dict[str, float]:
     return found
 
 
-def runs(records: dict[int, dict[str, Any]]) -> list[str]:
-    """Return the rows of the table of whole runs."""
+def runs(records: dict[int, dict[str, Any]], rate: float) -> list[str]:
+    """Return the rows of the table of whole runs, and what they are to be compared with: reading, in bytes a second."""
     rows = [
         "| Frames | Whole | merge | locate | panorama | other | Peak memory | Mean error |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -191,6 +206,14 @@ def runs(records: dict[int, dict[str, Any]]) -> list[str]:
             f"| {n_frames:,} | {record['seconds']:.0f} s | {shares} | {other:.1f} s | "
             f"{record['peak_memory_bytes'] / 2**20:.0f} MiB | {record['scores']['corner_error_px']['mean']:.3f} px |"
         )
+    longest = max(records)
+    passes = len(records[longest]["levels"]) + 1
+    once = longest * SHAPE[0] * SHAPE[1] / 8 / rate
+    rows.append(
+        f"\nTo read the frames once in each of {passes} passes, {passes - 1} levels and the panorama, "
+        f"takes {passes * once:.1f} s of {longest:,} frames ({rate / 1e9:.1f} GB/s, two threads, from the page cache): "
+        f"the run takes {records[longest]['seconds'] / passes / once:.0f} times that."
+    )
     if len(records) > 1:
         exponent = np.polyfit(np.log(list(records)), np.log([record["seconds"] for record in records.values()]), 1)[0]
         rows.append(f"\nTime grows with the number of frames to the power of {exponent:.2f}.")
@@ -222,16 +245,18 @@ def main() -> None:
     page: Path = arguments.page
     records: dict[int, dict[str, Any]] = {}
     tables: dict[str, list[str]] = {}
+    rate = 0.0
     with tempfile.TemporaryDirectory() as folder:
         for n_frames in arguments.frames:
             cube = simulate(Path(folder), n_frames)
             if not tables:
                 cv2.setNumThreads(1)
                 tables |= {"sums": sums(cube), "merging": merging(cube)}
+                rate = reading(cube)
             records[n_frames] = whole(cube)
             print(n_frames, f"{records[n_frames]['seconds']:.0f} s", file=sys.stderr, flush=True)
             cube.unlink()
-    tables["runs"] = runs(records)
+    tables["runs"] = runs(records, rate)
     text = page.read_text(encoding="utf-8")
     for name, rows in tables.items():
         begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"

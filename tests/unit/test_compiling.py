@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from photonpano.compiling import compiled, told_once
+from photonpano.compiling import _jit, told_once
 
 
 def test_what_is_compiled_is_told_once() -> None:
-    @compiled
+    @_jit(cache=False)
     def twice(values: np.ndarray) -> np.ndarray:
         return values * 2
 
