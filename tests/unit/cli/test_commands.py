@@ -140,7 +140,7 @@ def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) 
 def test_explain_forecasts_time_and_memory(folder: Path, invoke: Callable[..., Any]) -> None:
     lines = invoke("explain", "capture.yaml", "--forecast", "--set", "resample.with.group_size=10").stdout.splitlines()
     assert re.fullmatch(r"# forecast from a trial on frames 40 to 159: about .* with \d+ threads? \(level 1: .*\)", lines[-2])
-    assert re.fullmatch(r"# memory: about .* MiB, for a panorama of about \d+ x \d+ px if no place is seen twice", lines[-1])
+    assert re.fullmatch(r"# memory: about .* [MG]iB, for a panorama of about \d+ x \d+ px if no place is seen twice", lines[-1])
 
 
 def test_a_trial_that_fails_says_why(folder: Path, invoke: Callable[..., Any]) -> None:
