@@ -7,7 +7,7 @@ used here.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ from photonpano.locating import ImageLimits, blur_against_noise, motion_from_ima
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from photonpano import VirtualExposure
@@ -222,9 +224,8 @@ class _Descent:
 
 def _shifted(moving: View, fixed: View) -> NDArray[np.float64]:
     """Return the shift between two images by masked cross-correlation (Padfield 2012), in px of the finest layer."""
-    (down, right), *_ = phase_cross_correlation(  # type: ignore[no-untyped-call]
-        fixed.image, moving.image, reference_mask=fixed.seen, moving_mask=moving.seen
-    )
+    correlated: Callable[..., Any] = phase_cross_correlation
+    (down, right), *_ = correlated(fixed.image, moving.image, reference_mask=fixed.seen, moving_mask=moving.seen)
     return rescaled(translation(float(right), float(down)), moving.pixel)
 
 

@@ -24,6 +24,7 @@ from pydantic import ValidationError
 from photonpano import FrameSpan, Group, Located, PhotonpanoError, StageContext, discover, open_source, parse_spec
 from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import apply, corner_displacements, corners, inverse, normalised
+from photonpano.pipeline.capture import KnowsTruth
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 
@@ -89,7 +90,8 @@ def views(flux: float, seed: int, compensated: bool) -> Views:
     }
     merger = PhotonMleMerger(PhotonMleConfig(compensate=compensated))
     with open_source(parse_spec({"version": 1, "source": {"use": "simulator", "with": simulator}})) as source:
-        trajectory = FrameTrajectory(source.truth()["homographies"])  # type: ignore[attr-defined]  # simulators know it
+        assert isinstance(source, KnowsTruth)
+        trajectory = FrameTrajectory(source.truth()["homographies"])
         spans = (FrameSpan(start, start + GROUP_SIZE) for start in range(0, source.info.n_frames, GROUP_SIZE))
         groups = [Group(span, span.centre) for span in spans]
         exposures = [merger.merge(source, group, trajectory, 1.0) for group in groups]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.contributions import MergerContribution
-    from photonpano.protocols import Trajectory
+    from photonpano.protocols import Merger, Source, Trajectory
     from photonpano.values import BoolArray, FloatArray, Homography
 
 SHAPE = (40, 56)
@@ -234,7 +234,7 @@ class MergerConformance(StageConformance):
             merger = self.built(source.info)
             others = {"merged once more": fingerprint(self.merged(source, GROUP, trajectory))}
             others["with four threads at its disposal"] = fingerprint(self.merged(source, GROUP, trajectory, threads=4))
-            for found in in_threads(lambda _: fingerprint(merger.merge(source, GROUP, trajectory, 1.0))):  # noqa: B023
+            for found in in_threads(partial(_merged_by, merger, source, trajectory)):
                 others.setdefault("merged in several threads at once", found)
                 if found != expected:
                     others["merged in several threads at once"] = found
@@ -244,6 +244,11 @@ class MergerConformance(StageConformance):
     def _require_compensation(self) -> None:
         if not self.compensates:
             pytest.skip("compensates = False")
+
+
+def _merged_by(merger: Merger, source: Source, trajectory: Trajectory | None, thread: int) -> object:
+    del thread
+    return fingerprint(merger.merge(source, GROUP, trajectory, 1.0))
 
 
 def chance_of_light(flux: FloatArray) -> FloatArray:

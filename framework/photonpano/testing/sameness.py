@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from threading import Barrier
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.random.mtrand import get_bit_generator, set_bit_generator
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 T = TypeVar("T")
 
@@ -30,6 +32,17 @@ def fingerprint(value: Any) -> object:
     if isinstance(value, list | tuple):
         return tuple(fingerprint(item) for item in value)
     return repr(value)
+
+
+@contextmanager
+def global_chance(seed: int) -> Iterator[None]:
+    """Seed the generator that all of numpy shares, which no component must depend on, within a block."""
+    before = get_bit_generator()
+    set_bit_generator(np.random.MT19937(seed))
+    try:
+        yield
+    finally:
+        set_bit_generator(before)
 
 
 def in_threads(work: Callable[[int], T]) -> list[T]:

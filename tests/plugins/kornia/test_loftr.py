@@ -12,12 +12,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-torch = pytest.importorskip("torch")
-kornia = pytest.importorskip("kornia")
+pytest.importorskip("torch")
+pytest.importorskip("kornia")
 
-from photonpano_kornia.configs import KorniaLoftrConfig  # noqa: E402
-from photonpano_kornia.loftr import LoftrLocator  # noqa: E402
-from photonpano_kornia.weights import loftr_from  # noqa: E402
+import kornia
+import torch
+
+from photonpano_kornia.configs import KorniaLoftrConfig
+from photonpano_kornia.loftr import LoftrLocator
+from photonpano_kornia.weights import loftr_from
 
 SHAPE = (120, 176)
 STILL = np.eye(3)

@@ -11,11 +11,14 @@ from photonpano.geometry import apply, inverse, rescaling, translation
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-torch = pytest.importorskip("torch")
-kornia = pytest.importorskip("kornia")
+pytest.importorskip("torch")
+pytest.importorskip("kornia")
 
-from photonpano_kornia.configs import KorniaRegistratorConfig  # noqa: E402
-from photonpano_kornia.registrator import RegistratorLocator, unit_square  # noqa: E402
+import kornia
+import torch
+
+from photonpano_kornia.configs import KorniaRegistratorConfig
+from photonpano_kornia.registrator import RegistratorLocator, unit_square
 
 STILL = np.eye(3)
 

@@ -7,10 +7,12 @@ import pytest
 
 from photonpano import InputError
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("kornia")
 
-from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded  # noqa: E402
+import torch
+
+from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
 
 
 def test_torch_keeps_to_one_thread_inside_and_gets_its_own_back() -> None:

@@ -158,7 +158,7 @@ class WritesAndUndoes(Honest):
 
 class LeftToChance(Honest):
     def changed(self, found):
-        jitter = 1e-9 * np.random.normal()  # noqa: NPY002  the fault
+        jitter = 1e-9 * np.random.get_bit_generator().random_raw() / 2**32  # the fault
         return replace(found, homography=found.homography @ translation(jitter, 0))
 
 

@@ -100,7 +100,7 @@ class SharesAPosition(Honest):
 class LeftToChance(Honest):
     def __init__(self, context):
         super().__init__(context)
-        self.valid = np.random.random(self.info.frame_shape) > 0.1  # noqa: NPY002  the fault
+        self.valid = np.random.Generator(np.random.get_bit_generator()).random(self.info.frame_shape) > 0.1  # the fault
 
 
 class Doubled(BinaryResponse):
