@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         InterpolatorContribution,
         LocatorContribution,
         MergerContribution,
+        Recognised,
         Requirement,
         ResamplerContribution,
         SourceContext,
@@ -33,7 +34,16 @@ if TYPE_CHECKING:
         SpecError,
     )
     from photonpano.hookspecs import hookimpl
-    from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source, Trajectory
+    from photonpano.protocols import (
+        Interpolator,
+        LinearlyCorrectedSource,
+        Locator,
+        Merger,
+        PackedSource,
+        Resampler,
+        Source,
+        Trajectory,
+    )
     from photonpano.registry import Catalog, discover
     from photonpano.spec import Plan, load_spec, parse_spec
     from photonpano.values import (
@@ -61,6 +71,7 @@ __all__ = [
     "InputError",
     "Interpolator",
     "InterpolatorContribution",
+    "LinearlyCorrectedSource",
     "Located",
     "LocationError",
     "Locator",
@@ -69,10 +80,12 @@ __all__ = [
     "MergerContribution",
     "NotLocated",
     "OutputError",
+    "PackedSource",
     "Panorama",
     "PhotonpanoError",
     "Plan",
     "PluginError",
+    "Recognised",
     "Requirement",
     "Resampler",
     "ResamplerContribution",

@@ -13,7 +13,7 @@ from photonpano.errors import CaptureUnreadError
 from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
@@ -148,16 +148,36 @@ def no_problems(*_: Any) -> Sequence[str]:
     return ()
 
 
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """What a source takes for its own when it is shown a path.
+
+    Attributes:
+        keys: the keys that open it, the path among them; they are what a spec would say under `with`.
+        because: a clause that completes "it is taken for ...: ", with what decided, such as "8,388,608 bytes a file".
+    """
+
+    keys: Mapping[str, Any]
+    because: str
+
+
+def _not_ours(_: Path) -> None:
+    """Recognise nothing: the default `recognise` of a source."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SourceContribution(Contribution[C, SourceContext, Source]):
     """Offers a source.
 
     Attributes:
         check: problems of a config that can be told without reading the capture, such as a missing file.
+        recognise: tells whether a path is a capture of this source, for specs that leave the choice to `auto`. It looks at
+            names, sizes and first bytes, imports nothing heavy, and raises nothing.
     """
 
     kind: ClassVar[str] = "source"
     check: Callable[[C], Sequence[str]] = no_problems
+    recognise: Callable[[Path], Recognised | None] = _not_ours
 
 
 @dataclass(frozen=True, kw_only=True)

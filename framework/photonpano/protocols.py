@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
         BoolArray,
         Counts,
         FloatArray,
+        FluxImage,
+        Frames,
         FrameSpan,
         Group,
         Homography,
@@ -47,7 +49,7 @@ class Source(Protocol):
         """Sum the frames of a span: (H, W) uint32."""
         ...
 
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+    def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span one by one: (n, H, W)."""
         ...
 
@@ -58,6 +60,40 @@ class Source(Protocol):
     def __enter__(self) -> Source: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
+
+
+@runtime_checkable
+class PackedSource(Source, Protocol):
+    """A source of binary frames that has them packed: what only moves or counts bits need not unpack them."""
+
+    def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span, eight pixels to a byte.
+
+        Returns:
+            (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width: the first pixel is the highest bit, and what fills
+            up the last byte of a row is zero. It belongs to the caller.
+        """
+        ...
+
+
+@runtime_checkable
+class LinearlyCorrectedSource(Source, Protocol):
+    """A source whose sums hold more than the flux, such as dark counts, and which knows how to take it out."""
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """Return what the sum of some frames would be, on average, if they showed nothing but the flux.
+
+        Mergers do this to the sums of frames before they warp them. It is linear, so that the average is right, and may be
+        negative.
+
+        Args:
+            counts: (H, W), from `counts`.
+            n_frames: how many frames they are of.
+
+        Returns:
+            (H, W) float32.
+        """
+        ...
 
 
 class Resampler(Protocol):

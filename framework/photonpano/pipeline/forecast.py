@@ -20,12 +20,10 @@ from photonpano.values import FrameSpan
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from numpy.typing import NDArray
-
     from photonpano.pipeline.loop import LevelResult
     from photonpano.protocols import Source
     from photonpano.spec.plan import Plan
-    from photonpano.values import BoolArray, Counts, Response, StreamInfo
+    from photonpano.values import BoolArray, Counts, Frames, Response, StreamInfo
 
 TRIAL_GROUPS = 12
 """So many groups of the first level, from the middle of the capture, are run through all levels."""
@@ -67,7 +65,7 @@ class PartOfSource:
         """Sum the frames of a span: (H, W) uint32."""
         return self._source.counts(self._there(span))
 
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+    def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span one by one: (n, H, W)."""
         return self._source.frames(self._there(span))
 

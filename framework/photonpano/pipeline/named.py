@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from photonpano.pipeline.components import Level
     from photonpano.protocols import Source, Trajectory
-    from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Response, StreamInfo
+    from photonpano.values import BoolArray, Counts, FloatArray, Frames, FrameSpan, Response, StreamInfo
 
 ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
 
@@ -56,7 +56,7 @@ class NamedSource:
         """
         return self._checked(self._source.counts, span, self.info.frame_shape)
 
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+    def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span.
 
         Raises:

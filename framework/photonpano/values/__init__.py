@@ -1,6 +1,6 @@
 """Frozen values that pass between the stages; they import numpy only."""
 
-from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Homography
+from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
 from photonpano.values.capture import CaptureSummary, Decision, DecisionValue
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, StreamInfo, true_spans
@@ -16,6 +16,7 @@ __all__ = [
     "FloatArray",
     "FluxImage",
     "FrameSpan",
+    "Frames",
     "Group",
     "Homography",
     "Located",

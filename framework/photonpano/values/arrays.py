@@ -19,4 +19,7 @@ FluxImage: TypeAlias = NDArray[np.float32]
 Counts: TypeAlias = NDArray[np.uint32]
 """(H, W) uint32: sums of frames."""
 
+Frames: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
+"""(n, H, W): zeros and ones of a binary capture, grey values or small sums of another."""
+
 BoolArray: TypeAlias = NDArray[np.bool_]

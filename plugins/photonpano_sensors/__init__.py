@@ -1,0 +1,1 @@
+"""Captures as cameras and their programs write them."""

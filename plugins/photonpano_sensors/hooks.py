@@ -1,0 +1,16 @@
+"""What this plugin contributes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from photonpano import SourceContribution, hookimpl
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@hookimpl
+def photonpano_sources() -> Iterator[SourceContribution[Any]]:
+    """Offer captures as cameras and their programs write them."""
+    yield from ()
