@@ -84,7 +84,7 @@ def _run(plan: Plan, progress: Progress, observers: Observers) -> dict[str, Any]
     with open_source(plan) as source, run_folder(plan.output.directory) as folder, ThreadPoolExecutor(1) as aside:
         # A second of imports that nothing waits for.
         aside.submit(load_figures)
-        outcome = execute(plan, source, __version__, progress, observers)
+        outcome = execute(plan, source, __version__, progress, observers, folder.write_tile)
         write_outcome(folder, outcome, source.info.frame_shape)
         arrays = RunArrays(
             preview=outcome.picture,

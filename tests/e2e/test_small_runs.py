@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from photonpano import api
 from photonpano.evaluation import corner_errors
 from photonpano.geometry import rescaling, translation
 from photonpano.pipeline.capture import truth_path
+from photonpano.pipeline.panorama import BYTES_PER_PIXEL
 from photonpano.pipeline.progress import Quiet
 from photonpano.pipeline.run import execute
 from photonpano.pipeline.run_folder import run_folder
@@ -29,6 +32,28 @@ if TYPE_CHECKING:
 SHAPE = (128, 160)
 INSIDE = slice(25, 275)
 """The frames that every level locates: at the first, the ends lie beyond the middle of a group."""
+
+
+def test_a_panorama_larger_than_the_memory_is_written_in_parts(small_spec: dict[str, Any], tmp_path: Path) -> None:
+    plan = parse_spec(
+        small_spec | {"levels": 1, "output": {"directory": str(tmp_path)}},
+        overrides=("render.scale=9", "run.memory=64 MiB"),
+    )
+    record = api.run(plan).record["panorama"]
+    flux, coverage = (tifffile.imread(tmp_path / name) for name in ("panorama.tiff", "coverage.tiff"))
+    picture = cv2.imread(str(tmp_path / "panorama.png"), cv2.IMREAD_UNCHANGED)
+    factor = record["picture_reduction"]
+    assert flux.size * BYTES_PER_PIXEL > 64 * 1024**2
+    assert flux.shape == coverage.shape == (record["height"], record["width"])
+    assert picture.shape == tuple(-(-side // factor) for side in flux.shape)
+    np.testing.assert_array_equal(np.isnan(flux), coverage == 0)
+    assert record["coverage_share"] == pytest.approx((coverage > 0).mean(), abs=0.01)
+    # The picture shows the same: bright where the flux is.
+    whole = np.s_[: flux.shape[0] // factor * factor, : flux.shape[1] // factor * factor]
+    blocks = np.nan_to_num(flux[whole]).reshape(flux.shape[0] // factor, factor, -1, factor).mean(axis=(1, 3))
+    shown = picture[: blocks.shape[0], : blocks.shape[1]]
+    assert np.corrcoef(np.sqrt(blocks).ravel(), shown.ravel())[0, 1] > 0.98
+    assert f"<code>panorama.png</code> one for {factor}" in (tmp_path / "report.html").read_text()
 
 
 def outcome_of(plan: Plan) -> RunOutcome:

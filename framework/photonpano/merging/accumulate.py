@@ -78,7 +78,7 @@ def accumulate(
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
-        advance: is told the number of frames of each chunk.
+        advance: is told the number of frames of each chunk; first of all chunks together that miss the grid.
         pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
         threads: how many.
         counts_of: sums the frames of a span, if not the source itself.
@@ -89,17 +89,20 @@ def accumulate(
     parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], n_parts)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
     placed = landings(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
+    landed = [(chunk, landing) for chunk, landing in zip(chunks, placed, strict=True) if landing.rows and landing.columns]
+    advance = advance or _no_one
+    if missing := sum(len(chunk.span) for chunk in chunks) - sum(len(chunk.span) for chunk, _ in landed):
+        advance(missing)
     # What is started is worked on while the next is started, if there is a pool; results are taken in order.
     start = pool.map if pool else map
     adding: Iterable[None] = ()
-    for first in range(0, len(chunks), _BATCH):
-        batch, where = chunks[first : first + _BATCH], placed[first : first + _BATCH]
-        summed = list(start(partial(_summed, counts_of or source.counts, masked), batch, where))
+    for first in range(0, len(landed), _BATCH):
+        batch = landed[first : first + _BATCH]
+        summed = list(start(partial(_summed, counts_of or source.counts, masked), *zip(*batch, strict=True)))
         deque(adding, maxlen=0)
         adding = start(partial(_Total.add, summed=summed), parts)
-        for chunk in batch:
-            if advance is not None:
-                advance(len(chunk.span))
+        for chunk, _ in batch:
+            advance(len(chunk.span))
     deque(adding, maxlen=0)
     return total.result()
 
@@ -187,6 +190,10 @@ class _Total:
     def result(self) -> PhotonSum:
         add_running_sums(self.steps, self.weight)
         return PhotonSum(self.counts, self.weight)
+
+
+def _no_one(_: int) -> None:
+    """Listen to no progress."""
 
 
 def _divided(length: int, parts: int) -> list[tuple[int, int]]:

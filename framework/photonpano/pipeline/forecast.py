@@ -106,7 +106,8 @@ def forecast(plan: Plan, source: Source) -> Forecast:
         round(side * plan.render.scale + (whole - side * plan.render.scale) * more)
         for side, whole in zip(part.info.frame_shape, canvas.shape, strict=True)
     ]
-    memory = (peak_memory_bytes() or 0) + n_frames * BYTES_PER_FRAME + BYTES_PER_PIXEL * sides[0] * sides[1]
+    rendering = min(BYTES_PER_PIXEL * sides[0] * sides[1], int(plan.run.memory))
+    memory = (peak_memory_bytes() or 0) + n_frames * BYTES_PER_FRAME + rendering
     return Forecast(span, threads, seconds, memory, (sides[0], sides[1]))
 
 

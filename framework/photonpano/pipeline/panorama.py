@@ -3,23 +3,42 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import canvas_of
+from photonpano.geometry import Canvas, canvas_of, translation
 from photonpano.merging import accumulate, chunks_of
 from photonpano.values import Panorama
 
 if TYPE_CHECKING:
-    from photonpano.geometry import Canvas
+    from collections.abc import Iterator, Sequence
+
     from photonpano.pipeline.progress import Progress
     from photonpano.protocols import Source, Trajectory
     from photonpano.values import FrameSpan
 
 BYTES_PER_PIXEL = 40
-"""Peak memory for each pixel of the canvas: sums, estimate and what is written, as measured in the tests."""
+"""Peak memory for each pixel that is rendered at a time: sums, estimate and what is written, as measured in the tests."""
+LARGEST = 16
+"""A panorama that is so many times as large as what fits into the memory is refused: it mostly comes of a wrong motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tile:
+    """A part of a canvas.
+
+    Attributes:
+        left: columns of the canvas to the left of it.
+        top: rows of the canvas above it.
+        canvas: its own pixel grid.
+    """
+
+    left: int
+    top: int
+    canvas: Canvas
 
 
 def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int, int], scale: float, memory: int) -> Canvas:
@@ -30,10 +49,10 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
         span: the frames that are to be seen.
         frame_shape: (height, width) of a frame.
         scale: pixels of the canvas per pixel of the reference frame.
-        memory: bytes that a panorama may take.
+        memory: bytes that rendering may take.
 
     Raises:
-        CanvasTooLargeError: it would take more; the message says how much.
+        CanvasTooLargeError: it is `LARGEST` times as large as what fits, or more; the message says how large.
         LocationError: frames reach the horizon of the reference plane.
     """
     homographies = trajectory.at(np.arange(span.start, span.stop))
@@ -44,15 +63,39 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
             f"the motion turns so far away from the reference frame that a flat panorama cannot show it ({error}); "
             "choose a render.reference in the middle of the motion, or fewer frames"
         ) from error
-    needed = canvas.height * canvas.width * BYTES_PER_PIXEL
-    if needed > memory:
-        fitting = scale * np.sqrt(memory / needed)
+    excess = canvas.height * canvas.width * BYTES_PER_PIXEL / memory
+    if excess > LARGEST:
+        fitting = scale * np.sqrt(LARGEST / excess)
         raise CanvasTooLargeError(
-            f"the panorama would have {canvas.width} x {canvas.height} pixels and take {_gib(needed)}, more than the "
-            f"{_gib(memory)} of run.memory. Raise run.memory, lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
+            f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what the {_gib(memory)} of "
+            f"run.memory hold. Up to {LARGEST} times is rendered in parts; more is often a sign of a wrong motion. "
+            f"Raise run.memory, lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
             "or choose a render.reference nearer to the middle of the motion"
         )
     return canvas
+
+
+def tiles_of(canvas: Canvas, memory: int) -> tuple[tuple[Tile, ...], int]:
+    """Divide a canvas across its longer side into tiles that are rendered one by one within the memory.
+
+    Returns:
+        The tiles, one if the canvas fits as it is; and by what factor an overview of it is smaller that fits beside them.
+        Tiles begin at multiples of that factor.
+    """
+    fits = memory // BYTES_PER_PIXEL
+    n_pixels = canvas.height * canvas.width
+    if n_pixels <= fits:
+        return (Tile(0, 0, canvas),), 1
+    reduction = int(np.ceil(np.sqrt(4 * n_pixels / fits)))
+    longer, shorter = max(canvas.shape), min(canvas.shape)
+    length = max(1, fits // (2 * shorter * reduction)) * reduction
+    tiles = []
+    for start in range(0, longer, length):
+        size = min(length, longer - start)
+        left, top = (start, 0) if canvas.width == longer else (0, start)
+        height, width = (canvas.height, size) if canvas.width == longer else (size, canvas.width)
+        tiles.append(Tile(left, top, Canvas(height, width, translation(-left, -top) @ canvas.transform)))
+    return tuple(tiles), reduction
 
 
 def render(
@@ -75,12 +118,29 @@ def render(
         threads: how many work on it; the result does not depend on it.
         progress: is told of the frames.
     """
-    with progress.stage("panorama", len(span), "frames") as advance:
-        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        with ThreadPoolExecutor(threads, thread_name_prefix="render") as pool:
-            photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance, pool, threads)
-    flux, weight = photons.estimate(source.response)
-    return Panorama(flux, weight, canvas.transform)
+    (panorama,) = render_tiles(source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, threads, progress)
+    return panorama
+
+
+def render_tiles(
+    source: Source,
+    trajectory: Trajectory,
+    span: FrameSpan,
+    tiles: Sequence[Tile],
+    tolerance_px: float,
+    threads: int,
+    progress: Progress,
+) -> Iterator[Panorama]:
+    """Render the tiles of a canvas, one after the other: see `render`."""
+    chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
+    with (
+        progress.stage("panorama", len(span) * len(tiles), "frames") as advance,
+        ThreadPoolExecutor(threads, thread_name_prefix="render") as pool,
+    ):
+        for tile in tiles:
+            grid = tile.canvas
+            photons = accumulate(source, chunks, grid.transform, grid.shape, advance, pool, threads)
+            yield Panorama(*photons.estimate(source.response), grid.transform)
 
 
 def _gib(size: float) -> str:

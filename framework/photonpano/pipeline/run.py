@@ -17,7 +17,8 @@ from photonpano.pipeline.components import build_levels, origin_of
 from photonpano.pipeline.loop import estimate_motion
 from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.observers import NOBODY
-from photonpano.pipeline.panorama import plan_canvas, render
+from photonpano.pipeline.overview import Overview
+from photonpano.pipeline.panorama import plan_canvas, render_tiles, tiles_of
 from photonpano.pipeline.record import (
     level_record,
     levels_decision,
@@ -34,9 +35,13 @@ from photonpano.spec.tree import Place
 from photonpano.values import Decision, FrameSpan
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
+    from photonpano.geometry import Canvas
     from photonpano.pipeline.observers import Observers
+    from photonpano.pipeline.panorama import Tile
     from photonpano.pipeline.progress import Progress
     from photonpano.pipeline.run_folder import RunFolder
     from photonpano.protocols import Source
@@ -55,7 +60,8 @@ class RunOutcome:
     """What a run found, and what it records of itself.
 
     Attributes:
-        panorama: flux and weight on the canvas.
+        canvas: the pixel grid of the panorama.
+        panorama: flux and weight on the canvas, averaged down where it was rendered in tiles.
         homographies: (T, 3, 3), frame pixels to reference pixels.
         located: (T,), False where a frame lies outside what was located.
         std_px: (T,) expected corner error, infinite where a frame lies outside what was located.
@@ -63,6 +69,7 @@ class RunOutcome:
         record: the content of `run.json`.
     """
 
+    canvas: Canvas
     panorama: Panorama
     homographies: FloatArray
     located: BoolArray
@@ -76,8 +83,27 @@ class RunOutcome:
         return tone_mapped(self.panorama.flux, self.record["panorama"]["white_flux"])
 
 
-def execute(plan: Plan, source: Source, version: str, progress: Progress, observers: Observers = NOBODY) -> RunOutcome:
+def _forget(tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
+    """Keep nothing but the overview."""
+
+
+def execute(
+    plan: Plan,
+    source: Source,
+    version: str,
+    progress: Progress,
+    observers: Observers = NOBODY,
+    keep: Callable[[Tile, Panorama, Canvas], None] = _forget,
+) -> RunOutcome:
     """Run a plan on its open source: the loop, then the panorama.
+
+    Args:
+        plan: which components.
+        source: the capture.
+        version: of photonpano, for the record.
+        progress: is told of the stages.
+        observers: are told of them when they are done.
+        keep: is given the panorama tile by tile, each with the canvas that it is a part of.
 
     Raises:
         InputError: the capture shows nothing, or does not suit the plan.
@@ -105,8 +131,14 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
     rendering = time.perf_counter()
     covered = results[-1].located.covered
     canvas = plan_canvas(trajectory, covered, stream.frame_shape, plan.render.scale, int(plan.run.memory))
+    tiles, reduction = tiles_of(canvas, int(plan.run.memory))
+    shown = Overview(canvas, reduction)
     with one_thread_inside():
-        panorama = render(source, trajectory, covered, canvas, plan.render.tolerance_px, threads, progress)
+        rendered = render_tiles(source, trajectory, covered, tiles, plan.render.tolerance_px, threads, progress)
+        for tile, part in zip(tiles, rendered, strict=True):
+            keep(tile, part, canvas)
+            shown.add(tile, part)
+    panorama = shown.panorama
     observers.rendered(canvas, time.perf_counter() - rendering)
     seen = panorama.weight > 0
     white_flux = float(np.quantile(panorama.flux[seen], plan.render.white_quantile)) or 1.0
@@ -133,6 +165,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
             "height": canvas.height,
             "width": canvas.width,
             "scale": plan.render.scale,
+            "picture_reduction": reduction,
             "white_flux": white_flux,
             "coverage_share": float(seen.mean()),
             "seconds": round(now - rendering, 3),
@@ -142,14 +175,14 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
         "seconds": round(now - start, 3),
         "peak_memory_bytes": peak_memory_bytes(),
     }
-    return RunOutcome(panorama, trajectory.at(frames), located, std_px, reference, record)
+    return RunOutcome(canvas, panorama, trajectory.at(frames), located, std_px, reference, record)
 
 
 def write_outcome(folder: RunFolder, outcome: RunOutcome, frame_shape: tuple[int, int]) -> None:
-    """Write everything but the report into a run folder."""
-    folder.write_panorama(outcome.panorama, outcome.picture)
+    """Write everything but the report and the panorama's flux and weight into a run folder."""
+    folder.write_picture(outcome.picture)
     folder.write_trajectory(
-        outcome.homographies, outcome.located, outcome.std_px, outcome.panorama.canvas, frame_shape, outcome.reference
+        outcome.homographies, outcome.located, outcome.std_px, outcome.canvas.transform, frame_shape, outcome.reference
     )
     folder.write_record(outcome.record)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano.geometry import Canvas
+    from photonpano.pipeline.panorama import Tile
     from photonpano.values import BoolArray, FloatArray, FluxImage, Homography, Panorama
 
 
@@ -37,14 +40,18 @@ class RunFolder:
     directory: Path
     staging: Path
 
-    def write_panorama(self, panorama: Panorama, picture: NDArray[np.uint8]) -> None:
-        """Write panorama.tiff and coverage.tiff (float32), and panorama.png (8 bits, sRGB)."""
+    def write_tile(self, tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
+        """Write a part of panorama.tiff and coverage.tiff (float32); the parts make up the canvas."""
+        with _writing(self.directory):
+            _write_box(self.staging / "panorama.tiff", rendered.flux, tile, canvas)
+            _write_box(self.staging / "coverage.tiff", rendered.weight, tile, canvas)
+
+    def write_picture(self, picture: NDArray[np.uint8]) -> None:
+        """Write panorama.png (8 bits, sRGB)."""
         encoded, png = cv2.imencode(".png", picture)
         if not encoded:
             raise OutputError(f"OpenCV could not encode the panorama of {picture.shape} as PNG")
         with _writing(self.directory):
-            _write_tiff(self.staging / "panorama.tiff", panorama.flux)
-            _write_tiff(self.staging / "coverage.tiff", panorama.weight)
             (self.staging / "panorama.png").write_bytes(png.tobytes())
 
     def write_trajectory(
@@ -149,5 +156,20 @@ def _to_disk(file: Path) -> None:
         os.fsync(stream.fileno())
 
 
-def _write_tiff(path: Path, image: FluxImage) -> None:
-    tifffile.imwrite(path, image, photometric="minisblack", metadata=None)
+def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None:
+    """Write a box of pixels into a TIFF file, which the first one lays out."""
+    if not path.exists():
+        room = 4 * canvas.height * canvas.width
+        if room > shutil.disk_usage(path.parent).free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        tifffile.imwrite(path, shape=canvas.shape, dtype=np.float32, photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as file:
+        start = file.pages.first.dataoffsets[0]
+    with path.open("rb+") as stream:
+        if image.shape[1] == canvas.width:
+            stream.seek(start + 4 * tile.top * canvas.width)
+            image.tofile(stream)
+            return
+        for row, pixels in enumerate(image, start=tile.top):
+            stream.seek(start + 4 * (row * canvas.width + tile.left))
+            pixels.tofile(stream)

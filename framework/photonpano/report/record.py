@@ -83,11 +83,15 @@ class DecisionRecord(TypedDict):
 
 
 class PanoramaRecord(TypedDict):
-    """The panorama; `coverage_share` is the share of its pixels that was seen, `white_flux` what is white in the PNG."""
+    """The panorama; `coverage_share` is the share of its pixels that was seen, `white_flux` what is white in the PNG.
+
+    The PNG is smaller than the panorama by `picture_reduction`, where that was rendered in parts.
+    """
 
     height: int
     width: int
     scale: float
+    picture_reduction: int
     white_flux: float
     coverage_share: float
     seconds: float

@@ -72,5 +72,6 @@ class RunSettings(Config):
     memory: ByteSize = Field(
         ByteSize(2 * 1024**3),
         ge=64 * 1024**2,
-        description="a panorama that would take more memory than this is refused",
+        description="a panorama that would take more memory than this is rendered in parts; one that is more than 16 times as "
+        "large is refused",
     )

@@ -6,17 +6,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import CanvasTooLargeError, FrameSpan, LocationError
-from photonpano.geometry import from_parameters, translation
+from photonpano import CanvasTooLargeError, FrameSpan, LocationError, Panorama
+from photonpano.geometry import Canvas, apply, from_parameters, translation
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.panorama import BYTES_PER_PIXEL, plan_canvas, render
+from photonpano.pipeline.overview import Overview
+from photonpano.pipeline.panorama import BYTES_PER_PIXEL, Tile, plan_canvas, render, render_tiles, tiles_of
 from photonpano.pipeline.progress import Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from photonpano import Panorama
-    from photonpano.geometry import Canvas
 
 SHAPE = (30, 40)
 N = 60
@@ -31,18 +29,19 @@ def test_the_canvas_holds_the_frames_of_the_span_only(pan: Callable) -> None:
     np.testing.assert_array_equal(canvas.transform, translation(-20, 0))
 
 
-def test_a_canvas_beyond_the_memory_is_refused_before_it_is_made(pan: Callable) -> None:
+def test_a_canvas_far_beyond_the_memory_is_refused_before_it_is_made(pan: Callable) -> None:
     """40,000 px wide and 50,000 high at scale 10."""
     with pytest.raises(CanvasTooLargeError) as caught:
         plan_canvas(pan(3960 / (N - 1), 4970 / (N - 1)), ALL, SHAPE, 10.0, 2 * GIB)
     assert str(caught.value) == (
-        "the panorama would have 40000 x 50000 pixels and take 75 GiB, more than the 2 GiB of run.memory. "
-        "Raise run.memory, lower render.scale from 10 to 1.6, "
+        "the panorama would have 40000 x 50000 pixels, 37 times what the 2 GiB of run.memory hold. "
+        "Up to 16 times is rendered in parts; more is often a sign of a wrong motion. "
+        "Raise run.memory, lower render.scale from 10 to 6.5, "
         "or choose a render.reference nearer to the middle of the motion"
     )
 
 
-@pytest.mark.parametrize(("scale", "memory"), [(8.0, 2 * GIB), (1.0, GIB // 16), (0.9, GIB // 16)])
+@pytest.mark.parametrize(("scale", "memory"), [(8.0, GIB // 8), (1.0, GIB // 256), (0.9, GIB // 256)])
 def test_the_scale_that_it_suggests_fits_and_is_not_much_too_small(pan: Callable, scale: float, memory: int) -> None:
     with pytest.raises(CanvasTooLargeError) as caught:
         plan_canvas(pan(5), ALL, (1000, 2000), scale, memory)
@@ -107,6 +106,58 @@ def test_at_twice_the_scale_every_pixel_is_four(panning: Any, pan: Callable) -> 
     dark = [mean_count[10:50, 2 * column : 2 * column + 2].mean() for column in (36, 52)]
     np.testing.assert_allclose(bright, 0.8, atol=0.03)
     np.testing.assert_allclose(dark, 0.2, atol=0.03)
+
+
+@pytest.mark.parametrize("motion", [(1, 0.0), (0.2, 1.5)], ids=["wide", "high"])
+@pytest.mark.parametrize("scale", [1.0, 1.7])
+def test_tiles_make_up_the_panorama(panning: Any, known_motion: type, motion: tuple[float, float], scale: float) -> None:
+    right, down = motion
+    turning = known_motion(lambda t: from_parameters([1e-4 * t, 2e-4 * t, -2e-4 * t, 0, right * t, down * t, 1e-6 * t, 0]))
+    canvas = plan_canvas(turning, ALL, SHAPE, scale, GIB)
+    whole = render(panning, turning, ALL, canvas, 0.25, 1, Quiet())
+    tiles, reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL // 3)
+    assert len(tiles) > 2
+    flux, weight = np.zeros(canvas.shape), np.zeros(canvas.shape)
+    shown = Overview(canvas, reduction)
+    for tile, part in zip(tiles, render_tiles(panning, turning, ALL, tiles, 0.25, 2, Quiet()), strict=True):
+        box = np.s_[tile.top : tile.top + tile.canvas.height, tile.left : tile.left + tile.canvas.width]
+        flux[box], weight[box] = part.flux, part.weight
+        shown.add(tile, part)
+    np.testing.assert_allclose(weight, whole.weight, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(flux, whole.flux, rtol=1e-3, atol=1e-4)
+    single = Overview(canvas, reduction)
+    single.add(Tile(0, 0, canvas), Panorama(flux.astype(np.float32), weight.astype(np.float32), canvas.transform))
+    np.testing.assert_allclose(shown.panorama.flux, single.panorama.flux, rtol=1e-6)
+    np.testing.assert_allclose(shown.panorama.weight, single.panorama.weight, rtol=1e-6)
+
+
+def test_an_overview_averages_what_was_seen() -> None:
+    flux = np.array([[1, 3, np.nan], [np.nan, 5, np.nan], [4, 4, 8]], np.float32)
+    canvas = Canvas(3, 3, translation(2, 1))
+    shown = Overview(canvas, 2)
+    shown.add(Tile(0, 0, canvas), Panorama(flux, np.where(np.isnan(flux), 0, 8).astype(np.float32), canvas.transform))
+    np.testing.assert_array_equal(shown.panorama.flux, [[3, np.nan], [4, 8]])
+    np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
+    # The centre of the first square lies between the pixels 0 and 1.
+    np.testing.assert_allclose(apply(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
+
+
+def test_what_fits_is_rendered_at_once(pan: Callable) -> None:
+    canvas = plan_canvas(pan(1), ALL, SHAPE, 1.0, GIB)
+    (tile,), reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL)
+    assert (tile.left, tile.top, tile.canvas, reduction) == (0, 0, canvas, 1)
+
+
+@pytest.mark.parametrize("size", [(3000, 40_000), (50_000, 3000), (3001, 3003)])
+@pytest.mark.parametrize("excess", [1.01, 3, 16])
+def test_tiles_and_their_overview_fit_into_the_memory(size: tuple[int, int], excess: float) -> None:
+    canvas, memory = Canvas(*size, np.eye(3)), int(size[0] * size[1] * BYTES_PER_PIXEL / excess)
+    tiles, reduction = tiles_of(canvas, memory)
+    assert sum(tile.canvas.height * tile.canvas.width for tile in tiles) == size[0] * size[1]
+    assert all(tile.left % reduction == tile.top % reduction == 0 for tile in tiles)
+    most = max(tile.canvas.height * tile.canvas.width for tile in tiles)
+    assert BYTES_PER_PIXEL * (most + size[0] * size[1] / reduction**2) <= memory
+    assert len(tiles) <= 4 * excess
 
 
 def test_it_tells_of_every_frame(panning: Any, pan: Callable) -> None:

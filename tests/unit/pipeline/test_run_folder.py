@@ -11,7 +11,8 @@ import pytest
 import tifffile
 
 from photonpano import OutputError, Panorama
-from photonpano.geometry import translation
+from photonpano.geometry import Canvas, translation
+from photonpano.pipeline.panorama import Tile
 from photonpano.pipeline.run_folder import run_folder
 
 if TYPE_CHECKING:
@@ -23,12 +24,14 @@ if TYPE_CHECKING:
 FLUX = np.random.default_rng(0).random((60, 90), np.float32)
 FLUX[:, :5] = np.nan
 PANORAMA = Panorama(FLUX, np.where(np.isnan(FLUX), np.float32(0), np.float32(7)), translation(3, 4))
+CANVAS = Canvas(60, 90, PANORAMA.canvas)
 PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
 FILES = {"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
 
 
 def write_panorama(folder: RunFolder) -> None:
-    folder.write_panorama(PANORAMA, PICTURE)
+    folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, CANVAS)
+    folder.write_picture(PICTURE)
 
 
 def write_trajectory(folder: RunFolder) -> None:
@@ -135,9 +138,8 @@ def files_of_at_most(n_bytes: int) -> Iterator[None]:
 def test_a_full_disk_leaves_what_was_there(old: Path, write: Callable[[RunFolder], None]) -> None:
     with pytest.raises(OutputError) as caught, run_folder(old) as folder, files_of_at_most(4096):
         write(folder)
-    reason = "a file was cut short" if write is write_panorama else "File too large"
     assert str(caught.value) == (
-        f"{old}: the results could not be written ({reason}); what was there before is unchanged. "
+        f"{old}: the results could not be written (File too large); what was there before is unchanged. "
         "Make room, or choose another folder with --output"
     )
     require_old(old)

@@ -122,6 +122,7 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             "height": height,
             "width": width,
             "scale": 1.0,
+            "picture_reduction": 1,
             "white_flux": 1.8342,
             "coverage_share": float((arrays.coverage > 0).mean()),
             "seconds": 4.18,
