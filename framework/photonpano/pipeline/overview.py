@@ -27,6 +27,7 @@ class Overview:
 
     def __init__(self, canvas: Canvas, reduction: int) -> None:
         self._reduction = reduction
+        self._n_pixels, self._n_seen = canvas.height * canvas.width, 0
         shape = -(-canvas.height // reduction), -(-canvas.width // reduction)
         to_overview = rescaling(1 / reduction) @ canvas.transform
         empty = np.zeros((0, 0) if reduction == 1 else shape, np.float32)
@@ -35,16 +36,22 @@ class Overview:
     def add(self, tile: Tile, rendered: Panorama) -> None:
         """Enter a tile: the mean flux of the pixels that were seen, and the mean weight of all."""
         step = self._reduction
+        known = rendered.weight > 0
+        self._n_seen += int(np.count_nonzero(known))
         if step == 1:
             self.panorama = rendered
             return
-        known = np.isfinite(rendered.flux)
         share = _averaged(known, step)
         height, width = share.shape
         box = np.s_[tile.top // step : tile.top // step + height, tile.left // step : tile.left // step + width]
         flux = _averaged(np.where(known, rendered.flux, 0), step)
         self.panorama.flux[box] = np.divide(flux, share, out=np.full_like(flux, np.nan), where=share > 0)
         self.panorama.weight[box] = _averaged(rendered.weight, step)
+
+    @property
+    def coverage_share(self) -> float:
+        """The share of the canvas that was seen."""
+        return self._n_seen / self._n_pixels
 
 
 def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:

@@ -167,7 +167,7 @@ def execute(
             "scale": plan.render.scale,
             "picture_reduction": reduction,
             "white_flux": white_flux,
-            "coverage_share": float(seen.mean()),
+            "coverage_share": shown.coverage_share,
             "seconds": round(now - rendering, 3),
         },
         "motion": motion_record(std_px),
