@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from photonpano import Config, FrameSpan, InputError, SourceContribution, SpecPath, StreamInfo
+from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinaryResponse, packed_counts
 
 if TYPE_CHECKING:
@@ -220,10 +220,21 @@ def _check(config: PackedNpyConfig) -> Sequence[str]:
     return ()
 
 
+def _recognise(path: Path) -> Recognised | None:
+    if path.suffix != ".npy" or not path.is_file():
+        return None
+    try:
+        header, _ = _layout(PackedNpyConfig(path=path))
+    except InputError:
+        return None
+    return Recognised({"path": path}, f"uint8 of shape {header.shape} in a .npy file")
+
+
 PACKED_NPY = SourceContribution(
     name="packed-npy",
     summary="Binary frames in a .npy file, eight pixels to a byte as numpy.packbits makes them",
     config=PackedNpyConfig,
     build=lambda config, _: PackedNpySource(config),
     check=_check,
+    recognise=_recognise,
 )

@@ -127,7 +127,7 @@ class _Writer:
         yield from (f"{indent}  {line}" for line in others)
 
     def _origin(self, path: str, value: Any) -> str:
-        """Say which plugin gives a component."""
+        """Say which plugin gives a component, and why it was chosen where the spec leaves that open."""
         from photonpano.registry import KINDS
 
         *_, section, key = ["", *re.sub(r"\.fallback\.\d+", "", path).split(".")]
@@ -135,7 +135,8 @@ class _Writer:
         if key != "use" or not kinds:
             return ""
         entry = self._catalog.find(kinds[0], value)
-        return f"{entry.plugin} {entry.version}"
+        reasons = [decision.reason for decision in self._plan.decisions if decision.what == path.removesuffix(".use")]
+        return ", ".join([f"{entry.plugin} {entry.version}", *reasons])
 
     def _written(self, path: str) -> str:
         """Say where a value comes from, unless it stands in the file as it is."""

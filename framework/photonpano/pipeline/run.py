@@ -31,7 +31,7 @@ from photonpano.pipeline.record import (
 )
 from photonpano.pipeline.threads import one_thread_inside, thread_count
 from photonpano.spec.tree import Place
-from photonpano.values import Decision, FrameSpan
+from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -95,7 +95,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
     except InputError as error:
         # The source knows its file, the spec knows where that is named.
         raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
-    decisions: list[Decision] = []
+    decisions = list(plan.decisions)
     levels = build_levels(plan, source, decisions)
     with one_thread_inside(), told_once(partial(progress.note, COMPILING)):
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged, observers)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic.json_schema import models_json_schema
 
+from photonpano.registry.auto import AutoConfig
 from photonpano.registry.chain import CHAIN, ChainConfig
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.wording import TolerantJsonSchema
@@ -47,6 +48,8 @@ def json_schema(catalog: Catalog) -> Schema:
     definitions["fallback"] = {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}
     if ChainConfig in schemas:
         definitions[_definition(schemas[ChainConfig])]["properties"]["backends"]["items"] = one
+    if AutoConfig in schemas:  # what it hands on is known once a source has recognised the path
+        definitions[_definition(schemas[AutoConfig])]["additionalProperties"] = True
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from photonpano.registry import Observer
     from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.spec.tree import Place
+    from photonpano.values import Decision
 
 ContributionT = TypeVar("ContributionT", covariant=True)
 
@@ -72,6 +73,7 @@ class Plan:
         places: where each value of the spec was written, by its path, for messages that come up later.
         file: the spec file, None for a spec that was built in Python.
         observers: the plugins that watch the run.
+        decisions: what the spec leaves open, and reading it has decided: which source recognises the capture.
     """
 
     source: Choice[SourceContribution[Any]]
@@ -85,3 +87,4 @@ class Plan:
     places: Mapping[str, Place] = field(default_factory=dict)
     file: Path | None = None
     observers: tuple[Observer, ...] = ()
+    decisions: tuple[Decision, ...] = ()

@@ -58,6 +58,8 @@ def is_valid(spec, catalog):
         ({"locate": {"use": "chain-of-backends", "with": {"backends": []}}}, False),
         ({"locate": {"fallback": "chain-of-backends"}}, False),
         ({"merge": {"fallback": "photon-mle"}}, False),
+        ({"source": {"use": "auto", "with": {"path": "cube.npy", "frame_rate_hz": 96800}}}, True),
+        ({"source": {"use": "auto", "with": {"frame_rate_hz": 96800}}}, False),
         ({"levels": [{"locate": {"fallback": "direct"}}]}, True),
         ({"source": {"with": {"flux": 1}}}, False),
     ],
