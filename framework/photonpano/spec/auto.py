@@ -78,11 +78,10 @@ def found_source(keys: Value, catalog: Catalog, directory: Path, problems: list[
     if len(answers.recognised) != 1:
         several = [f"{entry.name} ({answer.because})" for entry, answer in answers.recognised]
         if several:
-            message = f"{path} is recognised by {listed(several)}; write the name of the right one in place of {AUTO.name}"
+            message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
-            remedy = f"write the name of the one that reads it in place of {AUTO.name}"
             lines = [*_near_misses(keys, catalog, directory), *answers.failures]
-            message = "\n  ".join([f"no source recognises {path}, {_looks(path)}; {remedy}", *lines])
+            message = "\n  ".join([f"no source recognises {path}, {_looks(path)}; name the one that reads it", *lines])
         problems.append(place.problem(message))
         return None
     for failure in answers.failures:

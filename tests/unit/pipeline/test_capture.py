@@ -55,7 +55,7 @@ class TruthfulSource(RandomSource):
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.pipeline.capture._BLOCK_BYTES", 7 * 6 * 19)
+    monkeypatch.setattr("photonpano.pipeline.packed_frames._BLOCK_BYTES", 7 * 6 * 19)
 
 
 @pytest.mark.usefixtures("small_blocks")

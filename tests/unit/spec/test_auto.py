@@ -69,8 +69,7 @@ def test_what_was_recognised_is_laid_under_what_is_written(folder, catalog):
 def test_nobody_recognises_it(folder, catalog):
     said = told(folder, catalog.including(HALVES), "source: {use: auto, with: {path: cube.dat}}")
     assert said == (
-        "scan.yaml:2:34: source.with.path: no source recognises cube.dat, a file of 5 bytes; "
-        "write the name of the one that reads it in place of auto\n"
+        "scan.yaml:2:34: source.with.path: no source recognises cube.dat, a file of 5 bytes; name the one that reads it\n"
         "  halves: finds nothing wrong with it\n"
         "  packed-npy: finds nothing wrong with it"
     )
@@ -99,7 +98,7 @@ def test_several_recognise_it(folder, catalog):
     said = told(folder, catalog.including(also), "source: {use: auto, with: {path: cube.npy}}")
     assert said == (
         "scan.yaml:2:34: source.with.path: cube.npy is recognised by greedy (it is there) and packed-npy "
-        "(its name ends in .npy); write the name of the right one in place of auto"
+        "(its name ends in .npy); name the right one"
     )
 
 
