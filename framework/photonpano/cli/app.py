@@ -11,6 +11,7 @@ from photonpano.cli.check import check
 from photonpano.cli.convert import convert
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
+from photonpano.cli.info import info
 from photonpano.cli.outcome import reported
 from photonpano.cli.plugins import plugins
 from photonpano.cli.run import run
@@ -37,7 +38,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, explain, convert, simulate, evaluate, schema, warm_up):
+for command in (run, check, explain, info, convert, simulate, evaluate, schema, warm_up):
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

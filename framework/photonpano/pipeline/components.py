@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from photonpano.contributions import Contribution
     from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
     from photonpano.spec.plan import Choice, Plan
-    from photonpano.values import DecisionValue, Group
+    from photonpano.values import CaptureSummary, DecisionValue, Group
 
 HALVED_LEVELS = 2
 """So many levels, at most, are located at half size unless the spec says otherwise."""
@@ -155,6 +155,22 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
         except CaptureUnreadError as error:
             foreseen.append(str(error))
     return foreseen
+
+
+def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
+    """Return what the resampler of the first level chooses for a capture that looks like this, such as its group size.
+
+    Raises:
+        InputError: the capture is too short for it.
+    """
+    decisions: list[Decision] = []
+    choice = plan.levels[0].resample
+    threads = thread_count(plan.run)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
+    resampler: Resampler = _built(choice, context)
+    with _blaming(origin_of(choice), 1):
+        resampler.groups(source.info.n_frames, 1)
+    return decisions
 
 
 def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], None]:

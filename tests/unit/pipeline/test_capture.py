@@ -279,7 +279,7 @@ def test_a_full_disk_leaves_what_can_be_continued(tmp_path: Path) -> None:
 )
 def test_a_source_that_breaks_its_contract_is_told(tmp_path: Path, packed: np.ndarray) -> None:
     source = PackedRandomSource(5, 6, 19)
-    source.packed = lambda span: packed
+    source.packed = lambda _span: packed
     with pytest.raises(PluginError) as caught:
         write_packed(source, tmp_path / "cube.npy")
     assert str(caught.value) == (
