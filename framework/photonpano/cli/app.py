@@ -8,6 +8,7 @@ from typer.core import TyperGroup
 
 import photonpano
 from photonpano.cli.check import check
+from photonpano.cli.dark import dark
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
 from photonpano.cli.outcome import reported
@@ -36,7 +37,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, explain, simulate, evaluate, schema, warm_up):
+for command in (run, check, explain, simulate, dark, evaluate, schema, warm_up):
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

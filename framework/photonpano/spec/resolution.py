@@ -11,6 +11,7 @@ from photonpano.registry.kinds import KINDS
 from photonpano.registry.suggestions import listed
 from photonpano.spec.chain import NO_PART, spelled_out
 from photonpano.spec.checks import STAGES, complaints
+from photonpano.spec.corrections import resolved_corrections, written_corrections
 from photonpano.spec.plan import Choice, LevelPlan, Plan
 from photonpano.spec.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
 from photonpano.spec.tree import Value, given, joined
@@ -43,7 +44,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "run": RunSettings,
 }
 """The framework's own sections."""
-SECTIONS = ("version", *KIND_OF, "levels", *SETTINGS)
+SECTIONS = ("version", "source", "corrections", *STAGES, "levels", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
 
 
@@ -104,6 +105,7 @@ class _Resolver:
         source = self.select("source", sections["source"]).choice
         if source is not None:
             self.problems += map(sections["source"].head.problem, complaints(source))
+        corrections = resolved_corrections(sections["corrections"], self.directory, self.problems)
         stages = {name: self.select(name, sections[name]) for name in STAGES}
         levels = [self.level(each, stages) for each in self.levels(sections["levels"])]
         until_converged = sections["levels"].content == UNTIL_CONVERGED
@@ -112,6 +114,7 @@ class _Resolver:
             return None
         plan = Plan(
             source,
+            corrections,
             tuple(filter(None, levels)),
             until_converged,
             **settings,
@@ -310,6 +313,7 @@ class _Resolver:
         return {
             "version": VERSION,
             "source": _written(plan.source),
+            "corrections": written_corrections(plan.corrections),
             **chosen,
             "levels": UNTIL_CONVERGED if plan.until_converged else levels,
             **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
