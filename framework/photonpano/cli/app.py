@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 import photonpano
 from photonpano.cli.check import check
 from photonpano.cli.convert import convert
+from photonpano.cli.dark import dark
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
 from photonpano.cli.info import info
@@ -38,7 +39,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, explain, info, convert, simulate, evaluate, schema, warm_up):
+for command in (run, check, explain, info, convert, simulate, dark, evaluate, schema, warm_up):
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

@@ -112,7 +112,7 @@ class _Writer:
             if isinstance(value, dict) and value:
                 yield f"{indent}{key}:"
                 yield from self._mapping(value, path, f"{indent}  ")
-            elif value and re.fullmatch(r"(levels\.\d+\.)?locate\.fallback", path):
+            elif value and re.fullmatch(r"corrections|(levels\.\d+\.)?locate\.fallback", path):
                 yield f"{indent}{key}:"
                 for index, item in enumerate(value):
                     yield from self._item(item, f"{path}.{index}", f"{indent}  ")
@@ -121,8 +121,8 @@ class _Writer:
                 comment = ", ".join(filter(None, remarks))
                 yield f"{indent}{key}: {flow(value)}" + (f"  # {comment}" if comment else "")
 
-    def _item(self, mapping: Mapping[str, Any], where: str, indent: str) -> Iterator[str]:
-        first, *others = self._mapping(mapping, where, "")
+    def _item(self, item: Mapping[str, Any] | str, where: str, indent: str) -> Iterator[str]:
+        first, *others = [item] if isinstance(item, str) else self._mapping(item, where, "")
         yield f"{indent}- {first}"
         yield from (f"{indent}  {line}" for line in others)
 

@@ -8,9 +8,9 @@ import typer
 from photonpano.cli.capture import CapturePath, Corrections, Keys, SourceName
 
 if TYPE_CHECKING:
-    from photonpano.pipeline.inspection import PixelSummary
     from photonpano.protocols import Source
     from photonpano.spec import Plan
+    from photonpano.values import CaptureSummary
 
 HOT_SHARE = 0.001
 """With more hot pixels than this, a mask is recommended."""
@@ -39,7 +39,7 @@ def info(
     from photonpano.pipeline.components import build_source, origin_of
     from photonpano.pipeline.named import NamedSource
 
-    # Whatever a spec says of groups, what a capture asks for is told.
+    # Whatever a spec says of groups, what the capture asks for is told.
     plan = plan_for(path, source, keys, corrections, ["resample={use: midpoint}", "levels=1"])
     with build_source(plan) as opened:
         facts = _facts(plan, NamedSource(opened, origin_of(plan.source)))
@@ -54,28 +54,16 @@ def info(
 
 def _facts(plan: "Plan", source: "Source") -> dict[str, Any]:
     """Look at a capture, and say everything as plain data."""
-    from photonpano.errors import PhotonpanoError
-    from photonpano.pipeline.components import foreseen_decisions
-    from photonpano.pipeline.inspection import judge_pixels
+    from photonpano.pipeline.inspection import saturated_share
     from photonpano.pipeline.probing import summarise
     from photonpano.pipeline.threads import one_thread_inside, thread_count
 
     stream = source.info
     with one_thread_inside():
-        pixels, capture = judge_pixels(source), summarise(source, thread_count(plan.run))
-    warnings = list(_warnings(source, pixels))
-    group_size: dict[str, Any] = {"frames": None, "reason": "nothing"}
-    try:
-        for decision in foreseen_decisions(plan, source, capture):
-            if decision.what == "group_size":
-                group_size = {"frames": decision.value, "reason": decision.reason}
-    except PhotonpanoError as error:
-        group_size["reason"] = str(error)
-        warnings.append(str(error))
-    reasons = [decision.reason for decision in plan.decisions if decision.what == "source"]
-    return {
+        capture = summarise(source, thread_count(plan.run))
+    facts: dict[str, Any] = {
         "source": plan.source.contribution.name,
-        "reason": reasons[0] if reasons else None,
+        "reason": next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
         "n_frames": stream.n_frames,
         "height": stream.height,
         "width": stream.width,
@@ -86,17 +74,38 @@ def _facts(plan: "Plan", source: "Source") -> dict[str, Any]:
         "flux": capture.flux,
         "speed_px": capture.speed_px,
         "speed_how": capture.how,
-        "group_size": group_size,
-        "looked_at_frames": pixels.n_frames,
-        "unused_share": pixels.unused_share,
-        "hot_share": pixels.hot_share,
-        "saturated_share": pixels.saturated_share,
-        "warnings": warnings,
-        "spec": _document(plan),
+        "unused_share": 1 - float(source.valid.mean()),
+        "hot_share": _hot_share(plan, source),
+        "saturated_share": saturated_share(source),
+        **_group_size(plan, source, capture),
     }
+    return facts | {"warnings": list(_warnings(source, facts)), "spec": _document(plan)}
 
 
-def _warnings(source: "Source", pixels: "PixelSummary") -> Iterator[str]:
+def _hot_share(plan: "Plan", source: "Source") -> float:
+    """Return how many of the pixels that may be used the correction `hot-pixels` would mask."""
+    from dataclasses import replace
+
+    from photonpano.corrections import HotPixels
+    from photonpano.pipeline.components import build_source
+
+    with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as masked:
+        return 1 - float(masked.valid[source.valid].mean())
+
+
+def _group_size(plan: "Plan", source: "Source", capture: "CaptureSummary") -> dict[str, Any]:
+    from photonpano.errors import InputError
+    from photonpano.pipeline.components import foreseen_decisions
+
+    try:
+        decisions = foreseen_decisions(plan, source, capture)
+    except InputError as error:
+        return {"group_size": None, "group_size_reason": str(error)}
+    ((size, reason),) = [(each.value, each.reason) for each in decisions if each.what == "group_size"]
+    return {"group_size": size, "group_size_reason": reason}
+
+
+def _warnings(source: "Source", facts: Mapping[str, Any]) -> Iterator[str]:
     from photonpano.errors import InputError
     from photonpano.pipeline.inspection import require_photons
 
@@ -105,11 +114,12 @@ def _warnings(source: "Source", pixels: "PixelSummary") -> Iterator[str]:
     except InputError as error:
         yield str(error)
         return
-    if pixels.hot_share > HOT_SHARE:
-        yield f"about {_percent(pixels.hot_share)} of the pixels are hot, and draw lines through panoramas unless they are masked"
-    if pixels.saturated_share > SATURATED_SHARE:
-        share = _percent(pixels.saturated_share)
-        yield f"{share} of the pixels have their highest value in every frame, so that their flux is unknown; expose less"
+    if (share := facts["hot_share"]) > HOT_SHARE:
+        yield f"about {_percent(share)} of the pixels are hot; the correction hot-pixels masks them"
+    if (share := facts["saturated_share"]) > SATURATED_SHARE:
+        yield f"{_percent(share)} of the pixels have their highest value in every frame: their flux is unknown; expose less"
+    if facts["group_size"] is None:
+        yield facts["group_size_reason"]
 
 
 def _document(plan: "Plan") -> dict[str, Any]:
@@ -138,14 +148,14 @@ def _rows(facts: Mapping[str, Any]) -> Iterator[list[str]]:
     from photonpano.values import StreamInfo
 
     stream = StreamInfo(*(facts[key] for key in ("n_frames", "height", "width", "frame_rate_hz", "kind", "bit_depth")))
-    group_size, speed_px, hot = facts["group_size"], facts["speed_px"], facts["hot_share"]
+    size, speed_px, hot = facts["group_size"], facts["speed_px"], facts["hot_share"]
     yield ["source", facts["source"] + (f" ({facts['reason']})" if facts["reason"] else "")]
     yield ["capture", capture_words(stream)]
     yield ["duration", "unknown without frame_rate_hz" if facts["seconds"] is None else duration(facts["seconds"])]
     yield ["flux", f"{facts['flux']:.3g} photons per pixel and frame"]
-    yield ["hot pixels", f"{'about ' if hot else ''}{_percent(hot)}, as {facts['looked_at_frames']} frames tell"]
+    yield ["hot pixels", f"about {_percent(hot)}" if hot else "none"]
     yield ["speed", facts["speed_how"] if speed_px is None else f"{speed_px:.2g} px a frame ({facts['speed_how']})"]
-    yield ["group size", "unknown" if group_size["frames"] is None else f"{group_size['frames']}: {group_size['reason']}"]
+    yield ["group size", "unknown" if size is None else f"{size} ({facts['group_size_reason']})"]
 
 
 def _spec(facts: Mapping[str, Any]) -> str:

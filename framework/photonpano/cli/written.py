@@ -29,7 +29,7 @@ def tell_written(files: Sequence[Path], info: StreamInfo, unused: int) -> None:
 
     path, *truth = files
     if unused:
-        warn(f"{unused} pixels are not to be used, which {path} does not say; name them in a file as bad_pixels")
+        warn(f"{unused} pixels are not to be used, which {path} does not say; mask them with `corrections`")
     words = [capture_words(info), "the truth: motion and scene"]
     typer.echo(columns([[str(file), decimal(file.stat().st_size), text] for file, text in zip(files, words, strict=False)]))
     typer.echo("\nIn a spec that lies here:\n")

@@ -15,6 +15,7 @@ import numpy as np
 from photonpano.errors import InputError, OutputError
 from photonpano.pipeline.atomic import atomic_path, resumable_path
 from photonpano.pipeline.packed_frames import PackedFrames
+from photonpano.protocols import LinearlyCorrectedSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -74,13 +75,18 @@ def write_packed(
         The files written, the capture first.
 
     Raises:
-        InputError: the source is not binary.
+        InputError: the source is not binary, or it takes something out of sums, which bits cannot hold.
         OutputError: the files cannot be written, or will not fit on the disk. Nothing is left under the final names then, or
             when the source fails.
         PluginError: the source gives frames of another shape than it promises.
     """
     if source.info.kind != "binary":
         raise InputError(f"cannot write {path}: packed .npy files hold binary frames, and this source gives intensities")
+    if isinstance(source, LinearlyCorrectedSource):
+        raise InputError(
+            f"cannot write {path}: some corrections change sums of frames, and not the frames; "
+            "leave them to the specs that read the file"
+        )
     if path.suffix != ".npy":
         raise OutputError(f"cannot write {path}: a packed capture is a .npy file; name it {path.name}.npy")
     truth = source.truth() if isinstance(source, KnowsTruth) else {}

@@ -10,8 +10,11 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
-from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError
+from photonpano.corrections import CorrectedSource
+from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError, SpecError
+from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.threads import thread_count
+from photonpano.spec.tree import Place
 from photonpano.values import Decision
 
 if TYPE_CHECKING:
@@ -76,13 +79,26 @@ class Level:
 
 
 def build_source(plan: Plan) -> Source:
-    """Open the capture of a plan.
+    """Open the capture of a plan, with its corrections.
 
     Raises:
         InputError: the capture cannot be used as it is.
         PluginError: a library is missing, or the plugin failed in its own way.
+        SpecError: a correction does not suit the capture, or its file is not what it should be.
     """
-    return _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+    source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+    if not plan.corrections:
+        return source
+
+    def blame(index: int, message: str) -> SpecError:
+        where = f"corrections.{index}"
+        return SpecError([plan.places.get(where, Place(where)).problem(message)])
+
+    try:
+        return CorrectedSource(NamedSource(source, origin_of(plan.source)), plan.corrections, blame)
+    except BaseException:
+        source.close()
+        raise
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:

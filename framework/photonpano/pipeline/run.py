@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.compiling import told_once
+from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_levels, origin_of
@@ -82,6 +83,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
         PluginError: a component failed in its own way, or broke its contract.
     """
     start = time.perf_counter()
+    corrected = source if isinstance(source, CorrectedSource) else None
     source = NamedSource(source, origin_of(plan.source))
     threads = thread_count(plan.run)
     stream = source.info
@@ -91,7 +93,7 @@ def execute(plan: Plan, source: Source, version: str, progress: Progress, observ
     except InputError as error:
         # The source knows its file, the spec knows where that is named.
         raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
-    decisions = list(plan.decisions)
+    decisions = [*plan.decisions, *(corrected.decisions if corrected else ())]
     levels = build_levels(plan, source, decisions)
     with one_thread_inside(), told_once(partial(progress.note, COMPILING)):
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged, observers)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         ResamplerContribution,
         SourceContribution,
     )
+    from photonpano.corrections import Correction
     from photonpano.registry import Observer
     from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.spec.tree import Place
@@ -63,6 +64,7 @@ class Plan:
 
     Attributes:
         source: the capture.
+        corrections: what is done to its frames before anything else, in order.
         levels: one plan for each level, in order.
         until_converged: the loop ends once the motion has settled, at the latest after the last of `levels`, all of them alike.
         graph: which pairs are registered, and what happens when the graph falls apart.
@@ -77,6 +79,7 @@ class Plan:
     """
 
     source: Choice[SourceContribution[Any]]
+    corrections: tuple[Correction, ...]
     levels: tuple[LevelPlan, ...]
     until_converged: bool
     graph: GraphSettings

@@ -13,6 +13,7 @@ from photonpano.registry.suggestions import listed
 from photonpano.spec.auto import found_source
 from photonpano.spec.chain import NO_PART, spelled_out
 from photonpano.spec.checks import STAGES, complaints
+from photonpano.spec.corrections import resolved_corrections, written_corrections
 from photonpano.spec.plan import Choice, LevelPlan, Plan
 from photonpano.spec.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
 from photonpano.spec.tree import Value, given, joined
@@ -46,7 +47,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "run": RunSettings,
 }
 """The framework's own sections."""
-SECTIONS = ("version", *KIND_OF, "levels", *SETTINGS)
+SECTIONS = ("version", "source", "corrections", *STAGES, "levels", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
 
 
@@ -108,6 +109,7 @@ class _Resolver:
         source = self.select("source", sections["source"]).choice
         if source is not None:
             self.problems += map(sections["source"].head.problem, complaints(source))
+        corrections = resolved_corrections(sections["corrections"], self.directory, self.problems)
         stages = {name: self.select(name, sections[name]) for name in STAGES}
         levels = [self.level(each, stages) for each in self.levels(sections["levels"])]
         until_converged = sections["levels"].content == UNTIL_CONVERGED
@@ -116,6 +118,7 @@ class _Resolver:
             return None
         plan = Plan(
             source,
+            corrections,
             tuple(filter(None, levels)),
             until_converged,
             **settings,
@@ -330,6 +333,7 @@ class _Resolver:
         return {
             "version": VERSION,
             "source": _written(plan.source),
+            "corrections": written_corrections(plan.corrections),
             **chosen,
             "levels": UNTIL_CONVERGED if plan.until_converged else levels,
             **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
