@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,27 @@ def resumable_path(final: Path) -> Iterator[Path]:
     """
     with _becoming(final, part_path(final)):
         yield part_path(final)
+
+
+@contextmanager
+def atomic_folder(final: Path) -> Iterator[Path]:
+    """Lend an empty folder beside `final`, which becomes `final` when the block ends well, and otherwise is removed.
+
+    Raises:
+        OutputError: there is something under that name, or the folder cannot be written.
+    """
+    place = final.absolute()
+    temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
+    try:
+        if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
+            raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
+        temporary.mkdir()
+        yield temporary
+        temporary.replace(place)
+    except OSError as error:
+        raise OutputError(_message(final, error)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

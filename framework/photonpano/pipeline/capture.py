@@ -5,8 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import TYPE_CHECKING, BinaryIO, Protocol, runtime_checkable
 
@@ -15,11 +13,11 @@ import numpy as np
 from photonpano.errors import InputError, OutputError
 from photonpano.pipeline.atomic import atomic_path, resumable_path
 from photonpano.pipeline.packed_frames import PackedFrames
+from photonpano.pipeline.threads import in_order
 from photonpano.protocols import LinearlyCorrectedSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from concurrent.futures import Future
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -125,31 +123,13 @@ def _write_capture(
             file.write(packed.header)
         file.seek(packed.position(done))
         file.truncate()
-        _write_frames(packed, done, file, progress, threads)
+        for frames in in_order(packed.of, packed.blocks(done), threads):
+            file.write(frames.data)
+            if progress is not None:
+                progress(len(frames))
         # A disk that is full must show before the truth gets its final name.
         file.flush()
         os.fsync(file.fileno())
-
-
-def _write_frames(
-    packed: PackedFrames, first: int, file: BinaryIO, progress: Callable[[int], object] | None, threads: int
-) -> None:
-    """Write the frames from the first on, in order, while `threads` blocks are being made."""
-
-    def write(block: Future[NDArray[np.uint8]]) -> None:
-        frames = block.result()
-        file.write(frames.data)
-        if progress is not None:
-            progress(len(frames))
-
-    due: deque[Future[NDArray[np.uint8]]] = deque()
-    with ThreadPoolExecutor(threads, thread_name_prefix="capture") as pool:
-        for span in packed.blocks(first):
-            due.append(pool.submit(packed.of, span))
-            if len(due) > threads:
-                write(due.popleft())
-        while due:
-            write(due.popleft())
 
 
 def _lock(file: BinaryIO, final: Path) -> None:
