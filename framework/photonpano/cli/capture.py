@@ -90,9 +90,9 @@ def plan_for(
 def _told(problem: Problem) -> str:
     """Say what is wrong without naming a spec that nobody wrote."""
     where = problem.where
-    if where in ("source", "source.with.path"):
+    if where in ("", "source", "source.with.path"):
         return problem.message
-    for prefix, option in (("source.with.", "--with "), ("source.use", "--source"), ("corrections", "--correct")):
-        if where.startswith(prefix):
-            return f"{where.replace(prefix, option, 1)}: {problem.message}"
-    return f"{where}: {problem.message}"
+    if where.startswith("corrections"):
+        return f"--correct: {problem.message}"
+    option = "--source" if where == "source.use" else where.replace("source.with.", "--with ", 1)
+    return f"{option}: {problem.message}"

@@ -88,7 +88,7 @@ def _look(source: Source, centre: float, lengths: Sequence[int]) -> tuple[float,
 
 def _common_shift(images: Sequence[FluxImage]) -> float | None:
     """Return by how much each of three images is shifted against the one before, in its pixels; None if they do not agree."""
-    if not all(image.any() for image in images):
+    if not all(np.ptp(image) for image in images):
         return None
     first, second, both = (_shift(images[k], images[j]) for k, j in ((0, 1), (1, 2), (0, 2)))
     if max(np.linalg.norm(second - first), np.linalg.norm(both - first - second)) > _ALIKE:
