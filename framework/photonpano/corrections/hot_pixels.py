@@ -102,7 +102,8 @@ def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[Boo
     image = np.where(usable, image.ravel()[pixels.index], np.float32(np.nan))
     above, below = _excess(image), _excess(-image)
     outside = np.fmax(above, below)
-    typical = float(np.nanmedian(np.abs(image - _ranked(image, None)))) if usable.any() else 0.0
+    differences = np.abs(image - _ranked(image, None))
+    typical = float(np.median(known)) if (known := differences[np.isfinite(differences)]).size else 0.0
     std = max(_TO_STD * typical, float(np.max(response.stabilised_std(frames))))
     return outside > threshold * std, seen
 
@@ -115,7 +116,7 @@ def _excess(image: FluxImage) -> FluxImage:
 def _ranked(image: FluxImage, rank: int | None) -> FluxImage:
     """Return the median of the known neighbours of each pixel, itself not among them, or the so-manieth brightest."""
     side = 2 * _REACH + 1
-    padded = np.pad(image, _REACH, constant_values=np.nan)
+    padded = np.pad(image, _REACH, mode="reflect")
     windows = sliding_window_view(padded, (side, side)).reshape(*image.shape, side * side)
     around = np.sort(np.delete(windows, side * side // 2, axis=-1), axis=-1)  # NaN comes last
     known = np.isfinite(around).sum(axis=-1, keepdims=True)
