@@ -20,7 +20,7 @@ def dark(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="dark.npz for rates and hot pixels, mask.npy for a mask.", show_default=False
+            "--output", "-o", metavar="FILE", help="An .npz file for dark counts, a .npy file for a mask.", show_default=False
         ),
     ],
     threshold: Annotated[
@@ -52,6 +52,7 @@ def dark(
     from photonpano.corrections.hot_pixels import THRESHOLD
     from photonpano.errors import InputError, OutputError
     from photonpano.pipeline.atomic import atomic_path
+    from photonpano.registry.description import flow
     from photonpano.spec import load_spec
 
     if output.suffix not in (".npz", ".npy"):
@@ -71,10 +72,9 @@ def dark(
     if info.kind == "binary" and np.median(measured.rates[valid]) > BRIGHT:
         warn(f"half of the pixels count more than {BRIGHT:g} a frame; was the lens covered?")
     typer.echo(columns(_rows(output, info, measured, hot & valid, limit, valid)))
-    spelled = (
-        "[{hot-pixels: {dark: FILE}}, {dark-counts: {dark: FILE}}]" if output.suffix == ".npz" else "[{mask: {file: FILE}}]"
-    )
-    typer.echo(f"\nIn a spec that lies here:\n\ncorrections: {spelled.replace('FILE', str(output))}")
+    uses = {"hot-pixels": "dark", "dark-counts": "dark"} if output.suffix == ".npz" else {"mask": "file"}
+    typer.echo("\nIn a spec that lies here:\n")
+    typer.echo(f"corrections: {flow([{name: {key: str(output)}} for name, key in uses.items()])}")
 
 
 def _rows(

@@ -25,8 +25,9 @@ _SPANS, _SPAN_FRAMES = 16, 256
 """So many spans, of so many frames each, are looked at of a capture: enough to blur the scene."""
 _REACH = 2
 """A pixel is compared with those up to so many rows and columns away,"""
-_ALIKE = 4
-"""and is like them if so many are as bright: a straight edge or a line of the scene passes through as many."""
+_ONE_IN = 6
+"""and is like them if one in so many is as bright: a straight edge or a line of the scene passes through as many, at the border
+of the frame as well."""
 _TO_STD = 1.4826
 """Standard deviations of a normal distribution in its median absolute deviation."""
 
@@ -100,25 +101,20 @@ def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[Boo
     image = response.stabilised(response.flux(np.asarray(counts / seen, np.float32), frames), frames)
     usable = pixels.valid & ~pixels.interpolated
     image = np.where(usable, image.ravel()[pixels.index], np.float32(np.nan))
-    above, below = _excess(image), _excess(-image)
-    outside = np.fmax(above, below)
-    typical = float(np.nanmedian(np.abs(image - _ranked(image, None)))) if usable.any() else 0.0
+    outside = np.fmax(image - _ranked(image, _ONE_IN), -image - _ranked(-image, _ONE_IN))
+    differences = np.abs(image - _ranked(image, 2))
+    typical = float(np.median(known)) if (known := differences[np.isfinite(differences)]).size else 0.0
     std = max(_TO_STD * typical, float(np.max(response.stabilised_std(frames))))
     return outside > threshold * std, seen
 
 
-def _excess(image: FluxImage) -> FluxImage:
-    """Return by how much pixels are brighter than the brightest but a few of their neighbours; NaN where that is unknown."""
-    return image - _ranked(image, _ALIKE)
-
-
-def _ranked(image: FluxImage, rank: int | None) -> FluxImage:
-    """Return the median of the known neighbours of each pixel, itself not among them, or the so-manieth brightest."""
+def _ranked(image: FluxImage, one_in: int) -> FluxImage:
+    """Return what one in so many of the neighbours of each pixel reach, itself not among them; NaN where few are known."""
     side = 2 * _REACH + 1
     padded = np.pad(image, _REACH, constant_values=np.nan)
     windows = sliding_window_view(padded, (side, side)).reshape(*image.shape, side * side)
     around = np.sort(np.delete(windows, side * side // 2, axis=-1), axis=-1)  # NaN comes last
     known = np.isfinite(around).sum(axis=-1, keepdims=True)
-    place = known // 2 if rank is None else known - rank
-    found = np.take_along_axis(around, np.clip(place, 0, around.shape[-1] - 1), axis=-1)[..., 0]
-    return np.where(known[..., 0] > _ALIKE, found, np.float32(np.nan))
+    place = np.clip(known - known // one_in, 0, around.shape[-1] - 1)
+    found = np.take_along_axis(around, place, axis=-1)[..., 0]
+    return np.where(known[..., 0] >= _ONE_IN, found, np.float32(np.nan))

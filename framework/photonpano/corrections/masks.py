@@ -58,7 +58,7 @@ class ColourFilter(Correction):
         description="the filter array: a .png picture, or a .npy file (height, width, 3) of uint8 in the order red, green, "
         "blue, of the size that frames have at this place of the list; white is clear, others are pure red, green and blue"
     )
-    keep: tuple[Colour, ...] = Field(("clear",), min_length=1, description="the colours whose pixels are used")
+    keep: tuple[Colour, ...] = Field(("clear",), description="the colours whose pixels are used")
     others: Literal["mask", "interpolate"] = Field(
         "mask",
         description="what becomes of the other pixels: mask leaves them to the motion to fill, interpolate takes the mean of "

@@ -48,8 +48,8 @@ def apply_corrections(
     pixels = Pixels.as_read(source.valid)
     for place, correction in enumerate(corrections):
         try:
-            if correction.changes_sums and isinstance(source, LinearlyCorrectedSource):
-                raise InputError("this source corrects its sums itself, so that pixels may only be moved and masked")
+            if isinstance(source, LinearlyCorrectedSource):
+                raise InputError("this source takes things out of its sums itself, and cannot be corrected further")
             pixels = correction.applied(pixels, source, decide)
             if not pixels.valid.any():
                 raise InputError(f"{correction.name} leaves no pixel that may be used")
