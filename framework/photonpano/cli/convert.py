@@ -15,10 +15,11 @@ def convert(
     keys: Keys = None,
     corrections: Corrections = None,
 ) -> None:
-    """Write a capture of binary frames to a .npy file, eight pixels to a byte.
+    """Write a capture of binary frames to a packed .npy file.
 
-    The bits are those of the source, uncorrected unless corrections are asked for. If it is interrupted, what is written so
-    far stays beside the output with '.part' behind its name, and the same command goes on from there.
+    Eight pixels are packed to a byte. The bits are those of the source, uncorrected unless corrections are asked for. If it
+    is interrupted, what is written so far stays beside the output with '.part' behind its name, and the same command goes on
+    from there.
 
     Example: photonpano convert recording/ cube.npy --with frame_rate_hz=96800
     """

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from photonpano.cli.arguments import Overrides, Spec
+from photonpano.cli.capture import CapturePath, Corrections, Keys, SourceName
 
 if TYPE_CHECKING:
     from photonpano.corrections import DarkFrames
@@ -16,7 +16,7 @@ BRIGHT = 0.1
 
 
 def dark(
-    spec: Spec,
+    path: CapturePath,
     output: Annotated[
         Path,
         typer.Option(
@@ -32,19 +32,22 @@ def dark(
             show_default=False,
         ),
     ] = None,
-    overrides: Overrides = None,
+    source: SourceName = None,
+    keys: Keys = None,
+    corrections: Corrections = None,
 ) -> None:
-    """Measure dark counts and hot pixels in a capture that was recorded with the lens covered.
+    """Measure dark counts and hot pixels of a covered lens.
 
-    The spec needs no more than 'version' and 'source'; corrections that move pixels are applied, so that what is written fits
-    behind them in the list of another spec. An .npz file holds the dark counts of each pixel, from which a spec takes dark
+    The capture was recorded with the lens covered. Corrections that move pixels are applied, so that what is written fits
+    behind them in the list of a spec. An .npz file holds the dark counts of each pixel, from which a spec takes dark
     counts or hot pixels; a .npy file holds the mask of the hot pixels.
 
-    Example: photonpano dark covered.yaml --output dark.npz
+    Example: photonpano dark covered.npy --output dark.npz
     """
     import numpy as np
 
     from photonpano.api import open_source
+    from photonpano.cli.capture import plan_for
     from photonpano.cli.outcome import warn
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.wording import columns
@@ -53,16 +56,15 @@ def dark(
     from photonpano.errors import InputError, OutputError
     from photonpano.pipeline.atomic import atomic_path
     from photonpano.registry.description import flow
-    from photonpano.spec import load_spec
 
     if output.suffix not in (".npz", ".npy"):
         raise OutputError(f"cannot write {output}: dark counts are an .npz file, and a mask of hot pixels is a .npy file")
-    with open_source(load_spec(spec, overrides or ())) as source:
-        info, valid = source.info, source.valid
+    with open_source(plan_for(path, source, keys, corrections)) as capture:
+        info, valid = capture.info, capture.valid
         if not valid.any():
-            raise InputError(f"{spec}: no pixel may be used")
+            raise InputError(f"{path}: no pixel may be used")
         with progress_for_stderr().stage("dark counts", info.n_frames, "frames") as advance:
-            measured = measure_dark(source, advance)
+            measured = measure_dark(capture, advance)
     hot, limit = hot_in_the_dark(measured, THRESHOLD if threshold is None else threshold, valid)
     with atomic_path(output) as temporary:
         if output.suffix == ".npz":

@@ -25,7 +25,7 @@ def info(
     corrections: Corrections = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
-    """Say what a capture is, how bright it is, and how fast its image moves.
+    """Say what a capture is, how bright, and how fast its image moves.
 
     Reads some hundreds of frames, all over the capture. Ends with a spec to start from.
 

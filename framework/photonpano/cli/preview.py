@@ -46,9 +46,10 @@ def preview(
     label: Annotated[bool, typer.Option("--label/--no-label", help="Write frames and time below each picture.")] = True,
     fps: Annotated[float, typer.Option(min=0.1, max=240, metavar="HZ", help="Pictures a second of a film.")] = 24,
 ) -> None:
-    """Merge frames where they lie into pictures, to look at a capture.
+    """Merge frames into pictures, to look at a capture.
 
-    White is the same flux in all pictures, so that brightness can be compared.
+    Frames are summed where they lie, since no motion is known. White is the same flux in all pictures, so that brightness can
+    be compared.
 
     Example: photonpano preview cube.npy --output look.mp4 --group-size 500
     """

@@ -228,6 +228,7 @@ def test_plugins_list(invoke: Callable[..., Any]) -> None:
     head, *rows = result.stdout.splitlines()
     assert head.split() == ["KIND", "NAME", "PLUGIN", "SUMMARY"]
     assert [row.split()[:4] for row in rows] == [
+        ["source", "auto", "photonpano", "0.1.0"],
         ["source", "packed-npy", "photonpano", "0.1.0"],
         ["source", "simulator", "photonpano", "0.1.0"],
     ]

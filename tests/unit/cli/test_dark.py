@@ -45,7 +45,7 @@ def test_dark_counts_and_how_to_use_them(hot: np.ndarray, folder: Path, invoke: 
 
 
 def test_a_mask_and_how_to_use_it(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
-    done = invoke("dark", "covered.yaml", "-o", "mask.npy", "--threshold", "20")
+    done = invoke("dark", "covered.npy", "-o", "mask.npy", "--threshold", "20")
     np.testing.assert_array_equal(np.load(folder / "mask.npy"), hot)
     line = done.stdout.splitlines()[-1]
     assert line == "corrections: [{mask: {file: mask.npy}}]"
@@ -54,7 +54,7 @@ def test_a_mask_and_how_to_use_it(hot: np.ndarray, folder: Path, invoke: Callabl
 
 @pytest.mark.usefixtures("hot")
 def test_corrections_that_move_pixels_are_applied(folder: Path, invoke: Callable[..., Any]) -> None:
-    invoke("dark", "covered.yaml", "-o", "dark.npz", "--set", "corrections=[rot90, {crop: {rows: [0, 10]}}]")
+    invoke("dark", "covered.yaml", "-o", "dark.npz", "--correct", "rot90", "--correct", "{crop: {rows: [0, 10]}}")
     with np.load(folder / "dark.npz") as archive:
         assert archive["rates"].shape == (10, 24)
 
