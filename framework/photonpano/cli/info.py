@@ -155,7 +155,7 @@ def _rows(facts: Mapping[str, Any]) -> Iterator[list[str]]:
     yield ["flux", f"{facts['flux']:.3g} photons per pixel and frame"]
     yield ["hot pixels", f"about {_percent(hot)}" if hot else "none"]
     yield ["speed", facts["speed_how"] if speed_px is None else f"{speed_px:.2g} px a frame ({facts['speed_how']})"]
-    yield ["group size", "unknown" if size is None else f"{size} ({facts['group_size_reason']})"]
+    yield ["group size", "unknown" if size is None else f"{size}: {facts['group_size_reason']}"]
 
 
 def _spec(facts: Mapping[str, Any]) -> str:

@@ -39,7 +39,7 @@ def test_what_it_is_and_how_it_looks(cube: Path, invoke: Callable[..., Any]) -> 
     assert 0.5 < float(flux) < 2
     assert rows["hot pixels"].startswith(("none", "about "))
     assert rows["speed"].startswith("0.1 px a frame (the second fastest of ")
-    assert rows["group size"].startswith("25 (at 0.1 px a frame ")
+    assert rows["group size"].startswith("25: at 0.1 px a frame ")
     assert result.stdout.endswith(
         "\n\nA spec to start from:\n\nversion: 1\nsource: {use: packed-npy, with: {path: cube.npy, frame_rate_hz: 96800}}\n"
     )
