@@ -76,3 +76,16 @@ def test_what_is_wrong_is_told_by_the_name_of_the_option(cube: Path, arguments: 
     with pytest.raises(WrongArgumentError) as caught:
         plan_for(**{"path": Path("cube.npy")} | arguments)
     assert str(caught.value).startswith(message.replace("{folder}", str(cube.parent)))
+
+
+def test_check_and_explain_say_what_auto_is_and_why(cube: Path, invoke: Callable[..., Any]) -> None:
+    Path("scan.yaml").write_text(
+        "version: 1\nsource: {use: auto, with: {path: cube.npy}}\nresample: {with: {group_size: 5}}\nlevels: 1\n"
+    )
+    because = "cube.npy is taken for it: uint8 of shape (20, 8, 2) in a .npy file"
+    assert invoke("check", "scan.yaml").stdout == (
+        f"scan.yaml: ok, 1 level on packed-npy: 20 binary frames of 8x16\nsource is packed-npy: {because}\n"
+    )
+    printed = invoke("explain", "scan.yaml").stdout
+    assert f"\n  use: packed-npy  # photonpano 0.1.0, {because}\n" in printed
+    assert f"\n    path: {cube}\n" in printed
