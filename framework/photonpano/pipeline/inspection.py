@@ -43,9 +43,9 @@ def saturated_share(source: Source) -> float:
 
     Their flux is unknown.
     """
-    highest = 2**source.info.bit_depth - 1
+    highest = source.response.mean_count(np.array([np.inf], np.float32)).item()
     spans = _spread(source.info)
-    full = np.logical_and.reduce([source.counts(span) == highest * len(span) for span in spans])
+    full = np.logical_and.reduce([source.counts(span) >= highest * len(span) for span in spans])
     return float(full[source.valid].mean())
 
 

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from pydantic import Field
+
+from photonpano import Config, SourceContribution, SpecPath, StreamInfo, discover
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
-
-CAPTURE = (200, 96, 160)
 
 
 @pytest.fixture
@@ -64,18 +65,26 @@ def test_what_frames_cannot_hold_is_refused(cube: Path, invoke: Callable[..., An
     )
 
 
+class GreyConfig(Config):
+    path: SpecPath = Field(description="the capture")
+
+
+class Grey:
+    info = StreamInfo(5, 6, 19, None, "intensity", 8)
+    valid = np.ones((6, 19), bool)
+
+    def __enter__(self) -> Grey:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
 def test_intensities_are_refused(cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    from photonpano import StreamInfo
-    from photonpano_core.packed_npy import PackedNpySource
-
-    built = PackedNpySource.__init__
-
-    def grey(self: PackedNpySource, config: Any) -> None:
-        built(self, config)
-        self.info = StreamInfo(*CAPTURE, None, "intensity", 8)
-
-    monkeypatch.setattr(PackedNpySource, "__init__", grey)
-    result = invoke("convert", "cube.npy", "out.npy")
+    grey = SourceContribution(name="grey", summary="Toy", config=GreyConfig, build=lambda *_: Grey())
+    catalog = discover().including(grey)
+    monkeypatch.setattr("photonpano.spec.loading.discover", lambda: catalog)
+    result = invoke("convert", "cube.npy", "out.npy", "--source", "grey")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == (
         "error: cannot write out.npy: packed .npy files hold binary frames, and this source gives intensities\n"
