@@ -100,8 +100,7 @@ def test_results_come_in_order_and_few_are_waiting() -> None:
 
 
 def test_an_error_comes_when_it_is_its_turn() -> None:
-    found = []
+    results = in_order(lambda item: 1 / (3 - item), range(9), threads=2)
+    assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
     with pytest.raises(ZeroDivisionError):
-        for result in in_order(lambda item: 1 / (3 - item), range(9), threads=2):
-            found.append(result)
-    assert len(found) == 3
+        next(results)
