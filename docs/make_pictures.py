@@ -106,6 +106,7 @@ def main() -> None:
         finish(load_spec(path, overrides=overrides, output=in_folder(folder, name)), name, capture)
     save("first-panorama.png", picture(tifffile.imread(in_folder(folder, "scan") / "panorama.tiff"), 0.67))
     save("baselines.png", baselines(folder))
+    save("hot-pixels.png", hot_pixels(folder))
 
 
 def in_folder(folder: Path, name: str) -> Path:
@@ -200,6 +201,23 @@ def baselines(folder: Path) -> Picture:
             x, y = (trajectory["canvas"] @ (*PLACE, 1))[:2].round().astype(int)
         crop = picture(flux[y - 54 : y + 54, x - 54 : x + 54], 0.67)
         pictures.append(labelled(cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8), file))
+    return beside(pictures)
+
+
+def hot_pixels(folder: Path) -> Picture:
+    """Return the same place of two panoramas of a sensor with hot pixels, three times as large: as it is, and corrected."""
+    pictures = []
+    for name, corrections in {"hot pixels": "[]", "hot pixels masked": "[hot-pixels]"}.items():
+        directory = in_folder(folder, name)
+        overrides = [f"corrections={corrections}", "source.with.sensor.hot_rate=[0.5, 2]"]
+        plan = load_spec(EXAMPLES / "hot-pixels.yaml", overrides=overrides, output=directory)
+        if not (directory / "run.json").exists():
+            run(plan)
+        flux = tifffile.imread(directory / "panorama.tiff")
+        y, x = flux.shape[0] // 2, flux.shape[1] // 2
+        crop = picture(flux[y - 54 : y + 54, x - 72 : x + 72], 0.67)
+        large = cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
+        pictures.append(labelled(large, f"corrections: {corrections}"))
     return beside(pictures)
 
 

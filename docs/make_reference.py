@@ -18,6 +18,7 @@ import typer
 
 from photonpano import discover, hookspecs
 from photonpano.cli.app import app
+from photonpano.corrections import CORRECTIONS
 from photonpano.registry import KINDS
 from photonpano.registry.description import config_rows
 from photonpano.spec.resolution import SETTINGS
@@ -54,6 +55,10 @@ def generated(what: str) -> str:
     match kind:
         case "settings":
             return config_table(LevelSettings if name == ["levels"] else SETTINGS[name[0]])
+        case "corrections":
+            return corrections()
+        case "correction":
+            return config_table(CORRECTIONS[name[0]])
         case "command":
             return command(name)
         case "hook":
@@ -83,6 +88,15 @@ def components() -> str:
         if entry.plugin == "photonpano"
     ]
     return table(["Section", "`use`", "What it is"], rows)
+
+
+def corrections() -> str:
+    """Return all corrections, and what they do."""
+    rows = []
+    for name, model in CORRECTIONS.items():
+        shown = f"[`{name}`](#{name})" if model.model_fields else f"`{name}`"
+        rows.append([shown, " ".join((inspect.getdoc(model) or "").partition("\n\n")[0].split())])
+    return table(["Correction", "What it does"], rows)
 
 
 def command(names: Sequence[str]) -> str:

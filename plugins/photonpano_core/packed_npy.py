@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from photonpano import Config, FrameSpan, InputError, SourceContribution, SpecPath, StreamInfo
+from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinaryResponse, packed_counts
 
 if TYPE_CHECKING:
@@ -33,9 +33,6 @@ class PackedNpyConfig(Config):
     width: int | None = Field(
         None, ge=1, description="columns of a frame, in px; needed only where it is not eight times the bytes of a row"
     )
-    bad_pixels: SpecPath | None = Field(
-        None, description="a bool .npy file of frame size, true for pixels that must not be used, such as hot ones"
-    )
 
 
 class PackedNpySource:
@@ -50,7 +47,8 @@ class PackedNpySource:
         n_frames, height, _ = header.shape
         self.info = StreamInfo(n_frames, height, width, config.frame_rate_hz)
         self.response = BinaryResponse()
-        self.valid = _valid(config.bad_pixels, self.info.frame_shape)
+        self.valid = np.ones(self.info.frame_shape, np.bool_)
+        self.valid.flags.writeable = False
         self._frame = header.shape[1:]
         self._offset = header.offset
         self._path = config.path
@@ -192,32 +190,23 @@ def _require_whole(path: Path, header: _Header) -> None:
         )
 
 
-def _valid(bad_pixels: Path | None, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    if bad_pixels is None:
-        valid = np.ones(frame_shape, dtype=np.bool_)
-    else:
-        header = _header(bad_pixels)
-        if header.dtype != np.bool_ or header.shape != frame_shape:
-            raise InputError(
-                f"{bad_pixels} holds {header.dtype} values of shape {header.shape}; bad pixels are bool of the frame's shape "
-                f"{frame_shape}"
-            )
-        _require_whole(bad_pixels, header)
-        valid = ~np.load(bad_pixels, allow_pickle=False)
-        if not valid.any():
-            raise InputError(f"{bad_pixels} marks every pixel as bad; true is for pixels that must not be used")
-    valid.flags.writeable = False
-    return valid
-
-
 def _check(config: PackedNpyConfig) -> Sequence[str]:
-    """Do all but map the data: headers and masks are small."""
+    """Do all but read the data."""
     try:
-        header, width = _layout(config)
-        _valid(config.bad_pixels, (header.shape[1], width))
+        _layout(config)
     except InputError as error:
         return (str(error),)
     return ()
+
+
+def _recognise(path: Path) -> Recognised | None:
+    if path.suffix != ".npy" or not path.is_file():
+        return None
+    try:
+        header, _ = _layout(PackedNpyConfig(path=path))
+    except InputError:
+        return None
+    return Recognised({"path": path}, f"uint8 of shape {header.shape} in a .npy file")
 
 
 PACKED_NPY = SourceContribution(
@@ -226,4 +215,5 @@ PACKED_NPY = SourceContribution(
     config=PackedNpyConfig,
     build=lambda config, _: PackedNpySource(config),
     check=_check,
+    recognise=_recognise,
 )

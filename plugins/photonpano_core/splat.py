@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano import FrameSpan, VirtualExposure
+from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, VirtualExposure
 from photonpano.geometry import apply, corners, inverse
 from photonpano.merging import PhotonSum
 from photonpano_core.exposures import scaled_shape, summed_as_they_lie, to_exposure
@@ -36,7 +36,16 @@ class SplatMerger:
     """
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        """Merge a group; see `photonpano.Merger`."""
+        """Merge a group; see `photonpano.Merger`.
+
+        Raises:
+            InputError: something is to be taken out of sums, of which this merger makes none.
+        """
+        if isinstance(source, LinearlyCorrectedSource):
+            raise InputError(
+                "splat puts photons one by one, so that dark counts cannot be taken out, nor pixels interpolated: merge with "
+                "photon-mle, or let corrections only move and mask pixels"
+            )
         if trajectory is None:
             photons = summed_as_they_lie(source, group, scale)
         else:

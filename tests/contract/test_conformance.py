@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from photonpano import discover
+from photonpano.registry.auto import AUTO
 from photonpano.registry.chain import CHAIN
 from photonpano.testing.conformance import Conformance
 
@@ -18,7 +19,7 @@ OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.plugin ==
 @pytest.fixture(scope="module")
 def tested() -> set[tuple[str, str]]:
     """Return kind and name of what has a subclass of the kit that pytest collects."""
-    found = {(CHAIN.kind, CHAIN.name)}
+    found = {(own.kind, own.name) for own in (AUTO, CHAIN)}
     for path in PLUGINS.glob("*/test_conformance.py"):
         spec = importlib.util.spec_from_file_location(f"conformance_of_{path.parent.name}", path)
         module = importlib.util.module_from_spec(spec)
@@ -39,3 +40,11 @@ class TestChainOfBackends(Conformance):
 
     kind = "locator"
     contribution = CHAIN
+
+
+class TestAuto(Conformance):
+    """It stands for the source that recognises a path; the same holds."""
+
+    kind = "source"
+    contribution = AUTO
+    config = {"path": "capture.npy"}

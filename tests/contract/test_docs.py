@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 
 from photonpano import discover, hookspecs, parse_spec
 from photonpano.cli.app import app
+from photonpano.corrections import CORRECTIONS
 from photonpano.pipeline.capture import truth_path
 
 if TYPE_CHECKING:
@@ -280,6 +281,12 @@ def test_every_section_and_component_has_its_table():
     page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
     wanted = [f"settings {name}" for name in ("levels", "graph", "render", "output", "run")]
     wanted += [f"{entry.kind} {entry.name}" for entry in discover().rows if entry.plugin == "photonpano"]
+    assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
+
+
+def test_every_correction_has_its_table():
+    page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
+    wanted = ["corrections", *(f"correction {name}" for name, model in CORRECTIONS.items() if model.model_fields)]
     assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
 
 

@@ -179,10 +179,11 @@ def test_masked_hot_pixels_leave_no_trace(simulated: Callable) -> None:
     capture = simulated(path={"kind": "pan", "length_px": 40}, n_frames=120, sensor=sensor)
     with np.load(truth_path(capture)) as archive:
         np.save(capture.with_name("hot.npy"), archive["hot_pixels"])
-    source = {"use": "packed-npy", "with": {"path": str(capture), "bad_pixels": str(capture.with_name("hot.npy"))}}
-    spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 40}}, "levels": 1}
+    source = {"use": "packed-npy", "with": {"path": str(capture)}}
+    mask = {"mask": {"file": str(capture.with_name("hot.npy"))}}
+    spec = {"version": 1, "source": source, "corrections": [mask], "resample": {"with": {"group_size": 40}}, "levels": 1}
     masked = outcome_of(parse_spec(spec)).panorama
-    lit = outcome_of(parse_spec(spec, overrides=["source.with.bad_pixels=null"])).panorama
+    lit = outcome_of(parse_spec(spec, overrides=["corrections=[]"])).panorama
     assert not np.isnan(masked.flux[20:-20, 60:-60]).any()  # the part that all frames saw
     # A streak of light 40 px long behind each of 200 pixels raises the mean.
     assert np.nanmean(lit.flux) > 1.01 * np.nanmean(masked.flux)

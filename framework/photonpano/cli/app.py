@@ -8,10 +8,14 @@ from typer.core import TyperGroup
 
 import photonpano
 from photonpano.cli.check import check
+from photonpano.cli.convert import convert
+from photonpano.cli.dark import dark
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
+from photonpano.cli.info import info
 from photonpano.cli.outcome import reported
 from photonpano.cli.plugins import plugins
+from photonpano.cli.preview import preview
 from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
@@ -36,7 +40,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, explain, simulate, evaluate, schema, warm_up):
+for command in (run, check, explain, info, preview, convert, simulate, dark, evaluate, schema, warm_up):
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

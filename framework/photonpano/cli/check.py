@@ -23,5 +23,7 @@ def check(spec: Spec, overrides: Overrides = None) -> None:
         count = len(plan.levels)
         levels = f"{'up to ' if plan.until_converged else ''}{count} level{'' if count == 1 else 's'}"
         typer.echo(f"{spec}: ok, {levels} on {plan.source.contribution.name}: {capture_words(source.info)}")
+        for decision in plan.decisions:
+            typer.echo(f"{decision.what} is {decision.value}: {decision.reason}")
         for reason in dict.fromkeys(groups for groups in foreseen_groups(plan, source) if isinstance(groups, str)):
             typer.echo(f"groups are {reason}")

@@ -112,7 +112,7 @@ class _Writer:
             if isinstance(value, dict) and value:
                 yield f"{indent}{key}:"
                 yield from self._mapping(value, path, f"{indent}  ")
-            elif value and re.fullmatch(r"(levels\.\d+\.)?locate\.fallback", path):
+            elif value and re.fullmatch(r"corrections|(levels\.\d+\.)?locate\.fallback", path):
                 yield f"{indent}{key}:"
                 for index, item in enumerate(value):
                     yield from self._item(item, f"{path}.{index}", f"{indent}  ")
@@ -121,13 +121,13 @@ class _Writer:
                 comment = ", ".join(filter(None, remarks))
                 yield f"{indent}{key}: {flow(value)}" + (f"  # {comment}" if comment else "")
 
-    def _item(self, mapping: Mapping[str, Any], where: str, indent: str) -> Iterator[str]:
-        first, *others = self._mapping(mapping, where, "")
+    def _item(self, item: Mapping[str, Any] | str, where: str, indent: str) -> Iterator[str]:
+        first, *others = [item] if isinstance(item, str) else self._mapping(item, where, "")
         yield f"{indent}- {first}"
         yield from (f"{indent}  {line}" for line in others)
 
     def _origin(self, path: str, value: Any) -> str:
-        """Say which plugin gives a component."""
+        """Say which plugin gives a component, and why it was chosen where the spec leaves that open."""
         from photonpano.registry import KINDS
 
         *_, section, key = ["", *re.sub(r"\.fallback\.\d+", "", path).split(".")]
@@ -135,7 +135,8 @@ class _Writer:
         if key != "use" or not kinds:
             return ""
         entry = self._catalog.find(kinds[0], value)
-        return f"{entry.plugin} {entry.version}"
+        reasons = [decision.reason for decision in self._plan.decisions if decision.what == path.removesuffix(".use")]
+        return ", ".join([f"{entry.plugin} {entry.version}", *reasons])
 
     def _written(self, path: str) -> str:
         """Say where a value comes from, unless it stands in the file as it is."""

@@ -15,6 +15,10 @@ WRONG_SPEC = 2
 INTERRUPTED = 130
 
 
+class WrongArgumentError(PhotonpanoError):
+    """An argument or an option of a command is wrong."""
+
+
 @contextmanager
 def reported(*, debug: bool = False) -> Iterator[None]:
     """Report the errors of a command that are made for users; others are defects and keep their traceback.
@@ -62,7 +66,7 @@ def _told(error: PhotonpanoError) -> int:
     """Print an error, every problem of a spec on a line of its own, and return its exit code."""
     if not isinstance(error, SpecError):
         typer.echo(f"error: {error}", err=True)
-        return FAILED
+        return WRONG_SPEC if isinstance(error, WrongArgumentError) else FAILED
     for problem in error.problems:
         typer.echo(problem, err=True)
     count = len(error.problems)

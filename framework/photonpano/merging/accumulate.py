@@ -14,6 +14,7 @@ import numpy as np
 from photonpano.geometry import translation
 from photonpano.merging.landing import landings
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
+from photonpano.protocols import LinearlyCorrectedSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -52,7 +53,9 @@ class PhotonSum:
         """
         unknown = self.weight < MIN_WEIGHT
         seen = np.asarray(np.maximum(self.weight, MIN_WEIGHT), dtype=np.float32)
-        flux, weight = response.flux(np.asarray(self.counts / seen, dtype=np.float32), seen), self.weight.copy()
+        # Where dark counts were taken out, chance may leave less than nothing.
+        mean = np.asarray(np.maximum(self.counts, 0) / seen, dtype=np.float32)
+        flux, weight = response.flux(mean, seen), self.weight.copy()
         flux[unknown], weight[unknown] = np.nan, 0
         return flux, weight
 
@@ -74,20 +77,21 @@ def accumulate(
         see it; counts and weights are spread alike, so that their quotient is not biased at masks and borders.
 
     Args:
-        source: the capture; masked pixels do not count.
+        source: the capture; masked pixels do not count, and what a `LinearlyCorrectedSource` takes out of sums is taken out.
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
         advance: is told the number of frames of each chunk; first of all chunks together that miss the grid.
         pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
         threads: how many.
-        counts_of: sums the frames of a span, if not the source itself.
+        counts_of: sums the frames of a span, if not the source itself; nothing is taken out of them yet.
     """
     total = _Total.zeros(shape)
     # Narrow enough that several threads find work wherever frames lie on the grid.
     n_parts = 1 if threads == 1 else max(threads, shape[0] // _PART_ROWS)
     parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], n_parts)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
+    corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
     placed = landings(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
     landed = [(chunk, landing) for chunk, landing in zip(chunks, placed, strict=True) if landing.rows and landing.columns]
     advance = advance or _no_one
@@ -98,7 +102,7 @@ def accumulate(
     adding: Iterable[None] = ()
     for first in range(0, len(landed), _BATCH):
         batch = landed[first : first + _BATCH]
-        summed = list(start(partial(_summed, counts_of or source.counts, masked), *zip(*batch, strict=True)))
+        summed = list(start(partial(_summed, counts_of or source.counts, corrected, masked), *zip(*batch, strict=True)))
         deque(adding, maxlen=0)
         adding = start(partial(_Total.add, summed=summed), parts)
         for chunk, _ in batch:
@@ -124,9 +128,18 @@ class _Summed:
     seen: FluxImage | None
 
 
-def _summed(counts_of: Callable[[FrameSpan], Counts], masked: FluxImage | None, chunk: Chunk, landing: Landing) -> _Summed:
+def _summed(
+    counts_of: Callable[[FrameSpan], Counts],
+    corrected: Callable[[Counts, int], FluxImage] | None,
+    masked: FluxImage | None,
+    chunk: Chunk,
+    landing: Landing,
+) -> _Summed:
     n_frames, shrink = len(chunk.span), landing.shrink
-    counts: FluxImage | Counts = np.ascontiguousarray(counts_of(chunk.span))
+    raw = counts_of(chunk.span)
+    counts: FluxImage | Counts = np.ascontiguousarray(raw)
+    if corrected is not None:
+        counts = np.ascontiguousarray(corrected(raw, n_frames))
     if masked is not None:
         lit, seen = counts.astype(np.float32) * masked, masked * np.float32(n_frames)
         return _Summed(landing, n_frames, average_squares(lit, shrink), average_squares(seen, shrink))

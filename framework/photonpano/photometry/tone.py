@@ -22,6 +22,13 @@ def linear_to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
-def tone_mapped(flux: NDArray[np.float32], white: float) -> NDArray[np.uint8]:
-    """Return 8-bit sRGB for looking at: `white` photons per pixel per frame become 255; unknown pixels are black."""
-    return np.asarray(np.nan_to_num(linear_to_srgb(flux / white)) * 255 + 0.5).astype(np.uint8)
+def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -> NDArray[np.uint8]:
+    """Return 8 bits for looking at: `white` photons per pixel per frame become 255; unknown pixels are black.
+
+    Args:
+        flux: photons per pixel per frame period, NaN where unknown.
+        white: the flux from which on everything is white.
+        srgb: whether levels follow the sRGB curve, as screens expect, or are in proportion to the flux.
+    """
+    level = linear_to_srgb(flux / white) if srgb else np.clip(flux / white, 0, 1)
+    return np.asarray(np.nan_to_num(level) * 255 + 0.5).astype(np.uint8)

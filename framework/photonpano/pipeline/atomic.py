@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -33,16 +34,63 @@ def atomic_path(final: Path) -> Iterator[Path]:
     """
     temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.partial{final.suffix}")
     try:
+        with _becoming(final, temporary):
+            temporary.touch(exist_ok=False)
+            yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def part_path(final: Path) -> Path:
+    """Return where a file that can be continued lies until it is whole: `cube.npy.part` for `cube.npy`."""
+    return final.with_name(f"{final.name}.part")
+
+
+@contextmanager
+def resumable_path(final: Path) -> Iterator[Path]:
+    """Lend the `part_path` of `final`, which becomes `final` when the block ends well.
+
+    When the block raises, Ctrl-C included, it is left as it is, to be continued. It may be there before, for that reason.
+
+    Raises:
+        OutputError: the file cannot be written. Every `OSError` of the block is taken to be one of writing.
+    """
+    with _becoming(final, part_path(final)):
+        yield part_path(final)
+
+
+@contextmanager
+def atomic_folder(final: Path) -> Iterator[Path]:
+    """Lend an empty folder beside `final`, which becomes `final` when the block ends well, and otherwise is removed.
+
+    Raises:
+        OutputError: there is something under that name, or the folder cannot be written.
+    """
+    place = final.absolute()
+    temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
+    try:
+        if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
+            raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
+        temporary.mkdir()
+        yield temporary
+        temporary.replace(place)
+    except OSError as error:
+        raise OutputError(_message(final, error)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _becoming(final: Path, temporary: Path) -> Iterator[None]:
+    """Rename a file when the block ends well."""
+    try:
         if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        temporary.touch(exist_ok=False)
-        yield temporary
+        yield
         _flush_to_disk(temporary)
         temporary.replace(final)
     except OSError as error:
         raise OutputError(_message(final, error)) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _flush_to_disk(path: Path) -> None:

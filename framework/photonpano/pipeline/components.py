@@ -10,8 +10,11 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
-from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError
+from photonpano.corrections import CorrectedSource
+from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError, SpecError
+from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.threads import thread_count
+from photonpano.spec.tree import Place
 from photonpano.values import Decision
 
 if TYPE_CHECKING:
@@ -21,7 +24,7 @@ if TYPE_CHECKING:
     from photonpano.contributions import Contribution
     from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
     from photonpano.spec.plan import Choice, Plan
-    from photonpano.values import DecisionValue, Group
+    from photonpano.values import CaptureSummary, DecisionValue, Group
 
 HALVED_LEVELS = 2
 """So many levels, at most, are located at half size unless the spec says otherwise."""
@@ -76,13 +79,26 @@ class Level:
 
 
 def build_source(plan: Plan) -> Source:
-    """Open the capture of a plan.
+    """Open the capture of a plan, with its corrections.
 
     Raises:
         InputError: the capture cannot be used as it is.
         PluginError: a library is missing, or the plugin failed in its own way.
+        SpecError: a correction does not suit the capture, or its file is not what it should be.
     """
-    return _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+    source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+    if not plan.corrections:
+        return source
+
+    def blame(index: int, message: str) -> SpecError:
+        where = f"corrections.{index}"
+        return SpecError([plan.places.get(where, Place(where)).problem(message)])
+
+    try:
+        return CorrectedSource(NamedSource(source, origin_of(plan.source)), plan.corrections, blame)
+    except BaseException:
+        source.close()
+        raise
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
@@ -155,6 +171,22 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
         except CaptureUnreadError as error:
             foreseen.append(str(error))
     return foreseen
+
+
+def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
+    """Return what the resampler of the first level chooses for a capture that looks like this, such as its group size.
+
+    Raises:
+        InputError: the capture is too short for it.
+    """
+    decisions: list[Decision] = []
+    choice = plan.levels[0].resample
+    threads = thread_count(plan.run)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
+    resampler: Resampler = _built(choice, context)
+    with _blaming(origin_of(choice), 1):
+        resampler.groups(source.info.n_frames, 1)
+    return decisions
 
 
 def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], None]:

@@ -15,15 +15,19 @@ from photonpano.pipeline.progress import Quiet
 from photonpano.pipeline.record import peak_memory_bytes
 from photonpano.pipeline.stopwatch import Stopwatch
 from photonpano.pipeline.threads import one_thread_inside, thread_count
+from photonpano.protocols import LinearlyCorrectedSource, PackedSource
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import TracebackType
+
+    from numpy.typing import NDArray
 
     from photonpano.pipeline.loop import LevelResult
     from photonpano.protocols import Source
     from photonpano.spec.plan import Plan
-    from photonpano.values import BoolArray, Counts, Frames, Response, StreamInfo
+    from photonpano.values import BoolArray, Counts, FluxImage, Frames, Response, StreamInfo
 
 TRIAL_GROUPS = 12
 """So many groups of the first level, from the middle of the capture, are run through all levels."""
@@ -53,13 +57,20 @@ class Forecast:
 
 
 class PartOfSource:
-    """Some frames of a capture, numbered from 0."""
+    """Some frames of a capture, numbered from 0. It has `packed` and `corrected` if the capture has them."""
+
+    packed: Callable[[FrameSpan], NDArray[np.uint8]]
+    corrected: Callable[[Counts, int], FluxImage]
 
     def __init__(self, source: Source, span: FrameSpan) -> None:
         self._source, self._start = source, span.start
         self.info: StreamInfo = replace(source.info, n_frames=len(span))
         self.response: Response = source.response
         self.valid: BoolArray = source.valid
+        if isinstance(source, PackedSource):
+            self.packed = lambda span: source.packed(self._there(span))
+        if isinstance(source, LinearlyCorrectedSource):
+            self.corrected = source.corrected
 
     def counts(self, span: FrameSpan) -> Counts:
         """Sum the frames of a span: (H, W) uint32."""

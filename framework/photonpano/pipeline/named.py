@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from photonpano.errors import PhotonpanoError, PluginError
+from photonpano.protocols import LinearlyCorrectedSource, PackedSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from photonpano.pipeline.components import Level
     from photonpano.protocols import Source, Trajectory
-    from photonpano.values import BoolArray, Counts, FloatArray, Frames, FrameSpan, Response, StreamInfo
+    from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Response, StreamInfo
 
 ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
 
@@ -24,14 +25,23 @@ ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
 class NamedSource:
     """A source that is named in what it raises by mistake, whoever reads it: a merger, the renderer, a look at the capture.
 
+    It has `packed` and `corrected` if the source has them.
+
     Args:
         source: the source.
         origin: who provides it, such as "source 'packed-npy' of photonpano 0.1.0".
     """
 
+    packed: Callable[[FrameSpan], NDArray[np.uint8]]
+    corrected: Callable[[Counts, int], FluxImage]
+
     def __init__(self, source: Source, origin: str) -> None:
         self._source = source
         self._origin = origin
+        if isinstance(source, PackedSource):
+            self.packed = lambda span: self._packed(source, span)
+        if isinstance(source, LinearlyCorrectedSource):
+            self.corrected = source.corrected
 
     @property
     def info(self) -> StreamInfo:
@@ -73,6 +83,10 @@ class NamedSource:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+    def _packed(self, source: PackedSource, span: FrameSpan) -> NDArray[np.uint8]:
+        height, width = self.info.frame_shape
+        return self._checked(source.packed, span, (len(span), height, -(-width // 8)))
 
     def _checked(self, read: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
         try:

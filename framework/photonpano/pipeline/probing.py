@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from photonpano.protocols import LinearlyCorrectedSource
 from photonpano.values import CaptureSummary, FrameSpan
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def _look(source: Source, centre: float, lengths: Sequence[int]) -> tuple[float,
 
 def _common_shift(images: Sequence[FluxImage]) -> float | None:
     """Return by how much each of three images is shifted against the one before, in its pixels; None if they do not agree."""
-    if not all(image.any() for image in images):
+    if not all(np.ptp(image) for image in images):
         return None
     first, second, both = (_shift(images[k], images[j]) for k, j in ((0, 1), (1, 2), (0, 2)))
     if max(np.linalg.norm(second - first), np.linalg.norm(both - first - second)) > _ALIKE:
@@ -106,8 +107,10 @@ def _mean_count(source: Source, span: FrameSpan) -> FluxImage:
     height, width = (side // factor * factor for side in source.info.frame_shape)
     size = (width // factor, height // factor)
     valid = source.valid[:height, :width].astype(np.float32)
-    counts = source.counts(span)[:height, :width] * valid
-    share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, counts.astype(np.float32)))
+    counts = source.counts(span)
+    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
+    lit = lit[:height, :width] * valid
+    share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, lit.astype(np.float32)))
     mean = np.full(share.shape, np.nan, dtype=np.float32)
     np.divide(summed, share * len(span), out=mean, where=share > 0)
     return mean

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.compiling import told_once
+from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_levels, origin_of
+from photonpano.pipeline.inspection import require_photons
 from photonpano.pipeline.loop import estimate_motion
 from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.observers import NOBODY
@@ -32,7 +34,6 @@ from photonpano.pipeline.record import (
 )
 from photonpano.pipeline.threads import one_thread_inside, thread_count
 from photonpano.spec.tree import Place
-from photonpano.values import Decision, FrameSpan
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,10 +48,6 @@ if TYPE_CHECKING:
     from photonpano.protocols import Source
     from photonpano.spec.plan import Plan
     from photonpano.values import BoolArray, FloatArray, Panorama
-
-_PROBES = 16
-_PROBE_FRAMES = 16
-
 
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
@@ -112,6 +109,7 @@ def execute(
         PluginError: a component failed in its own way, or broke its contract.
     """
     start = time.perf_counter()
+    corrected = source if isinstance(source, CorrectedSource) else None
     source = NamedSource(source, origin_of(plan.source))
     threads = thread_count(plan.run)
     stream = source.info
@@ -121,7 +119,7 @@ def execute(
     except InputError as error:
         # The source knows its file, the spec knows where that is named.
         raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
-    decisions: list[Decision] = []
+    decisions = [*plan.decisions, *(corrected.decisions if corrected else ())]
     levels = build_levels(plan, source, decisions)
     with one_thread_inside(), told_once(partial(progress.note, COMPILING)):
         results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged, observers)
@@ -185,31 +183,6 @@ def write_outcome(folder: RunFolder, outcome: RunOutcome, frame_shape: tuple[int
         outcome.homographies, outcome.located, outcome.std_px, outcome.canvas.transform, frame_shape, outcome.reference
     )
     folder.write_record(outcome.record)
-
-
-def require_photons(source: Source) -> None:
-    """Look at a few frames all over the capture, and refuse one that is all dark or all lit.
-
-    Raises:
-        InputError: no pixel, or every pixel, is lit in all of them.
-    """
-    n_frames, valid = source.info.n_frames, source.valid
-    spans = [source.info.span]
-    if n_frames > _PROBES * _PROBE_FRAMES:
-        starts = np.linspace(0, n_frames - _PROBE_FRAMES, _PROBES).astype(int)
-        spans = [FrameSpan(int(start), int(start) + _PROBE_FRAMES) for start in starts]
-    lit = sum(int(source.counts(span)[valid].sum()) for span in spans)
-    seen = sum(len(span) for span in spans)
-    if lit == 0:
-        raise InputError(
-            f"no pixel is lit in any of {seen} frames looked at all over the capture; "
-            "check that the file is the right one, and that the lens was open"
-        )
-    if source.info.kind == "binary" and lit == seen * int(valid.sum()):
-        raise InputError(
-            f"every pixel is lit in all of {seen} frames looked at all over the capture, so that no flux can be told; "
-            "check the layout of the file, or expose less"
-        )
 
 
 def _reference_frame(plan: Plan, n_frames: int) -> int:

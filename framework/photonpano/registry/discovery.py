@@ -8,6 +8,7 @@ from importlib.metadata import version as version_of
 
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
+from photonpano.registry.auto import AUTO
 from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, make_entry, ordered
 from photonpano.registry.chain import CHAIN
 from photonpano.registry.observers import Observer
@@ -24,7 +25,7 @@ def discover() -> Catalog:
     environment variable `PHOTONPANO_DISABLE_PLUGINS` names, by its distribution or its entry point, is not even imported: see
     `Catalog.disabled`. Names there that are no plugin's are logged as a warning.
     """
-    rows = [make_entry(CHAIN, PROJECT, version_of(PROJECT), "built in")]
+    rows = [make_entry(own, PROJECT, version_of(PROJECT), "built in") for own in (AUTO, CHAIN)]
     broken: list[BrokenPlugin] = []
     disabled: list[DisabledPlugin] = []
     observers: list[Observer] = []

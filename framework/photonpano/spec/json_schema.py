@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic.json_schema import models_json_schema
 
+from photonpano.corrections import CORRECTIONS
+from photonpano.registry.auto import AutoConfig
 from photonpano.registry.chain import CHAIN, ChainConfig
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.wording import TolerantJsonSchema
+from photonpano.spec.corrections import corrections_schema
 from photonpano.spec.resolution import DEFAULT_FALLBACK, DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
 from photonpano.spec.settings import LevelSettings, OutputSettings
 
@@ -33,6 +36,7 @@ def json_schema(catalog: Catalog) -> Schema:
     offered = Counter((entry.kind, entry.name) for entry in catalog.rows)
     entries = [entry for entry in catalog.rows if offered[entry.kind, entry.name] == 1]
     models: list[type[BaseModel]] = [*(entry.contribution.config for entry in entries), LevelSettings, *SETTINGS.values()]
+    models += CORRECTIONS.values()
     schemas, definitions = _schemas(models)
     definitions[OutputSettings.__name__].pop("required")  # the run folder has a default that depends on the spec's name
     level = definitions[LevelSettings.__name__]
@@ -47,6 +51,8 @@ def json_schema(catalog: Catalog) -> Schema:
     definitions["fallback"] = {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}
     if ChainConfig in schemas:
         definitions[_definition(schemas[ChainConfig])]["properties"]["backends"]["items"] = one
+    if AutoConfig in schemas:  # what it hands on is known once a source has recognised the path
+        definitions[_definition(schemas[AutoConfig])]["additionalProperties"] = True
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
@@ -60,6 +66,8 @@ def json_schema(catalog: Catalog) -> Schema:
         "required": ["version", "source"],
         "properties": {
             "version": {"const": VERSION, "description": "the version of the format"},
+            "source": sections.pop("source"),
+            "corrections": corrections_schema(schemas),
             **sections,
             "levels": {
                 "description": "how many levels, as many as it takes, or an entry for each level that overrides stages for it",

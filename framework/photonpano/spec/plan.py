@@ -17,9 +17,11 @@ if TYPE_CHECKING:
         ResamplerContribution,
         SourceContribution,
     )
+    from photonpano.corrections import Correction
     from photonpano.registry import Observer
     from photonpano.spec.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.spec.tree import Place
+    from photonpano.values import Decision
 
 ContributionT = TypeVar("ContributionT", covariant=True)
 
@@ -62,6 +64,7 @@ class Plan:
 
     Attributes:
         source: the capture.
+        corrections: what is done to its frames before anything else, in order.
         levels: one plan for each level, in order.
         until_converged: the loop ends once the motion has settled, at the latest after the last of `levels`, all of them alike.
         graph: which pairs are registered, and what happens when the graph falls apart.
@@ -72,9 +75,11 @@ class Plan:
         places: where each value of the spec was written, by its path, for messages that come up later.
         file: the spec file, None for a spec that was built in Python.
         observers: the plugins that watch the run.
+        decisions: what the spec leaves open, and reading it has decided: which source recognises the capture.
     """
 
     source: Choice[SourceContribution[Any]]
+    corrections: tuple[Correction, ...]
     levels: tuple[LevelPlan, ...]
     until_converged: bool
     graph: GraphSettings
@@ -85,3 +90,4 @@ class Plan:
     places: Mapping[str, Place] = field(default_factory=dict)
     file: Path | None = None
     observers: tuple[Observer, ...] = ()
+    decisions: tuple[Decision, ...] = ()

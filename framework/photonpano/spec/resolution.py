@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import PluginError, SpecError
+from photonpano.registry.auto import AUTO
 from photonpano.registry.chain import CHAIN
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.suggestions import listed
+from photonpano.spec.auto import found_source
 from photonpano.spec.chain import NO_PART, spelled_out
 from photonpano.spec.checks import STAGES, complaints
+from photonpano.spec.corrections import resolved_corrections, written_corrections
 from photonpano.spec.plan import Choice, LevelPlan, Plan
 from photonpano.spec.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
 from photonpano.spec.tree import Value, given, joined
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 
     from photonpano.errors import Problem
     from photonpano.registry import Catalog, Entry, Kind
+    from photonpano.values import Decision
 
 VERSION = 1
 LEVELS = 3
@@ -43,7 +47,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "run": RunSettings,
 }
 """The framework's own sections."""
-SECTIONS = ("version", *KIND_OF, "levels", *SETTINGS)
+SECTIONS = ("version", "source", "corrections", *STAGES, "levels", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
 
 
@@ -92,6 +96,7 @@ class _Resolver:
         self.catalog = catalog
         self.problems = problems
         self.places = root.places()
+        self.decisions: list[Decision] = []
 
     def plan(self) -> Plan | None:
         """Resolve everything; None if there are problems."""
@@ -104,6 +109,7 @@ class _Resolver:
         source = self.select("source", sections["source"]).choice
         if source is not None:
             self.problems += map(sections["source"].head.problem, complaints(source))
+        corrections = resolved_corrections(sections["corrections"], self.directory, self.problems)
         stages = {name: self.select(name, sections[name]) for name in STAGES}
         levels = [self.level(each, stages) for each in self.levels(sections["levels"])]
         until_converged = sections["levels"].content == UNTIL_CONVERGED
@@ -112,6 +118,7 @@ class _Resolver:
             return None
         plan = Plan(
             source,
+            corrections,
             tuple(filter(None, levels)),
             until_converged,
             **settings,
@@ -119,6 +126,7 @@ class _Resolver:
             places=self.places,
             file=self.root.head.file,
             observers=self.catalog.observers,
+            decisions=tuple(self.decisions),
         )
         return replace(plan, document=self.document(plan, stages))
 
@@ -152,6 +160,8 @@ class _Resolver:
         self.known_keys(content, known, entry.contribution.config.model_fields if entry else ())
         if entry is not None and entry.contribution is CHAIN:
             return self.chain(section, value, keys, base)
+        if entry is not None and entry.contribution is AUTO:
+            return self.auto(kind, value, content["use"], keys)
         choice = self.choice(entry, keys, base) if entry else None
         fallbacks = self.fallbacks(value, content, choice, base) if section == "locate" else ()
         return _Selection(entry, keys, choice, fallbacks)
@@ -164,6 +174,19 @@ class _Resolver:
         chosen, first = spelled
         self.remember(first, value.place.where)
         return self.select(section, chosen, base)
+
+    def auto(self, kind: Kind, value: Value, use: Value, keys: Value) -> _Selection:
+        """Resolve a section that leaves the source open: the one that recognises the path is chosen."""
+        found = found_source(keys, self.catalog, self.directory, self.problems)
+        if found is None:
+            return _Selection(None, keys, None)
+        self.decisions.append(found.decision)
+        self.places = found.keys.places() | self.places
+        before = len(self.problems)
+        entry = self.entry(kind, value, replace(use, content=found.name))
+        choice = self.choice(entry, found.keys, None) if entry else None
+        self.problems[before:] = found.blamed(self.problems[before:])
+        return _Selection(entry, found.keys, choice)
 
     def fallbacks(
         self, value: Value, content: dict[str, Value], first: Choice[Any] | None, base: _Selection | None
@@ -310,6 +333,7 @@ class _Resolver:
         return {
             "version": VERSION,
             "source": _written(plan.source),
+            "corrections": written_corrections(plan.corrections),
             **chosen,
             "levels": UNTIL_CONVERGED if plan.until_converged else levels,
             **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pytest
 
+from photonpano.errors import InputError
 from photonpano.geometry import translation
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
 from photonpano.testing.sameness import fingerprint, in_threads
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from photonpano.contributions import MergerContribution
     from photonpano.protocols import Merger, Source, Trajectory
-    from photonpano.values import BoolArray, FloatArray, Homography
+    from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Homography
 
 SHAPE = (40, 56)
 N_FRAMES = 240
@@ -33,6 +34,8 @@ _STILL = np.array([[1, 0, 300.0], [0, 1, -80.0], [0, 0, 1]])
 _Z = 4.5
 """So many standard deviations are not chance: once in 150,000 times."""
 _BANDS = 4
+_DARK_RATE = np.float64(0.2)
+"""Dark counts of a pixel in a frame."""
 _MARGIN = 8
 """Pixels at the border of a moving camera are seen by few frames."""
 
@@ -158,6 +161,21 @@ class MergerConformance(StageConformance):
             f"(at most excess_variance = {self.excess_variance:g}); are all frames of the group counted?"
         )
 
+    def test_what_the_source_takes_out_of_sums_is_no_flux(self) -> None:
+        """Dark counts are not seen as light; a merger that cannot have them taken out refuses the source."""
+        known = float(chance_of_light(still_flux()).mean())
+        for trajectory in (None, KnownMotion(lambda _: np.eye(3))):
+            source = DarkSource(still_frames())
+            try:
+                exposure = self.merged(source, GROUP, trajectory)
+            except InputError:
+                continue
+            mean = float(exposure.response.mean_count(exposure.flux).mean())
+            assert abs(mean / known - 1) < 0.02, (
+                f"what source.corrected takes out of sums must not be in the flux; the mean count is {mean:.4f}, not "
+                f"{known:.4f}. `photonpano.merging.accumulate` does so; or raise an InputError for a LinearlyCorrectedSource"
+            )
+
     def test_masked_pixels_do_not_count(self) -> None:
         """Hot pixels are lit in every frame, and `source.valid` is false for them."""
         valid = dead_pixels()
@@ -246,14 +264,27 @@ class MergerConformance(StageConformance):
             pytest.skip("compensates = False")
 
 
+class DarkSource(MemorySource):
+    """Adds dark counts to frames, and knows how to take them out: a `photonpano.LinearlyCorrectedSource`."""
+
+    def __init__(self, frames: NDArray[np.uint8]) -> None:
+        dark = np.random.default_rng(9).random(frames.shape) < chance_of_light(_DARK_RATE)
+        super().__init__(frames | dark)
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """See `photonpano.LinearlyCorrectedSource`."""
+        dark_frames = n_frames - counts.astype(np.float32)
+        return np.asarray(n_frames - dark_frames * np.exp(_DARK_RATE), np.float32)
+
+
 def _merged_by(merger: Merger, source: Source, trajectory: Trajectory | None, thread: int) -> object:
     del thread
     return fingerprint(merger.merge(source, GROUP, trajectory, 1.0))
 
 
-def chance_of_light(flux: FloatArray) -> FloatArray:
+def chance_of_light(flux: FloatArray | np.float64) -> FloatArray:
     """Return the probability that a binary pixel is lit (paper, equation 2)."""
-    return -np.expm1(-flux)
+    return np.asarray(-np.expm1(-flux))
 
 
 def _to_scene(frame: float) -> Homography:

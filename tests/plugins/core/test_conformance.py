@@ -17,14 +17,11 @@ CATALOG = discover()
 
 class TestPackedNpy(SourceConformance):
     contribution = CATALOG.find("source", "packed-npy").contribution
-    wrong = ({"path": "there-is-no-such-file.npy"}, {"width": 33}, {"bad_pixels": "there-is-no-such-file.npy"})
+    wrong = ({"path": "there-is-no-such-file.npy"}, {"width": 33})
 
     def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
         np.save(folder / "capture.npy", np.packbits(frames, axis=-1))
-        bad = np.zeros(frames.shape[1:], bool)
-        bad[3, 4] = True
-        np.save(folder / "bad.npy", bad)
-        return {"path": folder / "capture.npy", "width": frames.shape[2], "bad_pixels": folder / "bad.npy"}
+        return {"path": folder / "capture.npy", "width": frames.shape[2]}
 
 
 class TestMidpoint(ResamplerConformance):

@@ -71,16 +71,6 @@ def test_many_threads_may_read_at_once(tmp_path: Path) -> None:
         assert all(pool.map(read, range(4)))
 
 
-def test_bad_pixels_are_not_valid(tmp_path: Path) -> None:
-    bad = np.zeros((6, 24), dtype=bool)
-    bad[2, 3] = True
-    path = saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))
-    with opened(path, bad_pixels=saved(tmp_path / "bad.npy", bad)) as source:
-        np.testing.assert_array_equal(source.valid, ~bad)
-        with pytest.raises(ValueError, match="read-only"):
-            source.valid[0, 0] = False
-
-
 def test_a_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
     with opened(saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))) as source:
         for read in (source.counts, source.frames):
@@ -194,16 +184,6 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path: Path)
         with pytest.raises(InputError) as caught:
             source.counts(FrameSpan(10, 100))
     assert str(caught.value) == (f"{path} has become shorter: frames 10 to 99 are no longer in it; copy or record it again")
-
-
-def test_masks_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    path = saved(tmp_path / "cube.npy", PACKED)
-    other = saved(tmp_path / "other.npy", np.zeros((6, 23), bool))
-    assert_refused(
-        f"{other} holds bool values of shape (6, 23); bad pixels are bool of the frame's shape (6, 24)", path, bad_pixels=other
-    )
-    every = saved(tmp_path / "every.npy", np.ones((6, 24), bool))
-    assert_refused(f"{every} marks every pixel as bad; true is for pixels that must not be used", path, bad_pixels=every)
 
 
 def test_a_negative_shape_is_refused(tmp_path: Path) -> None:

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group
+from photonpano import FrameSpan, Group, InputError
 from photonpano.geometry import inverse, rescaling
+from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.splat import SplatMerger
@@ -182,3 +183,16 @@ def test_frames_behind_the_camera_or_beside_the_grid_count_nothing(
     group = Group(FrameSpan(9, 12), 10.0)
     exposure = SplatMerger().merge(memory_source(frames), group, motion, 1.0)
     np.testing.assert_allclose(exposure.weight, 1, atol=1e-5)
+
+
+def test_dark_counts_that_are_to_be_taken_out_are_refused() -> None:
+    """At the first level already, where nothing is splatted yet."""
+    source: Any = MemorySource(np.zeros((10, 8, 8)))
+    source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
+    for trajectory in (None, KnownMotion(lambda _: np.eye(3))):
+        with pytest.raises(InputError) as caught:
+            SplatMerger().merge(source, Group(FrameSpan(0, 10), 5), trajectory, 1.0)
+        assert str(caught.value) == (
+            "splat puts photons one by one, so that dark counts cannot be taken out, nor pixels interpolated: merge with "
+            "photon-mle, or let corrections only move and mask pixels"
+        )

@@ -56,7 +56,7 @@ def test_simulate_warns_of_pixels_that_the_file_cannot_mark(folder: Path, invoke
         hot = int(truth["hot_pixels"].sum())
     assert hot > 0
     assert result.stderr == (
-        f"warning: {hot} pixels are not to be used, which hot.npy does not say; name them in a file as bad_pixels\n"
+        f"warning: {hot} pixels are not to be used, which hot.npy does not say; mask them with `corrections`\n"
     )
 
 
@@ -228,6 +228,7 @@ def test_plugins_list(invoke: Callable[..., Any]) -> None:
     head, *rows = result.stdout.splitlines()
     assert head.split() == ["KIND", "NAME", "PLUGIN", "SUMMARY"]
     assert [row.split()[:4] for row in rows] == [
+        ["source", "auto", "photonpano", "0.1.0"],
         ["source", "packed-npy", "photonpano", "0.1.0"],
         ["source", "simulator", "photonpano", "0.1.0"],
     ]
@@ -302,7 +303,7 @@ def test_plugins_show(finished: Path, invoke: Callable[..., Any]) -> None:
     head, facts, table, snippet = text.split("\n\n")
     assert head.startswith("packed-npy: ")
     assert facts == "kind    source\nplugin  photonpano 0.1.0 (core = photonpano_core.hooks)"
-    assert [line.split()[0] for line in table.splitlines()] == ["KEY", "path", "frame_rate_hz", "width", "bad_pixels"]
+    assert [line.split()[0] for line in table.splitlines()] == ["KEY", "path", "frame_rate_hz", "width"]
     assert "required" in table
     plan = parse_spec("version: 1\n" + snippet.replace('"<a path>"', "cube.npy"), directory=finished)
     assert plan.source.contribution.name == "packed-npy"

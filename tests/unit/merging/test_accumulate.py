@@ -10,6 +10,7 @@ from photonpano import FrameSpan
 from photonpano.geometry import from_parameters, rescaling, translation
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of
 from photonpano.photometry import BinaryResponse
+from photonpano.testing import MemorySource
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -191,3 +192,32 @@ def test_warps_are_exact_below_a_thirty_second_of_a_pixel(memory_source: type, s
     photons = accumulate(source, still(100, translation(shift_px, 0)), np.eye(3), SHAPE)
     inside = (slice(1, -1), slice(1, -1))
     np.testing.assert_allclose(photons.counts[inside], np.arange(SHAPE[1])[None, 1:-1].repeat(28, 0) - shift_px, atol=2e-4)
+
+
+class Halved(MemorySource):
+    """A source whose sums count twice."""
+
+    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
+        assert counts.dtype == np.uint32
+        return counts.astype(np.float32) / 2 - n_frames
+
+
+@pytest.mark.parametrize("scale", [1, 0.5])
+def test_what_the_source_takes_out_is_taken_out_of_each_chunk_once(scale: float) -> None:
+    """Whether the sums are the source's or are shared, and before pixels are masked and averaged."""
+    frames = frames_of(FLUX, 50)
+    valid = np.random.default_rng(0).random(SHAPE) > 0.1
+    halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
+    shape = round(scale * SHAPE[0]), round(scale * SHAPE[1])
+    plain, halved = (
+        accumulate(source, halves, rescaling(scale), shape, counts_of=counts_of)
+        for source, counts_of in ((MemorySource(frames, valid), None), (Halved(frames, valid), MemorySource(frames).counts))
+    )
+    np.testing.assert_array_equal(halved.weight, plain.weight)
+    np.testing.assert_allclose(halved.counts, plain.counts / 2 - plain.weight, atol=1e-3)
+
+
+def test_flux_is_not_negative_where_more_was_taken_out_than_there_is() -> None:
+    photons = PhotonSum(np.float32([[-3, 5]]), np.float32([[10, 10]]))
+    flux, _ = photons.estimate(BinaryResponse())
+    assert flux.tolist() == [[0, pytest.approx(np.log(2))]]

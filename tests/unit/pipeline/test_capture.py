@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError, OutputError, StreamInfo
+from photonpano import FrameSpan, InputError, OutputError, PluginError, StreamInfo
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.capture import truth_path, write_packed
 
@@ -55,7 +55,7 @@ class TruthfulSource(RandomSource):
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.pipeline.capture._BLOCK_BYTES", 7 * 6 * 19)
+    monkeypatch.setattr("photonpano.pipeline.packed_frames._BLOCK_BYTES", 7 * 6 * 19)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -169,3 +169,121 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
 
     peak(100)
     assert peak(2000) < peak(500) + 20_000
+
+
+class PackedRandomSource(RandomSource):
+    """Would fail if its frames were asked for one by one."""
+
+    def packed(self, span: FrameSpan) -> np.ndarray:
+        return np.packbits(super().frames(span), axis=-1)
+
+    def frames(self, span: FrameSpan) -> np.ndarray:
+        raise AssertionError("frames are packed, and need not be unpacked")
+
+
+def interrupted_after(n_frames: int, path: Path, source: RandomSource) -> None:
+    """Write a capture so that it can be continued, and interrupt it after so many frames."""
+    told: list[int] = []
+
+    def count(n_written: int) -> None:
+        told.append(n_written)
+        if sum(told) >= n_frames:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_packed(source, path, count, resumed=told.append)
+
+
+def test_packed_frames_are_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    write_packed(PackedRandomSource(50, 6, 19), path)
+    np.testing.assert_array_equal(np.load(path), np.packbits(RandomSource(50, 6, 19).frames(FrameSpan(0, 50)), axis=-1))
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("kind", [RandomSource, PackedRandomSource])
+@pytest.mark.parametrize("more", [b"", b"half a frame"])
+def test_what_was_interrupted_is_continued(tmp_path: Path, kind: type[RandomSource], more: bytes) -> None:
+    path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
+    interrupted_after(30, path, kind(100, 6, 19))
+    assert list(tmp_path.iterdir()) == [part]
+    with part.open("ab") as file:
+        file.write(more)
+    found: list[int] = []
+    told: list[int] = []
+    write_packed(kind(100, 6, 19), path, told.append, resumed=found.append)
+    assert list(tmp_path.iterdir()) == [path]
+    assert found[0] >= 30
+    assert told[0] == found[0]
+    assert sum(told) == 100
+    whole = tmp_path / "whole.npy"
+    write_packed(kind(100, 6, 19), whole)
+    assert path.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("other", ["another shape", "another last frame", "another first frame", "no header"])
+def test_a_part_of_another_capture_is_written_anew(tmp_path: Path, other: str) -> None:
+    path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
+    interrupted_after(30, path, RandomSource(100, 7 if other == "another shape" else 6, 19))
+    frame_bytes = 6 * 3
+    place = {"another last frame": -frame_bytes, "another first frame": 128, "no header": 0}.get(other)
+    if place is not None:
+        data = bytearray(part.read_bytes())
+        data[place] ^= 1
+        part.write_bytes(data)
+    found: list[int] = []
+    write_packed(RandomSource(100, 6, 19), path, resumed=found.append)
+    assert found == [0]
+    np.testing.assert_array_equal(
+        np.unpackbits(np.load(path), axis=-1, count=19), RandomSource(100, 6, 19).frames(FrameSpan(0, 100))
+    )
+
+
+def test_a_part_that_is_longer_than_the_capture_is_cut(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    write_packed(RandomSource(20, 6, 19), path)
+    whole = path.read_bytes()
+    path.rename(tmp_path / "cube.npy.part").write_bytes(whole + b"more")
+    found: list[int] = []
+    write_packed(RandomSource(20, 6, 19), path, resumed=found.append)
+    assert (found, path.read_bytes()) == ([20], whole)
+
+
+def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+
+    def write_again(n_frames: int) -> None:
+        write_packed(RandomSource(20, 6, 19), path, resumed=lambda _: None)
+
+    with pytest.raises(OutputError) as caught:
+        write_packed(RandomSource(20, 6, 19), path, write_again, resumed=lambda _: None)
+    assert str(caught.value) == f"cannot write {path}: another process is writing it; wait for it, or choose another name"
+
+
+def test_a_full_disk_leaves_what_can_be_continued(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    script = _RUNS_OUT_OF_DISK.replace("Path(sys.argv[1])", "Path(sys.argv[1]), resumed=print")
+    done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"cannot write {path}: File too large; ")
+    assert [file.name for file in tmp_path.iterdir()] == ["cube.npy.part"]
+    again = script.replace("(1_200_000, 1_200_000)", "(2**30, 2**30)")
+    done = subprocess.run([sys.executable, "-c", again, path], capture_output=True, text=True, check=True)
+    assert int(done.stdout) > 2000
+    assert np.load(path).shape == (4000, 64, 8)
+    assert np.load(path).min() == 255
+
+
+@pytest.mark.parametrize(
+    "packed", [np.zeros((5, 6, 4), np.uint8), np.zeros((5, 6, 3), np.uint16), np.zeros((4, 6, 3), np.uint8)]
+)
+def test_a_source_that_breaks_its_contract_is_told(tmp_path: Path, packed: np.ndarray) -> None:
+    source = PackedRandomSource(5, 6, 19)
+    source.packed = lambda _span: packed
+    with pytest.raises(PluginError) as caught:
+        write_packed(source, tmp_path / "cube.npy")
+    assert str(caught.value) == (
+        "the source broke its contract at frames 0 to 4: expected packed frames of uint8 (5, 6, 3), "
+        f"got {packed.dtype} {packed.shape}"
+    )
+    assert list(tmp_path.iterdir()) == []

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError
+from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import TRIAL_GROUPS, PartOfSource, forecast
 from photonpano.spec import parse_spec
@@ -22,6 +22,18 @@ def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[Me
     np.testing.assert_array_equal(part.frames(FrameSpan(0, 5)), frames[2:7])
     with pytest.raises(InputError, match="the capture has 5 frames"):
         part.counts(FrameSpan(3, 6))
+
+
+def test_a_part_has_what_the_capture_has(memory_source: type[MemorySource]) -> None:
+    whole: Any = memory_source(np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8))
+    assert not isinstance(PartOfSource(whole, FrameSpan(2, 7)), PackedSource | LinearlyCorrectedSource)
+    whole.packed = lambda span: np.packbits(whole.frames(span), axis=-1)
+    whole.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
+    part = PartOfSource(whole, FrameSpan(2, 7))
+    assert isinstance(part, PackedSource)
+    assert isinstance(part, LinearlyCorrectedSource)
+    np.testing.assert_array_equal(part.packed(FrameSpan(1, 4)), whole.packed(FrameSpan(3, 6)))
+    assert part.corrected(np.uint32([[5]]), 3) == 2
 
 
 def test_a_trial_tells_time_memory_and_canvas(small_spec: dict[str, Any]) -> None:

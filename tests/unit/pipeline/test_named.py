@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError, PluginError
+from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, PluginError
 from photonpano.pipeline.named import NamedSource, NamedTrajectory
 
 if TYPE_CHECKING:
@@ -35,6 +35,20 @@ def test_a_source_is_what_it_was(source: Any) -> None:
     assert named.valid is source.valid
     np.testing.assert_array_equal(named.counts(SPAN), source.counts(SPAN))
     np.testing.assert_array_equal(named.frames(SPAN), source.frames(SPAN))
+
+
+def test_it_has_what_the_source_has(source: Any) -> None:
+    assert not isinstance(NamedSource(source, ORIGIN), PackedSource | LinearlyCorrectedSource)
+    source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
+    source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
+    named = NamedSource(source, ORIGIN)
+    assert isinstance(named, PackedSource)
+    assert isinstance(named, LinearlyCorrectedSource)
+    np.testing.assert_array_equal(named.packed(SPAN), source.packed(SPAN))
+    np.testing.assert_array_equal(named.corrected(source.counts(SPAN), 3), source.counts(SPAN) - np.float32(3))
+    source.packed = raising(OSError("gone"))
+    with pytest.raises(PluginError, match=r"failed at frames 2 to 4: OSError: gone"):
+        NamedSource(source, ORIGIN).packed(SPAN)
 
 
 def test_it_closes_what_it_names(source: Any) -> None:

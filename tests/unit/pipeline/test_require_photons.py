@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from photonpano import InputError
-from photonpano.pipeline.run import require_photons
+from photonpano.pipeline.inspection import require_photons
 
 DARK = (
     "no pixel is lit in any of {} frames looked at all over the capture; "

@@ -11,7 +11,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from photonpano.pipeline.stopwatch import Stopwatch
-from photonpano.pipeline.threads import one_thread_inside, thread_count
+from photonpano.pipeline.threads import in_order, one_thread_inside, thread_count
 from photonpano.spec.settings import RunSettings
 
 if TYPE_CHECKING:
@@ -81,3 +81,26 @@ def test_the_time_of_a_failure_counts() -> None:
     with pytest.raises(ValueError, match="half-way"), clock("merge"):
         raise ValueError("half-way")
     assert set(clock.seconds) == {"merge"}
+
+
+def test_results_come_in_order_and_few_are_waiting() -> None:
+    made: list[int] = []
+
+    def work(item: int) -> int:
+        time.sleep(0.01 if item % 3 == 0 else 0)
+        made.append(item)
+        return -item
+
+    ahead = []
+    for taken, result in enumerate(in_order(work, iter(range(30)), threads=3)):
+        assert result == -taken
+        ahead.append(len(made) - taken)
+    assert len(made) == 30
+    assert max(ahead) <= 4
+
+
+def test_an_error_comes_when_it_is_its_turn() -> None:
+    results = in_order(lambda item: 1 / (3 - item), range(9), threads=2)
+    assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)

@@ -5,6 +5,7 @@ import pytest
 import photonpano
 from photonpano import PluginError
 from photonpano.registry import BrokenPlugin, DisabledPlugin, discover
+from photonpano.registry.suggestions import listed
 
 GOOD = """
 @hookimpl
@@ -35,8 +36,9 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
     assert of_toys(catalog.broken) == []
 
 
-def test_the_framework_offers_the_chain_itself():
-    entry = discover().get("locator", "chain-of-backends")
+@pytest.mark.parametrize(("kind", "name"), [("source", "auto"), ("locator", "chain-of-backends")])
+def test_the_framework_offers_some_names_itself(kind, name):
+    entry = discover().get(kind, name)
     assert (entry.plugin, entry.entry_point, entry.version) == ("photonpano", "built in", photonpano.__version__)
 
 
@@ -178,7 +180,7 @@ def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     catalog = discover()
     assert {row.plugin for row in catalog.rows if row.entry_point != "built in"} == {"alpha"}
     disabled = [row.entry_point.partition(" = ")[0] for row in catalog.disabled]
-    assert disabled == ["colmap", "core", "kornia", "opencv", "simulator"]
+    assert disabled == ["colmap", "core", "kornia", "opencv", "sensors", "simulator"]
 
 
 def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
@@ -187,8 +189,9 @@ def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "beta")
     with pytest.raises(PluginError) as caught:
         discover().get("source", "zzz")
+    known = listed(discover().names("source"))
     assert str(caught.value) == (
-        "there is no source 'zzz'; known: packed-npy, simulator and toy-camera. Disabled plugins may have offered it: "
+        f"there is no source 'zzz'; known: {known}. Disabled plugins may have offered it: "
         "beta 2.0 (beta = beta_hooks), by PHOTONPANO_DISABLE_PLUGINS=beta"
     )
 
@@ -211,7 +214,7 @@ def test_unknown_names_of_disabled_plugins_are_told(words, message, install, mon
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     discover()
-    known = "alpha, colmap, core, kornia, opencv, photonpano and simulator"
+    known = "alpha, colmap, core, kornia, opencv, photonpano, sensors and simulator"
     assert caplog.messages == [f"PHOTONPANO_DISABLE_PLUGINS {message.format(known=known)}"]
 
 

@@ -10,12 +10,14 @@ from photonpano import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
+    Recognised,
     Requirement,
     ResamplerContribution,
     SourceContribution,
     SpecPath,
 )
 from photonpano.registry import Catalog
+from photonpano.registry.auto import AUTO
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.chain import CHAIN
 
@@ -96,6 +98,10 @@ def missing_file(config):
     return [] if config.path.exists() else [f"there is no file {config.path.name}"]
 
 
+def npy(path):
+    return Recognised({"path": path}, "its name ends in .npy") if path.suffix == ".npy" else None
+
+
 def too_few_frames(config, info):
     if config.group_size > info.n_frames:
         return [f"a group of {config.group_size} frames does not fit into the capture, which has {info.n_frames}"]
@@ -103,7 +109,10 @@ def too_few_frames(config, info):
 
 
 CONTRIBUTIONS = [
-    SourceContribution(name="packed-npy", summary="Toy", config=PackedNpyConfig, build=unbuilt, check=missing_file),
+    AUTO,
+    SourceContribution(
+        name="packed-npy", summary="Toy", config=PackedNpyConfig, build=unbuilt, check=missing_file, recognise=npy
+    ),
     SourceContribution(name="simulator", summary="Toy", config=SimulatorConfig, build=unbuilt),
     ResamplerContribution(name="midpoint", summary="Toy", config=MidpointConfig, build=unbuilt, check=too_few_frames),
     MergerContribution(name="photon-mle", summary="Toy", config=PhotonMleConfig, build=unbuilt),

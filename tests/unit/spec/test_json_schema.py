@@ -58,8 +58,17 @@ def is_valid(spec, catalog):
         ({"locate": {"use": "chain-of-backends", "with": {"backends": []}}}, False),
         ({"locate": {"fallback": "chain-of-backends"}}, False),
         ({"merge": {"fallback": "photon-mle"}}, False),
+        ({"source": {"use": "auto", "with": {"path": "cube.npy", "frame_rate_hz": 96800}}}, True),
+        ({"source": {"use": "auto", "with": {"frame_rate_hz": 96800}}}, False),
         ({"levels": [{"locate": {"fallback": "direct"}}]}, True),
         ({"source": {"with": {"flux": 1}}}, False),
+        ({"corrections": ["rot90", {"crop": {"rows": [2, None]}}, {"rot180": None}]}, True),
+        ({"corrections": None}, True),
+        ({"corrections": ["rot45"]}, False),
+        ({"corrections": ["mask"]}, False),
+        ({"corrections": [{"mask": {}}]}, False),
+        ({"corrections": [{"rot90": None, "flip-ud": None}]}, False),
+        ({"corrections": {"rot90": None}}, False),
     ],
 )
 def test_schema_binds_the_keys_to_the_component(change, valid, catalog):

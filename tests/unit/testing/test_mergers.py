@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonpano import VirtualExposure, discover
+from photonpano import InputError, LinearlyCorrectedSource, VirtualExposure, discover
 from photonpano.geometry import inverse, translation
 from photonpano.photometry import BinaryResponse
-from photonpano.testing import KnownMotion, MergerConformance
+from photonpano.testing import KnownMotion, MemorySource, MergerConformance
 from photonpano.testing.conformance import Conformance
 from photonpano.testing.stages import StageConformance
 
@@ -90,6 +90,21 @@ class Unmasked:
         return getattr(self.source, name)
 
 
+class SeesDarkCounts(Honest):
+    """Passes over what the source would take out."""
+
+    def merge(self, source, group, trajectory, scale):
+        plain = MemorySource(source.frames(source.info.span), source.valid)
+        return replace(super().merge(plain, group, trajectory, scale), response=source.response)
+
+
+class RefusesDarkCounts(Honest):
+    def merge(self, source, group, trajectory, scale):
+        if isinstance(source, LinearlyCorrectedSource):
+            raise InputError("no")
+        return super().merge(source, group, trajectory, scale)
+
+
 class ForgetsTheMaskAlongAMotion(Honest):
     def merge(self, source, group, trajectory, scale):
         return super().merge(source if trajectory is None else Unmasked(source), group, trajectory, scale)
@@ -168,6 +183,7 @@ BROKEN = [
     ("test_only_the_frames_of_the_group_count", SmoothsInTime, "that of frames 20 to 219 changes with frames before"),
     ("test_flux_is_unbiased_on_photon_noise", AveragesFlux, r"the mean is off by \+\d+.\d standard errors"),
     ("test_flux_is_no_noisier_than_photons", DropsHalf, r"the flux is (1.9|2.0|2.1)\d times as noisy"),
+    ("test_what_the_source_takes_out_of_sums_is_no_flux", SeesDarkCounts, r"the mean count is 0.\d+, not 0.\d+"),
     ("test_masked_pixels_do_not_count", KnowsNoMask, "the weight of a camera that stands still must be 0; it is 200"),
     (
         "test_masked_pixels_do_not_count_along_a_motion",
@@ -205,6 +221,10 @@ def test_every_check_catches_something(checks_of):
 def test_an_honest_one_passes(checks_of, complaint):
     for check in checks_of(MergerConformance, Conformance):
         assert complaint(MergerConformance, check, Honest) is None, check
+
+
+def test_one_that_refuses_dark_counts_passes(complaint):
+    assert complaint(MergerConformance, "test_what_the_source_takes_out_of_sums_is_no_flux", RefusesDarkCounts) is None
 
 
 def test_a_naive_average_passes_if_it_says_so(checks_of, complaint):

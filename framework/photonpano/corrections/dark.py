@@ -1,0 +1,123 @@
+"""Dark counts: measured in dark frames, stored, read again, and taken out of sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from photonpano.contributions import SpecPath
+from photonpano.corrections.files import read_arrays
+from photonpano.corrections.pixels import Correction
+from photonpano.errors import InputError
+from photonpano.values import FrameSpan
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from photonpano.corrections.pixels import Decide, Pixels
+    from photonpano.protocols import Source
+    from photonpano.values import FluxImage
+
+DARK_FILE = "what `photonpano dark` wrote, or a .npy file of rates, of the size that frames have at this place of the list"
+_AT_ONCE = 1024
+"""Frames that are summed between two reports of progress."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DarkFrames:
+    """What frames show that were taken with the lens covered.
+
+    Attributes:
+        rates: (H, W) float32, dark counts per frame: photons of binary frames, grey values of others.
+        n_frames: how many frames tell it; None if unknown.
+    """
+
+    rates: FluxImage
+    n_frames: int | None
+
+
+class DarkCounts(Correction):
+    """Takes dark counts out of the flux, pixel by pixel."""
+
+    name: ClassVar[str] = "dark-counts"
+    dark: SpecPath = Field(description=f"dark counts per frame: {DARK_FILE}")
+    limit: float = Field(
+        0.1,
+        gt=0,
+        le=3,
+        description="pixels of binary frames with more dark counts per frame than this are masked: where they exceed the "
+        "photons of the scene, a pixel adds more noise than light",
+    )
+
+    @property
+    def changes_sums(self) -> bool:
+        """See `Correction`."""
+        return True
+
+    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+        """Note what is to be taken out, and mask where that is too much; see `Correction`."""
+        rates = read_dark(self.dark).rates
+        pixels.require(rates.shape, self.dark)
+        noted = replace(pixels, dark_rates=pixels.dark_rates + rates)
+        if source.info.kind != "binary":
+            return noted
+        high = noted.dark_rates > self.limit
+        if decide is not None:
+            n_masked = int((pixels.valid & high).sum())
+            reason = f"pixels with more than limit = {self.limit:g} dark counts a frame are masked"
+            decide("dark_counts_masked", n_masked, reason)
+        # What is masked needs no correction, which would be a large factor.
+        return replace(noted, valid=pixels.valid & ~high, dark_rates=np.where(high, np.float32(0), noted.dark_rates))
+
+
+def measure_dark(source: Source, advance: Callable[[int], object] | None = None) -> DarkFrames:
+    """Measure the dark counts of a capture that was recorded with the lens covered.
+
+    The rate of a binary pixel is `-ln(1 - k / n)` for k counts in n frames, as flux is; that of another is the mean of its grey
+    values.
+
+    Args:
+        source: the capture.
+        advance: is told how many frames have been read since the last call.
+    """
+    info = source.info
+    counts = np.zeros(info.frame_shape, np.uint64)
+    for start in range(0, info.n_frames, _AT_ONCE):
+        span = FrameSpan(start, min(start + _AT_ONCE, info.n_frames))
+        counts += source.counts(span)
+        if advance is not None:
+            advance(len(span))
+    mean = (counts / info.n_frames).astype(np.float32)
+    return DarkFrames(source.response.flux(mean, info.n_frames) if info.kind == "binary" else mean, info.n_frames)
+
+
+def write_dark(path: Path, dark: DarkFrames) -> None:
+    """Store dark counts as an .npz archive, which `read_dark` reads."""
+    np.savez_compressed(path, rates=dark.rates, n_frames=np.array(dark.n_frames))
+
+
+def read_dark(path: Path) -> DarkFrames:
+    """Read dark counts: an .npz archive that `write_dark` wrote, or a .npy file of rates.
+
+    Raises:
+        InputError: the file is missing, is something else, or holds rates that are negative or not finite.
+    """
+    arrays = read_arrays(path, "a file of dark counts")
+    rates, n_frames = arrays.get("rates", arrays.get("")), arrays.get("n_frames")
+    if rates is None:
+        raise InputError(f"{path} is an archive without `rates`; name what `photonpano dark` wrote, or a .npy file of rates")
+    if rates.ndim != 2 or rates.dtype.kind not in "fiu":
+        raise InputError(f"{path} holds {rates.dtype} of shape {rates.shape}; dark counts are numbers of shape (height, width)")
+    if not (np.isfinite(rates).all() and (rates >= 0).all()):
+        row, column = np.argwhere(~(np.isfinite(rates) & (rates >= 0)))[0].tolist()
+        raise InputError(
+            f"{path} holds dark counts that are negative or not finite, first {rates[row, column]} at row {row}, "
+            f"column {column}"
+        )
+    if n_frames is not None and (n_frames.shape != () or n_frames.dtype.kind not in "iu" or n_frames < 1):
+        raise InputError(f"{path} is damaged: n_frames is no number of frames; write it again with `photonpano dark`")
+    return DarkFrames(rates.astype(np.float32), None if n_frames is None else int(n_frames))

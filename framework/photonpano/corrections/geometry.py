@@ -1,0 +1,208 @@
+"""Corrections that move pixels. Each is one numpy function, which is applied to the numbers of the pixels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from photonpano.corrections.pixels import MISSING, Correction, numbered
+from photonpano.errors import InputError
+
+if TYPE_CHECKING:
+    from photonpano.corrections.pixels import Decide, Index, Pixels
+    from photonpano.protocols import Source
+
+
+class Rearrangement(Correction):
+    """Moves pixels, and leaves out or adds some."""
+
+    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+        """Move the pixels; see `Correction`."""
+        del source, decide
+        return pixels.rearranged(self.moved(numbered(pixels.shape)))
+
+    def moved(self, pixels: Index) -> Index:
+        """Return the (H, W) numbers of pixels where they are to lie, -1 for pixels that the sensor does not have.
+
+        Raises:
+            InputError: the frame is too small.
+        """
+        raise NotImplementedError
+
+
+class Crop(Rearrangement):
+    """Keeps a part of the frame."""
+
+    name: ClassVar[str] = "crop"
+    rows: tuple[int | None, int | None] = Field(
+        (None, None), description="the first row, and the one after the last; negative ones count from the end, null is the end"
+    )
+    columns: tuple[int | None, int | None] = Field((None, None), description="the same for columns")
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        return pixels[_part(self.rows, pixels.shape[0], "rows"), _part(self.columns, pixels.shape[1], "columns")]
+
+
+class SwapColumns(Rearrangement):
+    """Puts some columns where others are, and those in their place."""
+
+    name: ClassVar[str] = "swap-columns"
+    first: tuple[int, int] = Field(description="the first column, and the one after the last, from 0")
+    second: tuple[int, int] = Field(description="the same of those that they are swapped with: as many, and others")
+
+    @field_validator("first", "second")
+    @classmethod
+    def _in_order(cls, columns: tuple[int, int]) -> tuple[int, int]:
+        if not 0 <= columns[0] < columns[1]:
+            raise ValueError(f"columns count from 0, and the last lies behind the first; got {list(columns)}")
+        return columns
+
+    @model_validator(mode="after")
+    def _equal(self) -> SwapColumns:
+        (start, stop), (other_start, other_stop) = sorted((self.first, self.second))
+        if stop - start != other_stop - other_start:
+            counts = f"{self.first[1] - self.first[0]} columns {list(self.first)} with the "
+            counts += f"{self.second[1] - self.second[0]} columns {list(self.second)}"
+            raise ValueError(f"cannot swap the {counts}: there have to be as many")
+        if other_start < stop:
+            raise ValueError(f"cannot swap the columns {list(self.first)} with {list(self.second)}: they overlap")
+        return self
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        first, second = (slice(*columns) for columns in (self.first, self.second))
+        last = max(self.first[1], self.second[1])
+        if last > pixels.shape[1]:
+            raise InputError(f"there is no column {last - 1}: frames have {pixels.shape[1]} columns at this place of the list")
+        swapped = pixels.copy()
+        swapped[:, first], swapped[:, second] = pixels[:, second], pixels[:, first]
+        return swapped
+
+
+class MissingRow(Rearrangement):
+    """Inserts a row that the sensor does not have; it is masked, and the motion fills it."""
+
+    name: ClassVar[str] = "missing-row"
+    before: int | None = Field(
+        None,
+        ge=0,
+        description="the row before which it is inserted, from 0; by default it lies between the halves of the frame",
+    )
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        height = len(pixels)
+        before = height // 2 if self.before is None else self.before
+        if before > height:
+            raise InputError(f"there is no row {before}: frames have {height} rows at this place of the list")
+        return np.insert(pixels, before, MISSING, axis=0)
+
+
+class Rot90(Rearrangement):
+    """Turns the frame by 90 degrees clockwise."""
+
+    name: ClassVar[str] = "rot90"
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        return np.rot90(pixels, -1)
+
+
+class Rot180(Rearrangement):
+    """Turns the frame upside down, by 180 degrees."""
+
+    name: ClassVar[str] = "rot180"
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        return np.rot90(pixels, 2)
+
+
+class Rot270(Rearrangement):
+    """Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."""
+
+    name: ClassVar[str] = "rot270"
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        return np.rot90(pixels, 1)
+
+
+class FlipUd(Rearrangement):
+    """Mirrors the frame: what was above is below."""
+
+    name: ClassVar[str] = "flip-ud"
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        return np.flipud(pixels)
+
+
+class FlipLr(Rearrangement):
+    """Mirrors the frame: what was on the left is on the right."""
+
+    name: ClassVar[str] = "flip-lr"
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        return np.fliplr(pixels)
+
+
+class Preset(Rearrangement):
+    """What a known sensor needs: other corrections, one after the other.
+
+    Attributes:
+        shape: (height, width) of the frames that it is made for.
+        steps: the corrections.
+    """
+
+    shape: ClassVar[tuple[int, int]]
+    steps: ClassVar[tuple[Rearrangement, ...]]
+
+    def moved(self, pixels: Index) -> Index:
+        """See `Rearrangement`."""
+        if pixels.shape != self.shape:
+            wanted, here = ("x".join(map(str, shape)) for shape in (self.shape, pixels.shape))
+            raise InputError(f"{self.name} is for frames of {wanted} px, and they are of {here} px at this place of the list")
+        for step in self.steps:
+            pixels = step.moved(pixels)
+        return pixels
+
+
+class ColourSwissSpad2(Preset):
+    """A half array of the colour SwissSPAD2: from 256x512 to 254x496 px, with eight columns in their right places."""
+
+    name: ClassVar[str] = "colour-swissspad2"
+    shape: ClassVar[tuple[int, int]] = (256, 512)
+    steps: ClassVar[tuple[Rearrangement, ...]] = (
+        Crop(rows=(2, None), columns=(None, 496)),
+        SwapColumns(first=(252, 256), second=(260, 264)),
+    )
+
+
+class GreySwissSpad2Half(Preset):
+    """A half array of the grey SwissSPAD2: from 256x512 to 254x496 px."""
+
+    name: ClassVar[str] = "grey-swissspad2-half"
+    shape: ClassVar[tuple[int, int]] = (256, 512)
+    steps: ClassVar[tuple[Rearrangement, ...]] = (Crop(rows=(2, None), columns=(None, 496)),)
+
+
+class GreySwissSpad2Full(Preset):
+    """The full array of the grey SwissSPAD2: from 512x512 to 509x496 px, with the row that its halves lack between them."""
+
+    name: ClassVar[str] = "grey-swissspad2-full"
+    shape: ClassVar[tuple[int, int]] = (512, 512)
+    steps: ClassVar[tuple[Rearrangement, ...]] = (MissingRow(), Crop(rows=(2, -2), columns=(None, 496)))
+
+
+def _part(ends: tuple[int | None, int | None], length: int, what: str) -> slice:
+    """Return the slice between two ends, which numpy would cut off where it reaches beyond the frame."""
+    start, stop = (default if end is None else end + length * (end < 0) for end, default in zip(ends, (0, length), strict=True))
+    if not 0 <= start < stop <= length:
+        given = ", ".join("null" if end is None else str(end) for end in ends)
+        raise InputError(f"the {what} [{given}] are no part of a frame, which has {length} {what} at this place of the list")
+    return slice(start, stop)

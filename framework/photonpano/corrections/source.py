@@ -1,0 +1,224 @@
+"""A capture as its sensor should have recorded it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.corrections.pixels import MISSING, Pixels, numbered
+from photonpano.errors import InputError
+from photonpano.protocols import LinearlyCorrectedSource, PackedSource
+from photonpano.values import Decision
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from photonpano.corrections.pixels import Correction, Decide, Index
+    from photonpano.protocols import Source
+    from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
+
+_TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
+_CORNER_WEIGHT = 0.5
+"""A pixel that touches another with a corner only counts so much."""
+
+
+def apply_corrections(
+    source: Source,
+    corrections: Sequence[Correction],
+    decide: Decide | None = None,
+    blame: Callable[[int, str], Exception] | None = None,
+) -> Pixels:
+    """Return what corrections make of the pixels of a capture, one after the other.
+
+    Args:
+        source: the capture as it is read.
+        corrections: in the order in which they are applied.
+        decide: see `Correction.applied`.
+        blame: makes the error of what is wrong with a correction, given as its place in the list, from a sentence.
+
+    Raises:
+        InputError: a correction does not suit the capture, a file is not what it should be, or no pixel is left.
+    """
+    pixels = Pixels.as_read(source.valid)
+    for place, correction in enumerate(corrections):
+        try:
+            if isinstance(source, LinearlyCorrectedSource):
+                raise InputError("this source takes things out of its sums itself, and cannot be corrected further")
+            pixels = correction.applied(pixels, source, decide)
+            if not pixels.valid.any():
+                raise InputError(f"{correction.name} leaves no pixel that may be used")
+        except InputError as error:
+            if blame is None:
+                raise
+            raise blame(place, str(error)) from error
+    return pixels
+
+
+class CorrectedSource:
+    """A source whose frames are rearranged, and whose mask and sums are those of the corrected sensor.
+
+    Frames and counts stay whole numbers, as they were recorded. What has to be taken out of sums `corrected` takes out; where
+    there is nothing, it does not have that method, as it has `packed` only if the source has.
+
+    Attributes:
+        decisions: what was chosen because of what the capture shows; complete once `valid` has been asked for.
+
+    Raises:
+        InputError: see `apply_corrections`. What depends on frames is found out when `valid` is first asked for.
+    """
+
+    packed: Callable[[FrameSpan], NDArray[np.uint8]]
+    corrected: Callable[[Counts, int], FluxImage]
+
+    def __init__(
+        self, source: Source, corrections: Sequence[Correction], blame: Callable[[int, str], Exception] | None = None
+    ) -> None:
+        """Correct a source.
+
+        Args:
+            source: the capture as it is read; it is closed with this one.
+            corrections: in the order in which they are applied.
+            blame: see `apply_corrections`.
+        """
+        self._source, self._corrections, self._blame = source, tuple(corrections), blame
+        index = apply_corrections(source, corrections, blame=blame).index
+        self._gather = _Gather(index, source.info.frame_shape)
+        self._estimate: _Estimate | None = None
+        self._lock = Lock()
+        self.decisions: list[Decision] = []
+        self.info: StreamInfo = replace(source.info, height=index.shape[0], width=index.shape[1])
+        self.response: Response = source.response
+        if isinstance(source, PackedSource):
+            self.packed = lambda span: self._packed(source, span)
+        if any(correction.changes_sums for correction in corrections):
+            self.corrected = lambda counts, n_frames: self._estimated().corrected(counts, n_frames)
+
+    @property
+    def valid(self) -> BoolArray:
+        """(H, W) mask."""
+        return self._estimated().valid
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        return self._gather(self._source.counts(span))
+
+    def frames(self, span: FrameSpan) -> Frames:
+        """Return the frames of a span one by one: (n, H, W)."""
+        return self._gather(self._source.frames(span))
+
+    def close(self) -> None:
+        """Let go of the capture."""
+        self._source.close()
+
+    def __enter__(self) -> CorrectedSource:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _packed(self, source: PackedSource, span: FrameSpan) -> NDArray[np.uint8]:
+        return source.packed(span) if self._gather.identity else np.packbits(self.frames(span), axis=-1)
+
+    def _estimated(self) -> _Estimate:
+        """Return what is known of the pixels, after a look at the capture if a correction asks for it."""
+        with self._lock:
+            if self._estimate is None:
+                pixels = apply_corrections(self._source, self._corrections, self._decide, self._blame)
+                self._estimate = _Estimate.of(pixels, self.info.kind == "binary")
+            return self._estimate
+
+    def _decide(self, what: str, value: int, reason: str) -> None:
+        self.decisions.append(Decision(what, value, reason))
+
+
+class _Gather:
+    """Takes the pixels of an index from frames, as a plain slice where they are one."""
+
+    def __init__(self, index: Index, frame_shape: tuple[int, int]) -> None:
+        self._missing = index == MISSING
+        self._index = np.where(self._missing, 0, index)
+        self._slices = _slices(index, frame_shape)
+        self.identity = bool(np.array_equal(index, numbered(frame_shape)))
+
+    def __call__(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Gather the pixels of (..., h, w) frames: (..., H, W), 0 where the sensor has none."""
+        if self._slices is not None:
+            return np.ascontiguousarray(frames[..., self._slices[0], self._slices[1]])
+        *n, _, _ = frames.shape
+        gathered = np.take(frames.reshape(*n, -1), self._index, axis=-1)
+        gathered[..., self._missing] = 0
+        return gathered
+
+
+def _slices(index: Index, frame_shape: tuple[int, int]) -> tuple[slice, slice] | None:
+    """Return the rows and columns that an index takes, if it takes a part of the frame as it lies."""
+    top, left = divmod(int(index[0, 0]), frame_shape[1])
+    part = slice(top, top + index.shape[0]), slice(left, left + index.shape[1])
+    return part if np.array_equal(numbered(frame_shape)[part], index) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimate:
+    """How sums of frames become those of a sensor without faults.
+
+    With the dark counts d a frame, a pixel of n binary frames stays dark in `n exp(-f - d)` of them on average; so
+    `n - (n - k) exp(d)` of k counts is what it would have counted without them, on average.
+
+    Attributes:
+        valid: (H, W) bool, pixels that may be used.
+        gain: (H, W) float32, what counts are multiplied by; 1 where nothing is to be done.
+        offset: (H, W) float32, what is taken off for each frame.
+        filled: (P,) numbers of the pixels for which their neighbours stand in,
+        neighbours: (P, 8) numbers of those,
+        weights: (P, 8) float32, and how much they count; 1 together.
+    """
+
+    valid: BoolArray
+    gain: FluxImage
+    offset: FluxImage
+    filled: Index
+    neighbours: Index
+    weights: FluxImage
+
+    @classmethod
+    def of(cls, pixels: Pixels, binary: bool) -> _Estimate:
+        """Prepare what is done to each sum."""
+        rates = pixels.dark_rates
+        gain, offset = (np.exp(rates), np.expm1(rates)) if binary else (np.ones_like(rates), rates)
+        filled, neighbours, weights = _filling(pixels)
+        # Where no neighbour may be used, the motion fills the pixel.
+        lonely = weights.sum(axis=1) == 0
+        valid = pixels.valid.copy()
+        valid.ravel()[filled[lonely]] = False
+        valid.flags.writeable = False
+        filled, neighbours, weights = filled[~lonely], neighbours[~lonely], weights[~lonely]
+        return cls(valid, gain, offset, filled, neighbours, weights / weights.sum(axis=1, keepdims=True))
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """Return the sum of frames of a sensor without faults: see `LinearlyCorrectedSource`."""
+        summed = counts * self.gain - np.float32(n_frames) * self.offset
+        summed = summed.astype(np.float32, copy=False)
+        flat = summed.reshape(-1)
+        flat[self.filled] = (flat[self.neighbours] * self.weights).sum(axis=1)
+        return summed
+
+
+def _filling(pixels: Pixels) -> tuple[Index, Index, FluxImage]:
+    """Return the pixels to be interpolated, those that touch them, and how much these count; 0 for one that may not be used."""
+    height, width = pixels.shape
+    usable = np.pad(pixels.valid & ~pixels.interpolated, 1)
+    rows, columns = np.nonzero(pixels.interpolated & pixels.valid)
+    filled = (rows * width + columns).astype(np.intp)
+    neighbours = np.empty((len(filled), len(_TOUCHING)), np.intp)
+    weights = np.empty(neighbours.shape, np.float32)
+    for place, (down, right) in enumerate(_TOUCHING):
+        y, x = np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)
+        neighbours[:, place] = y * width + x
+        weights[:, place] = usable[rows + down + 1, columns + right + 1] * (_CORNER_WEIGHT if down and right else 1)
+    return filled, neighbours, weights

@@ -1,0 +1,95 @@
+"""Many pictures as a folder of PNGs, an MP4 or an animated WebP: whole, or absent."""
+
+from __future__ import annotations
+
+import importlib.util
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano.errors import OutputError
+from photonpano.pipeline.atomic import atomic_folder, atomic_path
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Picture = NDArray[np.uint8]
+
+MOST_WEBP = 500
+"""An animated WebP is made in memory, and has no more pictures than this."""
+_WEBP_QUALITY, _CRF = 90, "18"
+"""Of lossy compression: hardly to be seen."""
+
+
+def require_writable(path: Path, n_pictures: int) -> None:
+    """Refuse what `write_pictures` could not write, before the pictures are made.
+
+    Raises:
+        OutputError: the name tells no format, the format holds fewer pictures, or it needs a library that is not installed.
+    """
+    if path.suffix not in ("", ".mp4", ".webp"):
+        raise OutputError(f"cannot write {path}: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp")
+    if path.suffix == ".webp" and n_pictures > MOST_WEBP:
+        raise OutputError(
+            f"cannot write {path}: {n_pictures:,} pictures are too many for an animated WebP, which holds {MOST_WEBP}; "
+            "take a longer step, or write an .mp4"
+        )
+    if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
+        raise OutputError(f'cannot write {path}: videos need av, which is not installed: pip install "photonpano[video]"')
+
+
+def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str], fps: float) -> None:
+    """Write pictures of one size.
+
+    Args:
+        path: a folder, which is not there or empty, for PNGs; a file that ends in .mp4 or .webp for a film.
+        pictures: (H, W) uint8 each.
+        names: of the PNGs, without suffix, as many as there are pictures.
+        fps: pictures a second of a film.
+
+    Raises:
+        OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.
+    """
+    require_writable(path, len(names))
+    if path.suffix == "":
+        with atomic_folder(path) as folder:
+            for name, picture in zip(names, pictures, strict=True):
+                (folder / f"{name}.png").write_bytes(_png(picture))
+        return
+    write: Callable[[Path, Iterable[Picture], float], None] = _write_mp4 if path.suffix == ".mp4" else _write_webp
+    with atomic_path(path) as temporary:
+        write(temporary, pictures, fps)
+
+
+def _png(picture: Picture) -> bytes:
+    encoded, png = cv2.imencode(".png", picture)
+    if not encoded:
+        raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
+    return png.tobytes()
+
+
+def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    """Write H.264, whose colours are shared by two by two pixels: an odd row or column at the end is doubled."""
+    import av
+
+    frames = (np.pad(picture, [(0, side % 2) for side in picture.shape], mode="edge") for picture in pictures)
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": _CRF})
+        stream.pix_fmt = "yuv420p"
+        for number, frame in enumerate(frames):
+            if number == 0:
+                stream.height, stream.width = frame.shape
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        container.mux(stream.encode())
+
+
+def _write_webp(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    from PIL import Image
+
+    first, *others = map(Image.fromarray, pictures)
+    first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, quality=_WEBP_QUALITY)

@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from photonpano import Config, SourceContribution, SpecPath, StreamInfo, discover
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+@pytest.fixture
+def cube(folder: Path, finished: Path) -> Path:
+    shutil.copy(finished / "cube.npy", folder / "cube.npy")
+    return folder / "cube.npy"
+
+
+def test_a_capture_is_written_bit_by_bit(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("convert", "cube.npy", "out.npy", "--with", "frame_rate_hz=96800")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == (
+        "out.npy  384.1 kB  200 binary frames of 96x160 at 96,800 Hz\n\n"
+        "In a spec that lies here:\n\n"
+        "source: {use: packed-npy, with: {path: out.npy, frame_rate_hz: 96800}}\n"
+    )
+    assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
+
+
+def test_a_spec_may_name_the_capture(folder: Path, invoke: Callable[..., Any]) -> None:
+    assert invoke("convert", "capture.yaml", "out.npy", "--with", "n_frames=5").exit_code == 0
+    assert np.load(folder / "out.npy").shape == (5, 96, 20)
+    assert (folder / "out.truth.npz").exists()
+
+
+def test_corrections_are_made_where_they_are_asked_for(cube: Path, invoke: Callable[..., Any]) -> None:
+    assert (
+        invoke("convert", "cube.npy", "out.npy", "--correct", "{crop: {columns: [0, 43]}}", "--correct", "flip-lr").exit_code
+        == 0
+    )
+    frames = np.unpackbits(np.load(cube), axis=-1)
+    found = np.unpackbits(np.load(cube.parent / "out.npy"), axis=-1, count=43)
+    np.testing.assert_array_equal(found, frames[:, :, 42::-1])
+
+
+def test_what_frames_cannot_hold_is_refused(cube: Path, invoke: Callable[..., Any]) -> None:
+    pattern = np.full((96, 160, 3), 255, np.uint8)
+    pattern[::2, ::2, 1:] = 0
+    np.save(cube.parent / "pattern.npy", pattern)
+    correction = "{colour-filter: {pattern: pattern.npy, others: interpolate}}"
+    result = invoke("convert", "cube.npy", "out.npy", "--correct", correction)
+    assert result.exit_code == 1
+    assert result.stderr == (
+        "error: cannot write out.npy: some corrections change sums of frames, and not the frames; "
+        "leave them to the specs that read the file\n"
+    )
+
+
+class GreyConfig(Config):
+    path: SpecPath = Field(description="the capture")
+
+
+class Grey:
+    info = StreamInfo(5, 6, 19, None, "intensity", 8)
+    valid = np.ones((6, 19), bool)
+
+    def __enter__(self) -> Grey:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def test_intensities_are_refused(cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    grey = SourceContribution(name="grey", summary="Toy", config=GreyConfig, build=lambda *_: Grey())
+    catalog = discover().including(grey)
+    monkeypatch.setattr("photonpano.spec.loading.discover", lambda: catalog)
+    result = invoke("convert", "cube.npy", "out.npy", "--source", "grey")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr == (
+        "error: cannot write out.npy: packed .npy files hold binary frames, and this source gives intensities\n"
+    )
+
+
+SLOWLY = """
+import time
+from photonpano.cli.app import main
+from photonpano.pipeline import packed_frames
+packed_frames._BLOCK_BYTES = 20 * 96 * 20
+of = packed_frames.PackedFrames.of
+def slowly(self, span):
+    time.sleep(0.05)
+    return of(self, span)
+packed_frames.PackedFrames.of = slowly
+main()
+"""
+
+
+def heed_interrupts() -> None:
+    """Undo what a shell does to its background jobs: they, and what they start, ignore SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise there")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_conversion_is_continued(cube: Path, invoke: Callable[..., Any], sent: signal.Signals) -> None:
+    part, command = cube.parent / "out.npy.part", [sys.executable, "-c", SLOWLY, "convert", "cube.npy", "out.npy"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=cube.parent, text=True, preexec_fn=heed_interrupts, **pipes) as process:
+        while not (part.exists() and part.stat().st_size > 128) and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(sent)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert err == (
+        "what is written so far is in out.npy.part; the same command goes on from there\n"
+        "\ninterrupted; nothing half-written is left under a final name\n"
+    )
+    assert sorted(path.name for path in cube.parent.iterdir()) == ["capture.yaml", "cube.npy", "out.npy.part"]
+    there = (part.stat().st_size - 128) // (96 * 20)
+    result = invoke("convert", "cube.npy", "out.npy")
+    assert result.stderr == f"out.npy.part holds {there} of its frames, and is continued\n"
+    assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
+    assert not part.exists()
+
+
+def test_a_part_of_something_else_is_written_anew(cube: Path, invoke: Callable[..., Any]) -> None:
+    (cube.parent / "out.npy.part").write_bytes(b"something else")
+    result = invoke("convert", "cube.npy", "out.npy")
+    assert result.stderr == "out.npy.part is of another capture, and is written anew\n"
+    assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
+
+
+def test_a_capture_does_not_become_its_own_copy(cube: Path, invoke: Callable[..., Any]) -> None:
+    """The old file is read until the new one takes its name."""
+    before = cube.read_bytes()
+    assert invoke("convert", "cube.npy", "cube.npy").exit_code == 0
+    assert cube.read_bytes() == before

@@ -1,0 +1,87 @@
+"""What `photonpano dark` writes, prints and refuses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SHAPE = (24, 32)
+SPEC = "version: 1\nsource: {use: packed-npy, with: {path: covered.npy}}\n"
+
+
+@pytest.fixture
+def hot(folder: Path) -> np.ndarray:
+    """Put frames of a covered camera into the folder, and return its hot pixels."""
+    rng = np.random.default_rng(0)
+    hot = rng.random(SHAPE) < 0.03
+    rates = np.where(hot, 0.5, 0.002)
+    np.save(folder / "covered.npy", np.packbits(rng.random((1000, *SHAPE)) < -np.expm1(-rates), axis=-1))
+    (folder / "covered.yaml").write_text(SPEC)
+    return hot
+
+
+def test_dark_counts_and_how_to_use_them(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
+    done = invoke("dark", "covered.yaml", "--output", "dark.npz")
+    assert (done.exit_code, done.stderr) == (0, "")
+    with np.load(folder / "dark.npz") as archive:
+        assert sorted(archive.files) == ["n_frames", "rates"]
+        assert archive["rates"][hot].mean() == pytest.approx(0.5, rel=0.1)
+        assert archive["rates"][~hot].mean() == pytest.approx(0.002, rel=0.1)
+    lines = done.stdout.splitlines()
+    assert lines[0] == "dark.npz             from 1,000 binary frames of 24x32"
+    assert lines[1].startswith("dark counts a frame  median 0.002, 90 % 0.0")
+    assert lines[2].startswith(f"hot pixels           {hot.sum()} of 768 ({hot.mean():.2%}), above 0.0")
+    line = "corrections: [{hot-pixels: {dark: dark.npz}}, {dark-counts: {dark: dark.npz}}]"
+    assert lines[3:] == ["", "In a spec that lies here:", "", line]
+    assert len(parse_spec(f"{SPEC}{line}\n", directory=folder).corrections) == 2
+
+
+def test_a_mask_and_how_to_use_it(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
+    done = invoke("dark", "covered.npy", "-o", "mask.npy", "--threshold", "20")
+    np.testing.assert_array_equal(np.load(folder / "mask.npy"), hot)
+    line = done.stdout.splitlines()[-1]
+    assert line == "corrections: [{mask: {file: mask.npy}}]"
+    assert len(parse_spec(f"{SPEC}{line}\n", directory=folder).corrections) == 1
+
+
+@pytest.mark.usefixtures("hot")
+def test_corrections_that_move_pixels_are_applied(folder: Path, invoke: Callable[..., Any]) -> None:
+    invoke("dark", "covered.yaml", "-o", "dark.npz", "--correct", "rot90", "--correct", "{crop: {rows: [0, 10]}}")
+    with np.load(folder / "dark.npz") as archive:
+        assert archive["rates"].shape == (10, 24)
+
+
+def test_a_capture_that_is_not_dark_is_warned_of(folder: Path, invoke: Callable[..., Any]) -> None:
+    done = invoke("dark", "capture.yaml", "-o", "dark.npz")
+    assert done.exit_code == 0
+    assert done.stderr == "warning: half of the pixels count more than 0.1 a frame; was the lens covered?\n"
+
+
+@pytest.mark.usefixtures("hot")
+def test_another_suffix_is_refused_and_nothing_is_left(folder: Path, invoke: Callable[..., Any]) -> None:
+    done = invoke("dark", "covered.yaml", "-o", "dark.txt")
+    assert done.exit_code == 1
+    assert (
+        done.stderr == "error: cannot write dark.txt: dark counts are an .npz file, and a mask of hot pixels is a .npy file\n"
+    )
+    assert not list(folder.glob("*dark*"))
+
+
+@pytest.mark.usefixtures("hot")
+def test_explain_shows_corrections_as_they_are_written(folder: Path, invoke: Callable[..., Any]) -> None:
+    corrections = "corrections:\n  - rot90\n  - crop: {rows: [2, null]}\nresample: {with: {group_size: 50}}\n"
+    (folder / "scan.yaml").write_text(f"{SPEC}{corrections}")
+    printed = invoke("explain", "scan.yaml").stdout
+    assert (
+        "corrections:\n  - rot90\n  - crop:\n      rows: [2, null]\n      columns: [null, null]  # default\nresample:"
+        in printed
+    )
+    assert printed.startswith("# scan.yaml as it will run, on 1,000 binary frames of 30x24\n")

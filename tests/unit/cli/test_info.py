@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import json
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano.cli.info import _percent
+from photonpano.spec import parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+@pytest.fixture
+def cube(folder: Path, finished: Path) -> Path:
+    """A simulated capture in the current folder: 200 frames, a pan of 0.1 px a frame."""
+    shutil.copy(finished / "cube.npy", folder / "cube.npy")
+    return folder / "cube.npy"
+
+
+def rows_of(printed: str) -> dict[str, str]:
+    table = printed.partition("\n\n")[0]
+    return {line[:10].strip(): line[10:].strip() for line in table.splitlines()}
+
+
+def test_what_it_is_and_how_it_looks(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("info", "cube.npy", "--with", "frame_rate_hz=96800")
+    assert (result.exit_code, result.stderr) == (0, "")
+    rows = rows_of(result.stdout)
+    assert rows["source"] == "packed-npy (cube.npy is taken for it: uint8 of shape (200, 96, 20) in a .npy file)"
+    assert rows["capture"] == "200 binary frames of 96x160 at 96,800 Hz"
+    assert rows["duration"] == "2.07 ms"
+    flux, _, unit = rows["flux"].partition(" ")
+    assert unit == "photons per pixel and frame"
+    assert 0.5 < float(flux) < 2
+    assert rows["hot pixels"].startswith(("none", "about "))
+    assert rows["speed"].startswith("0.1 px a frame (the second fastest of ")
+    assert rows["group size"].startswith("25: at 0.1 px a frame ")
+    assert result.stdout.endswith(
+        "\n\nA spec to start from:\n\nversion: 1\nsource: {use: packed-npy, with: {path: cube.npy, frame_rate_hz: 96800}}\n"
+    )
+    plan = parse_spec(result.stdout.partition("start from:\n")[2], directory=cube.parent)
+    assert plan.source.config.path == cube
+
+
+def test_the_group_size_is_the_one_that_a_run_chooses(cube: Path, invoke: Callable[..., Any]) -> None:
+    facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
+    (cube.parent / "scan.yaml").write_text("version: 1\nsource: {use: auto, with: {path: cube.npy}}\nlevels: 1\n")
+    assert invoke("run", "scan.yaml").exit_code == 0
+    decisions = json.loads((cube.parent / "runs" / "scan" / "run.json").read_text())["decisions"]
+    assert {each["what"]: (each["value"], each["reason"]) for each in decisions} == {
+        "source": ("packed-npy", facts["reason"]),
+        "group_size": (facts["group_size"], facts["group_size_reason"]),
+    }
+
+
+def test_json_says_the_same(cube: Path, invoke: Callable[..., Any]) -> None:
+    facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
+    assert {key: facts[key] for key in ("source", "n_frames", "height", "width", "kind", "bit_depth", "warnings")} == {
+        "source": "packed-npy",
+        "n_frames": 200,
+        "height": 96,
+        "width": 160,
+        "kind": "binary",
+        "bit_depth": 1,
+        "warnings": [],
+    }
+    assert facts["frame_rate_hz"] is facts["seconds"] is None
+    assert facts["speed_px"] == pytest.approx(0.1, abs=0.02)
+    assert facts["unused_share"] == facts["saturated_share"] == 0
+    assert facts["spec"] == {"version": 1, "source": {"use": "packed-npy", "with": {"path": "cube.npy"}}}
+
+
+def test_a_spec_is_looked_at_whatever_groups_it_asks_for(cube: Path, invoke: Callable[..., Any]) -> None:
+    (cube.parent / "scan.yaml").write_text(
+        "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\ncorrections: [rot90]\n"
+        "resample: {with: {group_size: 7}}\nlevels: [{resample: {with: {group_size: 9}}}, {}]\n"
+    )
+    facts = json.loads(invoke("info", "scan.yaml", "--with", "frame_rate_hz=5", "--json").stdout)
+    assert (facts["height"], facts["width"], facts["group_size"]) == (160, 96, 25)
+    assert (facts["reason"], facts["frame_rate_hz"]) == (None, 5)
+    assert facts["spec"]["corrections"] == ["rot90"]
+
+
+def test_corrections_are_in_the_spec_to_start_from(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("info", "cube.npy", "--correct", "flip-ud", "--correct", "{crop: {rows: [2, null]}}")
+    assert rows_of(result.stdout)["capture"] == "200 binary frames of 94x160"
+    assert rows_of(result.stdout)["duration"] == "unknown without frame_rate_hz"
+    plan = parse_spec(result.stdout.partition("start from:\n")[2], directory=cube.parent)
+    assert len(plan.corrections) == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "flux", "warning"),
+    [
+        (0, 0, "no pixel is lit in any of 256 frames looked at all over the capture; check that the file is the right one, "),
+        (255, 7.2, "every pixel is lit in all of 256 frames looked at all over the capture, so that no flux can be told; "),
+    ],
+)
+def test_dark_and_saturated_captures_are_told(
+    folder: Path, invoke: Callable[..., Any], value: int, flux: float, warning: str
+) -> None:
+    np.save(folder / "cube.npy", np.full((600, 32, 4), value, np.uint8))
+    result = invoke("info", "cube.npy")
+    assert result.exit_code == 0
+    assert result.stderr.startswith(f"warning: {warning}")
+    facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
+    assert facts["saturated_share"] == (value == 255)
+    assert facts["speed_px"] is None
+    assert facts["flux"] == 0 if not flux else facts["flux"] > 3
+
+
+def test_hot_and_saturated_pixels_are_told(folder: Path, invoke: Callable[..., Any]) -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.random((600, 64, 64)) < 0.1
+    frames[:, rng.random((64, 64)) < 0.02] = True
+    frames[:, :8] = True
+    np.save(folder / "cube.npy", np.packbits(frames, axis=-1))
+    facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
+    assert facts["hot_share"] == pytest.approx(0.02 * 7 / 8, abs=0.006)
+    assert facts["saturated_share"] == pytest.approx(frames.all(axis=0).mean())
+    hot, saturated = invoke("info", "cube.npy").stderr.splitlines()
+    assert hot == f"warning: about {_percent(facts['hot_share'])} of the pixels are hot; the correction hot-pixels masks them"
+    assert saturated.startswith("warning: 14 % of the pixels have their highest value in every frame: ")
+
+
+def test_a_capture_that_is_too_short_for_groups(folder: Path, invoke: Callable[..., Any]) -> None:
+    np.save(folder / "cube.npy", np.random.default_rng(0).integers(0, 256, (5, 32, 4), np.uint8))
+    result = invoke("info", "cube.npy")
+    assert result.exit_code == 0
+    rows = rows_of(result.stdout)
+    assert (rows["speed"], rows["group size"]) == ("5 frames are too few to tell a motion", "unknown")
+    assert "warning: the capture has 5 frames, " in result.stderr

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import pytest
+from PIL import Image
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+@pytest.fixture
+def cube(folder: Path, finished: Path) -> Path:
+    shutil.copy(finished / "cube.npy", folder / "cube.npy")
+    return folder / "cube.npy"
+
+
+def test_a_folder_of_pictures(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("preview", "cube.npy", "-o", "look", "--group-size", "50", "--step", "75", "--white", "1.5")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == (
+        "look: 3 pictures of 200 binary frames of 96x160, 50 frames each\nwhite is 1.5 photons per pixel and frame\n"
+    )
+    files = sorted((cube.parent / "look").iterdir())
+    assert [file.name for file in files] == ["frame_000.png", "frame_075.png", "frame_150.png"]
+    assert {cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape for file in files} == {(110, 160)}
+
+
+def test_a_film(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("preview", "cube.npy", "-o", "look.webp", "--group-size", "20", "--fps", "10", "--no-label")
+    assert result.stdout.startswith("look.webp: 10 pictures of ")
+    with Image.open(cube.parent / "look.webp") as film:
+        assert (film.n_frames, film.size) == (10, (160, 96))
+
+
+def test_what_cannot_be_written_is_told_at_once(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("preview", "cube.npy", "-o", "look.jpg")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr == (
+        "error: cannot write look.jpg: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp\n"
+    )

@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano.photometry import packed_counts
+from photonpano.spec.corrections import resolved_corrections
+from photonpano.spec.tree import Place, from_data
+from photonpano.testing import MemorySource
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from photonpano import FrameSpan
+    from photonpano.corrections import Correction
+
+
+class PackedMemorySource(MemorySource):
+    """Frames in memory that are packed as well."""
+
+    def packed(self, span: FrameSpan) -> np.ndarray:
+        return np.packbits(self.frames(span), axis=-1)
+
+    def counts(self, span: FrameSpan) -> np.ndarray:
+        return packed_counts(self.packed(span), self.info.width)
+
+
+@pytest.fixture
+def packed_source() -> type[PackedMemorySource]:
+    return PackedMemorySource
+
+
+@pytest.fixture
+def corrections(tmp_path: Path) -> Callable[..., tuple[Correction, ...]]:
+    """Make corrections of what a spec would say: `corrections("rot90", {"crop": {"rows": [2, None]}})`."""
+
+    def corrections(*written: Any) -> tuple[Correction, ...]:
+        problems: list[Any] = []
+        found = resolved_corrections(from_data(list(written), problems, Place("corrections")), tmp_path, problems)
+        assert problems == []
+        return found
+
+    return corrections

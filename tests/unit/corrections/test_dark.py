@@ -1,0 +1,120 @@
+"""Dark counts: measured, stored, and taken out of sums without bias."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError
+from photonpano.corrections import CorrectedSource, DarkFrames, measure_dark, read_dark, write_dark
+from photonpano.testing import MemorySource
+from photonpano.values import Decision
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SHAPE = (20, 30)
+N = 2000
+SPAN = FrameSpan(0, N)
+
+
+def frames_of(flux: Any, seed: int = 0, n: int = N) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return (rng.random((n, *SHAPE)) < -np.expm1(-np.broadcast_to(flux, SHAPE))).astype(np.uint8)
+
+
+@pytest.mark.parametrize("rate", [0.001, 0.05, 0.4, 1.5])
+def test_dark_counts_are_taken_out_without_bias(rate: float, corrections: Callable, tmp_path: Path) -> None:
+    flux = 0.2
+    np.save(tmp_path / "dark.npy", np.full(SHAPE, rate))
+    keys = {"dark": "dark.npy", "limit": 2}
+    with CorrectedSource(MemorySource(frames_of(flux + rate)), corrections({"dark-counts": keys})) as source:
+        found = source.corrected(source.counts(SPAN), N) / N
+    p, n_all = -np.expm1(-flux - rate), N * found.size
+    error = np.exp(rate) * np.sqrt(p * (1 - p) / n_all)
+    assert abs(found.mean() + np.expm1(-flux)) < 4 * error
+
+
+def test_it_is_the_same_whatever_is_summed_with_what(corrections: Callable, tmp_path: Path) -> None:
+    rates = np.random.default_rng(0).uniform(0, 0.1, SHAPE)
+    np.save(tmp_path / "dark.npy", rates)
+    with CorrectedSource(MemorySource(frames_of(0.3 + rates)), corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
+        parts = [FrameSpan(0, 3), FrameSpan(3, N)]
+        together = sum(source.corrected(source.counts(part), len(part)) for part in parts)
+        np.testing.assert_allclose(source.corrected(source.counts(SPAN), N), together, atol=1e-3)
+
+
+def test_dark_counts_of_intensities_are_subtracted(corrections: Callable, tmp_path: Path) -> None:
+    values = np.random.default_rng(0).integers(0, 200, (5, *SHAPE), dtype=np.uint8)
+    grey = MemorySource(values)
+    grey.info = replace(grey.info, kind="intensity", bit_depth=8)
+    np.save(tmp_path / "dark.npy", np.full(SHAPE, 12.5))
+    with CorrectedSource(grey, corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
+        counts = source.counts(FrameSpan(0, 5))
+        np.testing.assert_allclose(source.corrected(counts, 5), counts - 62.5)
+        assert source.valid.all()
+
+
+def test_pixels_with_more_than_the_limit_are_masked_and_counted(corrections: Callable, tmp_path: Path) -> None:
+    rates = np.zeros(SHAPE)
+    rates[3, 4], rates[5, 6], rates[7, 8] = 40, 0.11, 0.09
+    np.save(tmp_path / "dark.npy", rates)
+    with CorrectedSource(MemorySource(frames_of(0.1)), corrections("rot180", {"dark-counts": {"dark": "dark.npy"}})) as source:
+        assert np.argwhere(~source.valid).tolist() == [[3, 4], [5, 6]]
+        assert np.isfinite(source.corrected(source.counts(SPAN), N)).all()
+        reason = "pixels with more than limit = 0.1 dark counts a frame are masked"
+        assert source.decisions == [Decision("dark_counts_masked", 2, reason)]
+
+
+def test_what_is_measured_is_the_rate_of_the_photons(tmp_path: Path) -> None:
+    rates = np.array([0.01, 0.5, 1.5])[:, None].repeat(SHAPE[0] * SHAPE[1] // 3, axis=1).reshape(SHAPE)
+    advanced: list[int] = []
+    measured = measure_dark(MemorySource(frames_of(rates)), advanced.append)
+    assert sum(advanced) == N == measured.n_frames
+    std = np.sqrt(np.expm1(rates) / N)
+    assert np.abs((measured.rates - rates) / std).mean() == pytest.approx(np.sqrt(2 / np.pi), rel=0.1)
+    write_dark(tmp_path / "dark.npz", measured)
+    again = read_dark(tmp_path / "dark.npz")
+    np.testing.assert_array_equal(again.rates, measured.rates)
+    assert again.n_frames == N
+    assert DarkFrames(again.rates, None).n_frames is None
+
+
+UNLIKELY = "holds dark counts that are negative or not finite"
+WRONG = {
+    "negative": (
+        np.array([[0, 1], [2, -0.5]]),
+        "holds dark counts that are negative or not finite, first -0.5 at row 1, column 1",
+    ),
+    "not finite": (np.array([[0, np.nan]]), "holds dark counts that are negative or not finite, first nan at row 0, column 1"),
+    "a mask": (np.zeros((2, 2), bool), "holds bool of shape (2, 2); dark counts are numbers of shape (height, width)"),
+    "frames": (np.zeros((2, 2, 2)), "holds float64 of shape (2, 2, 2); dark counts are numbers of shape (height, width)"),
+    "text": (None, "is not a file of dark counts: it is no .npy or .npz file of plain numbers"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_files_that_hold_no_rates_are_refused(case: str, tmp_path: Path) -> None:
+    array, message = WRONG[case]
+    path = tmp_path / "dark.npy"
+    if array is None:
+        path.write_text("no array")
+    else:
+        np.save(path, array)
+    with pytest.raises(InputError) as caught:
+        read_dark(path)
+    assert str(caught.value) == f"{path} {message}"
+
+
+def test_archives_of_something_else_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "dark.npz"
+    np.savez(path, homographies=np.eye(3))
+    with pytest.raises(InputError, match="is an archive without `rates`; name what `photonpano dark` wrote, or a"):
+        read_dark(path)
+    np.savez(path, rates=np.zeros((2, 2)), n_frames=np.array(-3))
+    with pytest.raises(InputError, match="is damaged: n_frames is no number of frames"):
+        read_dark(path)

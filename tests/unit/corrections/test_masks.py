@@ -1,0 +1,142 @@
+"""Pixels that somebody knows to be bad, and pixels behind a colour filter."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError
+from photonpano.corrections import CorrectedSource
+from photonpano.testing import MemorySource
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SHAPE = (6, 10)
+SPAN = FrameSpan(0, 50)
+RED, WHITE = (255, 0, 0), (255, 255, 255)
+
+
+@pytest.fixture
+def source() -> MemorySource:
+    return MemorySource(np.random.default_rng(0).integers(0, 2, (50, *SHAPE), dtype=np.uint8))
+
+
+@pytest.fixture
+def refused(source: MemorySource, corrections: Callable) -> Callable[..., str]:
+    def refused(*written: Any) -> str:
+        with pytest.raises(InputError) as caught:
+            CorrectedSource(source, corrections(*written))
+        return str(caught.value)
+
+    return refused
+
+
+def test_a_picture_is_as_good_a_mask_as_an_array(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
+    bad = np.random.default_rng(3).random(SHAPE) < 0.2
+    np.save(tmp_path / "bad.npy", bad)
+    cv2.imwrite(str(tmp_path / "bad.png"), bad * np.uint8(255))
+    for name in ("bad.npy", "bad.png"):
+        np.testing.assert_array_equal(CorrectedSource(source, corrections({"mask": {"file": name}})).valid, ~bad)
+
+
+def test_a_mask_is_of_the_size_at_its_place_of_the_list(refused: Callable, tmp_path: Path) -> None:
+    np.save(tmp_path / "bad.npy", np.zeros((10, 6), bool))
+    mask = {"mask": {"file": "bad.npy"}}
+    file = tmp_path / "bad.npy"
+    assert refused(mask) == f"{file} is of 10x6 px, and frames are of 6x10 px at this place of the list"
+    assert refused({"crop": {"rows": [2, None]}}, "rot90", mask) == (
+        f"{file} is of 10x6 px, and frames are of 10x4 px at this place of the list"
+    )
+
+
+def test_files_that_are_no_masks_are_refused(refused: Callable, tmp_path: Path) -> None:
+    np.save(tmp_path / "rates.npy", np.zeros(SHAPE))
+    np.savez(tmp_path / "dark.npz", rates=np.zeros(SHAPE))
+    for name in ("text.npy", "text.png"):
+        (tmp_path / name).write_text("no array")
+    (tmp_path / "empty.png").touch()
+    np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
+    kind = "a mask is a .npy file of bool, true for pixels that must not be used"
+    array = "is not a mask of bad pixels: it is no .npy or .npz file of plain numbers"
+    picture = "is not a mask of bad pixels: it is no picture that can be read"
+    expected = {
+        "rates.npy": f"holds float64 values; {kind}",
+        "dark.npz": f"is an archive; {kind}",
+        "text.npy": array,
+        "objects.npy": array,
+        "text.png": picture,
+        "empty.png": picture,
+    }
+    for name, message in expected.items():
+        assert refused({"mask": {"file": name}}) == f"{tmp_path / name} {message}"
+
+
+def pattern_of(red: np.ndarray) -> np.ndarray:
+    return np.where(red[..., None], np.uint8(RED), np.uint8(WHITE))
+
+
+def test_the_pixels_of_other_colours_are_masked(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
+    red = np.random.default_rng(3).random(SHAPE) < 0.3
+    np.save(tmp_path / "pattern.npy", pattern_of(red))
+    cv2.imwrite(str(tmp_path / "pattern.png"), pattern_of(red)[..., ::-1])
+    for name in ("pattern.npy", "pattern.png"):
+        clear, only_red, both = (
+            CorrectedSource(source, corrections({"colour-filter": {"pattern": name} | keep})).valid
+            for keep in ({}, {"keep": ["red"]}, {"keep": ["red", "clear"]})
+        )
+        np.testing.assert_array_equal(clear, ~red)
+        np.testing.assert_array_equal(only_red, red)
+        assert both.all()
+
+
+def test_filtered_pixels_are_the_mean_of_clear_ones_that_touch_them(
+    source: MemorySource, corrections: Callable, tmp_path: Path
+) -> None:
+    red = np.zeros(SHAPE, bool)
+    red[2, 3:5] = True
+    bad = np.zeros(SHAPE, bool)
+    bad[1, 3] = True
+    np.save(tmp_path / "pattern.npy", pattern_of(red))
+    np.save(tmp_path / "bad.npy", bad)
+    keys = {"pattern": "pattern.npy", "others": "interpolate"}
+    corrected = CorrectedSource(source, corrections({"colour-filter": keys}, {"mask": {"file": "bad.npy"}}))
+    np.testing.assert_array_equal(corrected.valid, ~bad)
+    counts = corrected.counts(SPAN)
+    np.testing.assert_array_equal(counts, source.counts(SPAN))
+    summed = corrected.corrected(counts, len(SPAN))
+    assert summed.dtype == np.float32
+    np.testing.assert_array_equal(summed[~red], counts[~red])
+    k = counts.astype(float)
+    beside, corners = k[3, 3] + k[2, 2], k[1, 2] + k[1, 4] + k[3, 2] + k[3, 4]
+    assert summed[2, 3] == pytest.approx((beside + corners / 2) / 4)
+
+
+def test_filtered_pixels_without_a_clear_neighbour_are_masked(
+    source: MemorySource, corrections: Callable, tmp_path: Path
+) -> None:
+    red = np.zeros(SHAPE, bool)
+    red[:3, :3] = True
+    np.save(tmp_path / "pattern.npy", pattern_of(red))
+    keys = {"pattern": "pattern.npy", "others": "interpolate"}
+    lonely = np.zeros(SHAPE, bool)
+    lonely[:2, :2] = True
+    np.testing.assert_array_equal(CorrectedSource(source, corrections({"colour-filter": keys})).valid, ~lonely)
+
+
+def test_unknown_colours_and_other_arrays_are_refused(refused: Callable, tmp_path: Path) -> None:
+    pattern = pattern_of(np.zeros(SHAPE, bool))
+    pattern[4, 5] = (255, 255, 0)
+    np.save(tmp_path / "pattern.npy", pattern)
+    np.save(tmp_path / "grey.npy", pattern[..., 0])
+    assert refused({"colour-filter": {"pattern": "pattern.npy"}}) == (
+        f"{tmp_path / 'pattern.npy'} has the colour (255, 255, 0) at row 4, column 5; a pattern has white for clear pixels, "
+        "and pure red, green and blue"
+    )
+    assert refused({"colour-filter": {"pattern": "grey.npy"}}) == (
+        f"{tmp_path / 'grey.npy'} holds uint8 values of shape (6, 10); a pattern is a .npy file of uint8 (height, width, 3)"
+    )
