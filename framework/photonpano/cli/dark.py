@@ -34,11 +34,11 @@ def dark(
     ] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Measure dark counts and hot pixels in a capture that was recorded with the lens covered.
+    """Measure dark counts and hot pixels, with the lens covered.
 
-    The spec needs no more than 'version' and 'source'; corrections that move pixels are applied, so that what is written fits
-    behind them in the list of another spec. An .npz file holds the dark counts of each pixel, from which a spec takes dark
-    counts or hot pixels; a .npy file holds the mask of the hot pixels.
+    The spec of such a capture needs no more than 'version' and 'source'. Its corrections are applied, so that what is written
+    fits behind them in the list of another spec. An .npz file holds the dark counts of each pixel, for dark-counts and
+    hot-pixels; a .npy file holds the mask of the hot pixels.
 
     Example: photonpano dark covered.yaml --output dark.npz
     """

@@ -48,6 +48,7 @@ def test_there_are_these_commands() -> None:
         "check",
         "explain",
         "simulate",
+        "dark",
         "evaluate",
         "schema",
         "warm-up",
