@@ -36,7 +36,7 @@ def dark(
     keys: Keys = None,
     corrections: Corrections = None,
 ) -> None:
-    """Measure dark counts and hot pixels of a covered lens.
+    """Measure dark counts and hot pixels, with the lens covered.
 
     The capture was recorded with the lens covered. Corrections that move pixels are applied, so that what is written fits
     behind them in the list of a spec. An .npz file holds the dark counts of each pixel, from which a spec takes dark

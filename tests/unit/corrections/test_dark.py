@@ -61,7 +61,7 @@ def test_dark_counts_of_intensities_are_subtracted(corrections: Callable, tmp_pa
 
 def test_pixels_with_more_than_the_limit_are_masked_and_counted(corrections: Callable, tmp_path: Path) -> None:
     rates = np.zeros(SHAPE)
-    rates[3, 4], rates[5, 6], rates[7, 8] = 40, 0.11, 0.09
+    rates[3, 4], rates[5, 6], rates[7, 8] = 200, 0.11, 0.09
     np.save(tmp_path / "dark.npy", rates)
     with CorrectedSource(MemorySource(frames_of(0.1)), corrections("rot180", {"dark-counts": {"dark": "dark.npy"}})) as source:
         assert np.argwhere(~source.valid).tolist() == [[3, 4], [5, 6]]

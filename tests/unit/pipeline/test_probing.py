@@ -9,6 +9,7 @@ import pytest
 from photonpano import FrameSpan, StreamInfo
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.probing import summarise
+from photonpano.testing import MemorySource
 
 SHAPE = (96, 128)
 
@@ -89,3 +90,16 @@ def test_a_few_frames_tell_no_motion() -> None:
     assert summary.speed_px is None
     assert summary.how == "20 frames are too few to tell a motion"
     assert summary.flux == pytest.approx(0.5, rel=0.1)
+
+
+class Veiled(MemorySource):
+    """Half of its counts are not the scene's."""
+
+    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
+        return counts.astype(np.float32) / 2
+
+
+def test_what_the_source_takes_out_of_sums_is_no_flux() -> None:
+    frames = np.random.default_rng(0).random((120, *SHAPE)) < 0.1
+    assert summarise(MemorySource(frames)).flux == pytest.approx(-np.log1p(-0.1), rel=0.02)
+    assert summarise(Veiled(frames)).flux == pytest.approx(-np.log1p(-0.05), rel=0.02)
