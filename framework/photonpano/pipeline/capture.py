@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, BinaryIO, Protocol, runtime_checkable
 
 import numpy as np
 
+from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError, OutputError
-from photonpano.pipeline.atomic import atomic_path
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
@@ -92,7 +91,7 @@ def _write_capture(
 ) -> None:
     info = source.info
     shape = (info.n_frames, info.height, -(-info.width // 8))
-    _require_space(final, math.prod(shape) + truth_bytes)
+    require_space(final, math.prod(shape) + truth_bytes)
     with temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
         _write_frames(source, file, progress, threads)
@@ -127,16 +126,3 @@ def _blocks(info: StreamInfo) -> Iterator[FrameSpan]:
     step = max(1, _BLOCK_BYTES // (info.height * info.width))
     for start in range(0, info.n_frames, step):
         yield FrameSpan(start, min(start + step, info.n_frames))
-
-
-def _require_space(path: Path, needed: int) -> None:
-    free = shutil.disk_usage(path.parent).free
-    if needed > free:
-        raise OutputError(
-            f"cannot write {path}: it takes {_size(needed)}, and its disk has {_size(free)} free; "
-            "free some space or choose another folder"
-        )
-
-
-def _size(n_bytes: int) -> str:
-    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.1f} MB"

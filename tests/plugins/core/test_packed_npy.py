@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonpano import FrameSpan, InputError, SourceContext
+from photonpano.reading import PackedFileSource
 
 if TYPE_CHECKING:
     from pathlib import Path
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig, PackedNpySource
+from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 
 
 def cube(n: int = 40, height: int = 6, width: int = 24, seed: int = 0) -> np.ndarray:
@@ -26,9 +27,9 @@ def saved(path: Path, array: np.ndarray, **options: Any) -> Path:
     return path
 
 
-def opened(path: Path, **config: Any) -> PackedNpySource:
+def opened(path: Path, **config: Any) -> PackedFileSource:
     source = PACKED_NPY.build(PackedNpyConfig(path=path, **config), SourceContext())
-    assert isinstance(source, PackedNpySource)
+    assert isinstance(source, PackedFileSource)
     return source
 
 
@@ -102,11 +103,12 @@ WRONG_ARRAYS = {
     ),
     "colour": (
         np.zeros((4, 6, 3, 3), np.uint8),
-        "{path} has 4 dimensions (4, 6, 3, 3), as colour captures have; save one channel, such as cube[..., 0]",
+        "{path} is a capture in colour, of shape (4, 6, 3, 3); choose a channel: 0, 1 or 2",
     ),
     "flat": (
         np.zeros((4, 6), np.uint8),
-        "{path} has the shape (4, 6); a packed capture has 3 dimensions: frames, height, bytes of a row",
+        "{path} has the shape (4, 6); a packed capture has 3 dimensions, frames, height and bytes of a row, and one of colour "
+        "a fourth, of 3 channels",
     ),
     "no frames": (
         np.zeros((0, 6, 3), np.uint8),
@@ -144,7 +146,6 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     ("content", "guess"),
     [
         (b"", ": it is empty"),
-        (b"\x1f\x8b\x08\x00 something", ": it is compressed with gzip; unpack it with gunzip"),
         (b"PK\x03\x04 something", ": it is an archive; save the array in it with numpy.save"),
         (b"\x93NUMPY\x01\x00\x10\x00{'descr': broken", " that can be read: its header is damaged; write it again"),
         (bytes(1000), ", by its first bytes; write it with numpy.save"),
@@ -188,12 +189,12 @@ def test_frames_that_were_not_packed_are_recognised_by_their_width(tmp_path: Pat
 def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     np.save(path, np.zeros((100, 16, 2), np.uint8))
-    with PackedNpySource(PackedNpyConfig(path=path)) as source:
+    with opened(path) as source:
         os.truncate(path, 1000)
         assert not source.counts(FrameSpan(0, 10)).any()
         with pytest.raises(InputError) as caught:
             source.counts(FrameSpan(10, 100))
-    assert str(caught.value) == (f"{path} has become shorter: frames 10 to 99 are no longer in it; copy or record it again")
+    assert str(caught.value) == f"{path} has become shorter while it was read; copy or record it again"
 
 
 def test_masks_that_do_not_fit_are_refused(tmp_path: Path) -> None:
