@@ -151,7 +151,7 @@ def _recognise(path: Path) -> Recognised | None:
             continue
         if max(unpacked_start(path, header.offset + _SAMPLE_BYTES)[header.offset :], default=0) <= 1:
             return None  # a pixel to a byte
-        because = f"it is a .npy file of uint8 {header.shape}"
+        because = f"a .npy file of uint8 {header.shape}"
         if channel is None:
             return Recognised({"path": str(path)}, because)
         return Recognised({"path": str(path), "channel": channel}, f"{because}, of whose channels the middle one is used")

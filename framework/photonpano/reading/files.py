@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from photonpano.errors import InputError
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
     import numpy as np
     from numpy.typing import NDArray
+
+Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_OPEN = 16
 """Files that are kept open; a capture may consist of hundreds, and a process is often allowed 1024."""
@@ -53,23 +56,22 @@ def _natural(path: Path) -> list[tuple[list[tuple[str, int]], str]]:
     return [([(text, int(digits or 0)) for text, digits in _TEXT_AND_NUMBER.findall(part)], part) for part in path.parts]
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the object that a JSON file holds.
+def read_json(path: Path, model: type[Model]) -> Model:
+    """Return what a JSON file says.
 
     Raises:
-        InputError: it is missing, or holds something else.
+        InputError: it is missing, or does not fit the model.
     """
     try:
-        content = json.loads(path.read_bytes())
+        return model.model_validate_json(path.read_bytes())
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}; check the path") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON; write it again") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path} holds no JSON object, which begins with a brace; write it again")
-    return content
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(f"{path} is wrong{where and f' at {where}'}: {first['msg']}; write it again") from error
 
 
 def read_start(path: Path, n_bytes: int) -> bytes:
