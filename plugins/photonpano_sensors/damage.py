@@ -27,6 +27,4 @@ def reading(path: Path, what: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}; check the path") from error
     except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as {what}; it is cut short, damaged, or something else: copy it again"
-        ) from error
+        raise InputError(f"{path} cannot be read as {what}: it is damaged or something else; copy it again") from error

@@ -40,8 +40,11 @@ def _joined(images: NDArray[Pixels]) -> NDArray[Pixels]:
     """
     *lead, rows, columns = images.shape
     zones = images.reshape(*lead, rows, _ZONES, 2, columns // (2 * _ZONES))
-    top, bottom = (zones[..., half, :].reshape(*lead, rows, columns // 2) for half in (0, 1))
-    return np.concatenate([top, bottom[..., ::-1, :]], axis=-2)
+    joined = np.empty((*lead, 2 * rows, columns // 2), images.dtype)
+    halves = joined.reshape(*lead, 2, rows, _ZONES, columns // (2 * _ZONES))
+    halves[..., 0, :, :, :] = zones[..., 0, :]
+    halves[..., 1, :, :, :] = zones[..., ::-1, :, 1, :]
+    return joined
 
 
 HALF = FrameLayout((256, 512), (256, 64), "little")

@@ -46,7 +46,7 @@ class UbiceptSource:
         first = self._group[self._names[0]]
         if first.ndim < 2 or min(first.shape[:2]) < 1 or any(size != 1 for size in first.shape[2:]):
             raise InputError(
-                f"{self._path} holds frames of shape {first.shape}; they are (height, width), perhaps with ones after"
+                f"{self._path} holds frames of shape {first.shape}; they are (height, width) or (height, width, 1, 1)"
             )
         if first.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self._path} holds {first.dtype} values; sums of binary frames are uint8 or uint16")
@@ -72,7 +72,7 @@ class UbiceptSource:
         found = self._file.visititems(lambda name, item: item.parent if _is_frame(name, item) else None)
         if found is None:
             raise InputError(
-                f"{self._path} has no group of frames, which are datasets with numbers as names; it is something else"
+                f"{self._path} has no group of frames, that is, datasets with numbers as names; choose another source"
             )
         return found
 

@@ -107,7 +107,7 @@ def _files(frames: Sequence[_Part], transforms: _Transforms, layout: FrameLayout
         header = headers[file]
         if start + n_frames > header.n_frames:
             raise InputError(
-                f"{folder / _TRANSFORMS} speaks of frame {start + n_frames - 1} of {file}, which has {header.n_frames}, from 0; "
+                f"{folder / _TRANSFORMS} speaks of frame {start + n_frames - 1} of {file}, which has {header.n_frames}; "
                 "write it again"
             )
         found.append(FrameFile(header.path, n_frames, header.offset + start * layout.stored_bytes))

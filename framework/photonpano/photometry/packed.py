@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 BitOrder: TypeAlias = Literal["big", "little"]
 """Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`."""
 
-_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _BLOCK_BYTES = 1024**2
 """Bytes of frames that are summed at a time: about what a core's cache holds."""
 
@@ -59,4 +58,8 @@ def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None =
 
 def reversed_bits(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Turn packed pixels of one bit order into those of the other: an array of the same shape."""
-    return np.frombuffer(bytearray(packed).translate(_REVERSED), np.uint8).reshape(packed.shape)
+    from photonpano.photometry.bits import reverse_bits
+
+    turned = np.empty(packed.shape, np.uint8)
+    reverse_bits(np.ascontiguousarray(packed).reshape(-1), turned.reshape(-1))
+    return turned
