@@ -22,6 +22,8 @@ _FILE_BYTES = 512 * 256 * 64
 """Bytes of a file, of 512 frames of the half array or 256 of the full one."""
 _SAMPLES = 64
 """So many full-array frames of the file, or pairs of half-array ones, are looked at to tell the two apart."""
+_BRIGHTEST = 0.9
+"""Brighter pixels count as if they were as bright as this share of all: hot ones must not outweigh the scene."""
 _STANDARD_ERRORS = 5.0
 
 
@@ -73,7 +75,7 @@ def _array_of(path: Path) -> tuple[Literal["half", "full"] | None, str]:
     """
     frames = np.memmap(path, np.uint8, "r").reshape(-1, *FULL.stored_shape)[:: _FILE_BYTES // FULL.stored_bytes // _SAMPLES]
     sums = np.unpackbits(frames, axis=-1, bitorder="little").sum(axis=0, dtype=np.float64)
-    first, second = np.split(sums, 2)
+    first, second = np.split(np.minimum(sums, np.quantile(sums, _BRIGHTEST)), 2)
     halves, rows = _alikeness(first, second), _alikeness(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]]))
     numbers = f"correlations of {np.tanh(halves):.2f} between the halves of their frames, {np.tanh(rows):.2f} between rows"
     if abs(halves - rows) < _STANDARD_ERRORS * np.sqrt(2 / first.size):

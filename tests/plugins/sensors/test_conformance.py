@@ -12,6 +12,7 @@ from photonpano import discover
 from photonpano.testing import SourceConformance
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 CATALOG = discover()
@@ -22,50 +23,35 @@ class BinConformance(SourceConformance):
     """Two files of which the second is shorter."""
 
     n_frames = 13
+    frame_shape = (512, 512)
     wrong = (NO_FILE,)
+
+    @pytest.fixture(autouse=True)
+    def _capture(self, tmp_path: Path, bin_file: Callable[[str, np.ndarray], bytes]) -> None:
+        self.bin_file = bin_file
+        self.prepare(tmp_path)
 
     def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
         for number, part in ((2, frames[:8]), (10, frames[8:])):
-            (folder / f"filename{number}.bin").write_bytes(self.file_bytes(part))
+            (folder / f"filename{number}.bin").write_bytes(self.bin_file(self.contribution.name, part))
         return {"path": folder, "frame_rate_hz": 96800}
-
-    def file_bytes(self, frames: np.ndarray) -> bytes:
-        raise NotImplementedError
 
 
 class TestSwissSpadHalf(BinConformance):
     contribution = CATALOG.find("source", "swissspad-half").contribution
     frame_shape = (256, 512)
 
-    def file_bytes(self, frames: np.ndarray) -> bytes:
-        return np.packbits(frames, axis=-1, bitorder="little").tobytes()
-
 
 class TestSwissSpadFull(BinConformance):
     contribution = CATALOG.find("source", "swissspad-full").contribution
-    frame_shape = (512, 512)
-
-    def file_bytes(self, frames: np.ndarray) -> bytes:
-        zones = []
-        for left in range(0, 512, 128):
-            zones += [frames[:, :256, left : left + 128], frames[:, :255:-1, left : left + 128]]
-        return np.packbits(np.concatenate(zones, axis=2), axis=-1, bitorder="little").tobytes()
 
 
 class TestSpad512(BinConformance):
     contribution = CATALOG.find("source", "spad512").contribution
-    frame_shape = (512, 512)
-
-    def file_bytes(self, frames: np.ndarray) -> bytes:
-        return np.packbits(frames, axis=-1).tobytes() + b"foot"
 
 
 class TestSpad512Sparse(BinConformance):
     contribution = CATALOG.find("source", "spad512-sparse").contribution
-    frame_shape = (512, 512)
-
-    def file_bytes(self, frames: np.ndarray) -> bytes:
-        return b"".join(np.append(np.flatnonzero(frame), 512 * 512).astype("<u4").tobytes() for frame in frames)
 
 
 class TestMatParts(SourceConformance):
