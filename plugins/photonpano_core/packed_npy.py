@@ -149,9 +149,9 @@ def _recognise(path: Path) -> Recognised | None:
             header, _ = _layout(PackedNpyConfig(path=path, channel=channel))
         except InputError:
             continue
-        if max(unpacked_start(path, header.offset + _SAMPLE_BYTES)[header.offset :], default=0) <= 1:
-            return None  # a pixel to a byte
-        because = f"a .npy file of uint8 {header.shape}"
+        if max(unpacked_start(path, header.offset + _SAMPLE_BYTES)[header.offset :], default=0) == 1:
+            return None  # zeros and ones: a pixel to a byte
+        because = f"uint8 of shape {header.shape} in a .npy file"
         if channel is None:
             return Recognised({"path": str(path)}, because)
         return Recognised({"path": str(path), "channel": channel}, f"{because}, of whose channels the middle one is used")

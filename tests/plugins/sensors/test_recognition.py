@@ -90,13 +90,15 @@ def test_packed_npy_files_are_known_by_their_header(tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", np.packbits(FRAMES, axis=-1))
     found = recognised(tmp_path / "cube.npy")
     assert set(found) == {"packed-npy"}
-    assert found["packed-npy"].because == "a .npy file of uint8 (6, 10, 2)"
+    assert found["packed-npy"].because == "uint8 of shape (6, 10, 2) in a .npy file"
     (tmp_path / "cube.npy.gz").write_bytes(gzip.compress((tmp_path / "cube.npy").read_bytes()))
     assert set(recognised(tmp_path / "cube.npy.gz")) == {"packed-npy"}
     np.save(tmp_path / "colour.npy", np.repeat(np.packbits(FRAMES, axis=-1)[..., None], 3, axis=-1))
     found = recognised(tmp_path / "colour.npy")
     assert found["packed-npy"].keys == {"path": str(tmp_path / "colour.npy"), "channel": 1}
-    assert found["packed-npy"].because == "a .npy file of uint8 (6, 10, 2, 3), of whose channels the middle one is used"
+    assert (
+        found["packed-npy"].because == "uint8 of shape (6, 10, 2, 3) in a .npy file, of whose channels the middle one is used"
+    )
 
 
 def test_frames_that_are_not_packed_are_left_alone(tmp_path: Path) -> None:
