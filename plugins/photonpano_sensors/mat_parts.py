@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.reading import BinarySource, FrameLayout, read_json
+from photonpano_sensors.mat_file import MatFrames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
 _MOST_PARTS = 4
-"""Parts that are kept, eight pixels to a byte; MATLAB's files can only be read whole."""
+"""Parts that are kept, eight pixels to a byte: files are compressed, and so can only be read from the beginning."""
 
 
 class MatPartsConfig(Config):
@@ -49,10 +50,8 @@ class MatPartsSource(BinarySource):
     """
 
     def __init__(self, config: MatPartsConfig) -> None:
-        from photonpano_sensors.mat_file import frames_of
-
         self._paths = _parts(config.path)
-        shapes = [frames_of(path).shape for path in self._paths]
+        shapes = [MatFrames(path).shape for path in self._paths]
         for path, shape in zip(self._paths, shapes, strict=True):
             if shape[1:] != shapes[0][1:]:
                 raise InputError(
@@ -64,7 +63,7 @@ class MatPartsSource(BinarySource):
         _, height, width = shapes[0]
         super().__init__(self._starts[-1], FrameLayout((height, width), (height, -(-width // 8))), config.frame_rate_hz)
         self._lock = Lock()
-        self._packed = lru_cache(_MOST_PARTS)(lambda path: frames_of(path).packed())
+        self._packed = lru_cache(_MOST_PARTS)(lambda path: MatFrames(path).packed())
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, a part at a time: see `BinarySource`."""

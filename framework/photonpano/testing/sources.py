@@ -124,7 +124,9 @@ class SourceConformance(Conformance):
     def test_packed_frames_are_the_frames(self) -> None:
         """Of a `photonpano.PackedSource`: what numpy packs along the width, zeros after it, and the caller's own."""
         with self.opened() as source:
-            for span in _spans(source) if isinstance(source, PackedSource) else ():
+            if not isinstance(source, PackedSource):
+                return
+            for span in _spans(source):
                 packed, expected = source.packed(span), np.packbits(source.frames(span), axis=-1)
                 assert packed.dtype == np.uint8, f"packed() returns uint8, got {packed.dtype}"
                 difference = _difference(packed, expected)

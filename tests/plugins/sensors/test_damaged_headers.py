@@ -58,7 +58,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Hold a capture of each kind that has a header."""
     folder = tmp_path_factory.mktemp("fuzz")
     np.save(folder / "frames.npy", np.packbits(FRAMES, axis=2))
-    savemat(folder / "whole.mat", {"OUTPUT": np.moveaxis(FRAMES, 0, -1)})
+    for name, compressed in (("whole.mat", False), ("compressed.mat", True)):
+        savemat(folder / name, {"TEXT": "text", "OUTPUT": np.moveaxis(FRAMES, 0, -1)}, do_compression=compressed)
     return folder
 
 
@@ -87,11 +88,12 @@ def test_bytes_in_transforms_json(folder: Path, changes: dict[int, int]) -> None
 
 
 @settings(deadline=None, max_examples=100)
-@given(changes=CHANGES, info=st.none() | JSON)
-def test_bytes_in_matlab_files(folder: Path, changes: dict[int, int], info: Any) -> None:
+@given(changes=CHANGES, info=st.none() | JSON, compressed=st.booleans())
+def test_bytes_in_matlab_files(folder: Path, changes: dict[int, int], info: Any, compressed: bool) -> None:
     parts = folder / "parts"
     parts.mkdir(exist_ok=True)
-    (parts / "part_1.mat").write_bytes(changed((folder / "whole.mat").read_bytes(), changes))
+    content = (folder / ("compressed.mat" if compressed else "whole.mat")).read_bytes()
+    (parts / "part_1.mat").write_bytes(changed(content, changes))
     (parts / "info.json").unlink(missing_ok=True)
     if info is not None:
         (parts / "info.json").write_text(json.dumps(info))
@@ -109,10 +111,11 @@ def hdf5(folder: Path) -> bytes:
 
 
 @settings(deadline=None, max_examples=100)
-@given(changes=CHANGES)
-def test_bytes_in_hdf5_files(folder: Path, hdf5: bytes, changes: dict[int, int]) -> None:
+@given(kept=st.integers(0, 20_000), start=st.binary(max_size=12))
+def test_hdf5_files_that_are_cut_short(folder: Path, hdf5: bytes, kept: int, start: bytes) -> None:
+    """Or begin with something else. Other bytes are not changed: the HDF5 library ends the process for some of these."""
     path = folder / "capture.ubi.h5"
-    path.write_bytes(changed(hdf5, changes))
+    path.write_bytes((start + hdf5[len(start) :])[: kept % len(hdf5)])
     try_to_read("ubicept-h5", path)
 
 
