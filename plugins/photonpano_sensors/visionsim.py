@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
+from photonpano.photometry import packed_along_width
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, npy_header, read_json, require_whole
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def _layout(transforms: _Transforms, packed_dim: int | None, channel: int | None
         return stored[..., last]
 
     def along_height(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return np.packbits(np.unpackbits(stored[..., last], axis=1, count=height), axis=2)
+        return packed_along_width(stored[..., last])[:, :height]
 
     def not_packed(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
         values = stored[..., last]

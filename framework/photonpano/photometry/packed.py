@@ -63,3 +63,13 @@ def reversed_bits(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
     turned = np.empty(packed.shape, np.uint8)
     reverse_bits(np.ascontiguousarray(packed).reshape(-1), turned.reshape(-1))
     return turned
+
+
+def packed_along_width(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pack along the width what is packed along the height: (n, H / 8, W) becomes (n, H, ceil(W / 8))."""
+    from photonpano.photometry.bits import transpose_bits
+
+    n_frames, rows, width = packed.shape
+    turned = np.empty((n_frames, 8 * rows, -(-width // 8)), np.uint8)
+    transpose_bits(np.ascontiguousarray(packed).reshape(-1, width), turned.reshape(n_frames * 8 * rows, -1))
+    return turned
