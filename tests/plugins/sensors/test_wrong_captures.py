@@ -94,6 +94,16 @@ def test_sparse_addresses_that_no_pixel_has(tmp_path: Path) -> None:
     )
 
 
+def test_sparse_addresses_in_any_order_and_more_than_once(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.bin"
+    path.write_bytes(np.array([700, 5, 700, 262144, 262144, 5, 262144], "<u4").tobytes())
+    contribution = CATALOG.find("source", SPARSE).contribution
+    with contribution.build(contribution.config(path=path), SourceContext()) as source:
+        counts = source.counts(FrameSpan(0, 3))
+        assert (counts[0, 5], counts[1, 700 - 512], counts.sum()) == (2, 1, 3)
+        np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)).sum(axis=0), counts)
+
+
 def test_a_file_that_becomes_shorter_while_it_is_read(tmp_path: Path) -> None:
     path = tmp_path / "frames.bin"
     fill(tmp_path, {"frames.bin": 10 * 16384})
