@@ -42,7 +42,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "chain": GROUPS,
     "colmap": GROUPS,
     "demo": GROUPS,
-    "swissspad": GROUPS | {"levels": "[{scale: 1}, {}, {}]"},
+    "swissspad": GROUPS | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
     "visionsim": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "splat": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
