@@ -1,8 +1,8 @@
 """photonpano: sharp panoramas from single-photon cameras.
 
-The names here are public: plugins and notebooks import them from `photonpano` and nowhere else, except for the pure
-functions of `photonpano.geometry`, `photonpano.photometry`, `photonpano.merging` and `photonpano.locating`. Each is imported
-when it is first used, so that the help of the command line needs no numpy.
+The names here are public: plugins and notebooks import them from `photonpano` and nowhere else, except for what
+`photonpano.geometry`, `photonpano.photometry`, `photonpano.merging`, `photonpano.locating` and `photonpano.reading` offer.
+Each is imported when it is first used, so that the help of the command line needs no numpy.
 """
 
 from importlib import import_module

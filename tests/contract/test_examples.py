@@ -42,6 +42,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "chain": GROUPS,
     "colmap": GROUPS,
     "demo": GROUPS,
+    "swissspad": GROUPS | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
+    "visionsim": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
     "splat": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
@@ -67,7 +69,7 @@ def photonpano(*arguments: str | Path, **overrides: Any) -> str:
 
 
 @pytest.fixture(scope="module")
-def examples(tmp_path_factory, small_capture) -> Path:
+def examples(tmp_path_factory, small_capture, simulated) -> Path:
     """A copy of the folder, with the files that the specs read."""
     folder = tmp_path_factory.mktemp("checkout") / "examples" / "pipelines"
     shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs", "*.npy", "*.npz"))
@@ -76,6 +78,16 @@ def examples(tmp_path_factory, small_capture) -> Path:
     for capture in (folder / "capture.npy", demo / "capture.npy"):
         shutil.copy(small_capture, capture)
         shutil.copy(truth_path(small_capture), truth_path(capture))
+    visionsim = folder / "visionsim"
+    visionsim.mkdir()
+    shutil.copy(small_capture, visionsim / "frames.npy")
+    camera = {"h": 128, "w": 160, "bitpack": True, "bitpack_dim": 2, "file_path": "frames.npy"}
+    (visionsim / "transforms.json").write_text(json.dumps(camera | {"frames": [{}] * 300}))
+    swissspad = folder / "swissspad"
+    swissspad.mkdir()
+    large = np.unpackbits(np.load(simulated(n_frames=240, frame_shape=[256, 512])), axis=-1)
+    for number, frames in enumerate(np.split(large, 2)):
+        np.packbits(frames, axis=-1, bitorder="little").tofile(swissspad / f"filename{number}.bin")
     rng = np.random.default_rng(0)
     blocks = cv2.resize(rng.uniform(0, 255, (40, 60)), (900, 600), interpolation=cv2.INTER_NEAREST)
     cv2.imwrite(str(folder / "photograph.jpg"), blocks + rng.normal(0, 10, blocks.shape))

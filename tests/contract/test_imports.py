@@ -12,7 +12,7 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-HEAVY = ("cv2", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia", "pycolmap")
+HEAVY = ("cv2", "h5py", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia", "pycolmap")
 COMMANDS = ["--help", "plugins list", "plugins show direct", "schema", "check scan.yaml"]
 HELP_SECONDS = 0.5
 
@@ -37,6 +37,7 @@ def test_the_package_imports_nothing_at_all() -> None:
         "import photonpano_core.hooks",
         "import photonpano_kornia.hooks",
         "import photonpano_opencv.hooks",
+        "import photonpano_sensors.hooks",
         "import photonpano_simulator.hooks",
         "from photonpano.registry import discover; discover()",
         "import photonpano.cli",

@@ -31,6 +31,7 @@ PACKED = np.packbits(FRAMES, axis=-1)
 BLANK_WALL = np.packbits(np.random.default_rng(0).random((40, 128, 160)) < 0.4, axis=-1)
 
 ONE_PROBLEM = "error: the spec has 1 problem\n"
+DIMENSIONS = "a packed capture has 3 dimensions, frames, height and bytes of a row, and one of colour a fourth, of 3 channels\n"
 
 
 def saved(array: np.ndarray) -> Callable[[Path], None]:
@@ -99,14 +100,12 @@ CASES = {
     "too few dimensions": Case(
         saved(PACKED[0]),
         2,
-        "DIR/spec.yaml:2:1: source: DIR/cube.npy has the shape (32, 6); "
-        "a packed capture has 3 dimensions: frames, height, bytes of a row\n" + ONE_PROBLEM,
+        "DIR/spec.yaml:2:1: source: DIR/cube.npy has the shape (32, 6); " + DIMENSIONS + ONE_PROBLEM,
     ),
     "too many dimensions": Case(
         saved(PACKED[..., None]),
         2,
-        "DIR/spec.yaml:2:1: source: DIR/cube.npy has 4 dimensions (40, 32, 6, 1), as colour captures have; "
-        "save one channel, such as cube[..., 0]\n" + ONE_PROBLEM,
+        "DIR/spec.yaml:2:1: source: DIR/cube.npy has the shape (40, 32, 6, 1); " + DIMENSIONS + ONE_PROBLEM,
     ),
     "width of other rows": Case(
         saved(PACKED),

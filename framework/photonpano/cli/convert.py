@@ -23,10 +23,10 @@ def convert(
 
     Example: photonpano convert recording/ cube.npy --with frame_rate_hz=96800
     """
+    from photonpano.atomic import part_path
     from photonpano.cli.capture import plan_for
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.written import tell_written
-    from photonpano.pipeline.atomic import part_path
     from photonpano.pipeline.capture import write_packed
     from photonpano.pipeline.components import build_source
     from photonpano.pipeline.threads import thread_count

@@ -47,6 +47,7 @@ def dark(
     import numpy as np
 
     from photonpano.api import open_source
+    from photonpano.atomic import atomic_path
     from photonpano.cli.capture import plan_for
     from photonpano.cli.outcome import warn
     from photonpano.cli.progress import progress_for_stderr
@@ -54,7 +55,6 @@ def dark(
     from photonpano.corrections import hot_in_the_dark, measure_dark, write_dark
     from photonpano.corrections.hot_pixels import THRESHOLD
     from photonpano.errors import InputError, OutputError
-    from photonpano.pipeline.atomic import atomic_path
     from photonpano.registry.description import flow
 
     if output.suffix not in (".npz", ".npy"):

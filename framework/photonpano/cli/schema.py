@@ -21,7 +21,7 @@ def schema(
     """
     import json
 
-    from photonpano.pipeline.atomic import atomic_path
+    from photonpano.atomic import atomic_path
     from photonpano.registry import discover
     from photonpano.spec import json_schema
 

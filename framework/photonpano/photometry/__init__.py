@@ -2,16 +2,20 @@
 
 from photonpano.photometry.contrast import signal_to_noise
 from photonpano.photometry.likeness import correlation_without_noise, noise_free_correlation
-from photonpano.photometry.packed import packed_counts
-from photonpano.photometry.responses import BinaryResponse
+from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
+from photonpano.photometry.responses import BinaryResponse, BinarySumResponse
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
+    "BinarySumResponse",
+    "BitOrder",
     "correlation_without_noise",
     "linear_to_srgb",
     "noise_free_correlation",
+    "packed_along_width",
     "packed_counts",
+    "reversed_bits",
     "signal_to_noise",
     "srgb_to_linear",
     "tone_mapped",

@@ -27,13 +27,14 @@ _STAGES = 3
 
 
 @compiled
-def add_counts(packed: NDArray[np.uint8], n_frames: int, counts: NDArray[np.uint32]) -> None:
+def add_counts(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDArray[np.uint32]) -> None:
     """Add packed frames to the counts of their pixels.
 
     Args:
         packed: (n B,) bytes of n frames, one after the other.
         n_frames: n, at most `MOST_FRAMES`.
-        counts: (8 B,), the highest bit of a byte first.
+        little: whether the first pixel of a byte is its lowest bit, and not its highest.
+        counts: (8 B,), what is added to.
     """
     frame_bytes = len(packed) // n_frames
     stages = np.empty((_STAGES, _ROWS * _WORDS), np.uint64)
@@ -48,6 +49,8 @@ def add_counts(packed: NDArray[np.uint8], n_frames: int, counts: NDArray[np.uint
             first = part * _WORDS
             if first < size:
                 _transpose(stages, n_bits, first, low)
+                if little:
+                    _reverse_bytes(low)
                 pixels = counts[8 * (start + first) : 8 * (start + min(first + _WORDS, size))]
                 _increase(pixels, low.view(np.uint8))
 
@@ -122,6 +125,16 @@ def _add(a: np.uint64, b: np.uint64, c: np.uint64) -> tuple[np.uint64, np.uint64
     """Add three bits of one weight, for 64 pixels: (carry, sum)."""
     differ = a ^ b
     return (a & b) | (differ & c), differ ^ c
+
+
+@compiled
+def _reverse_bytes(words: NDArray[np.uint64]) -> None:
+    """Put the last of the eight bytes of each word first."""
+    for j in range(_WORDS):
+        x = words[j]
+        x = ((x >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF)) | ((x & np.uint64(0x00FF00FF00FF00FF)) << np.uint64(8))
+        x = ((x >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)) | ((x & np.uint64(0x0000FFFF0000FFFF)) << np.uint64(16))
+        words[j] = (x >> np.uint64(32)) | (x << np.uint64(32))
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -11,18 +11,22 @@ if TYPE_CHECKING:
 
     from photonpano.values import Counts
 
+BitOrder: TypeAlias = Literal["big", "little"]
+"""Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`."""
+
 _BLOCK_BYTES = 1024**2
 """Bytes of frames that are summed at a time: about what a core's cache holds."""
 
 
-def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None = None) -> Counts:
+def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None = None, bit_order: BitOrder = "big") -> Counts:
     """Sum bit-packed frames, pixel by pixel, as fast as memory gives them, and in little memory beyond the result.
 
     Args:
-        packed: (n, H, ceil(width / 8)) uint8, packed along the width as `numpy.packbits` does: the first pixel is the highest
-            bit. A memory-mapped array is read in blocks.
+        packed: (n, H, ceil(width / 8)) uint8, packed along the width as `numpy.packbits` does. A memory-mapped array is read
+            in blocks.
         width: W, columns of a frame; the bits beyond it are ignored.
         counts: (H, W) uint32, what the sum is added to; None for zeros.
+        bit_order: which bit of a byte its first pixel is.
 
     Returns:
         (H, W) uint32, `counts` where it was given; zeros for no frames.
@@ -46,7 +50,26 @@ def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None =
     step = min(MOST_FRAMES, max(8, _BLOCK_BYTES // max(1, height * row_bytes)))
     for start in range(0, n_frames, step):
         block = np.ascontiguousarray(packed[start : start + step])
-        add_counts(block.reshape(-1), len(block), padded.reshape(-1))
+        add_counts(block.reshape(-1), len(block), bit_order == "little", padded.reshape(-1))
     if not whole:
         counts += padded[:, :width]
     return counts
+
+
+def reversed_bits(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Turn packed pixels of one bit order into those of the other: an array of the same shape."""
+    from photonpano.photometry.bits import reverse_bits
+
+    turned = np.empty(packed.shape, np.uint8)
+    reverse_bits(np.ascontiguousarray(packed).reshape(-1), turned.reshape(-1))
+    return turned
+
+
+def packed_along_width(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pack along the width what is packed along the height: (n, H / 8, W) becomes (n, H, ceil(W / 8))."""
+    from photonpano.photometry.bits import transpose_bits
+
+    n_frames, rows, width = packed.shape
+    turned = np.empty((n_frames, 8 * rows, -(-width // 8)), np.uint8)
+    transpose_bits(np.ascontiguousarray(packed).reshape(-1, width), turned.reshape(n_frames * 8 * rows, -1))
+    return turned

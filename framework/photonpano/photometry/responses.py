@@ -42,3 +42,33 @@ class BinaryResponse:
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `1 / (2 sqrt(frames))`."""
         return np.asarray(0.5 / np.sqrt(frames), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class BinarySumResponse:
+    """A frame is the sum of `n` binary frames, taken one after the other, so that a count goes from 0 to n.
+
+    Flux is photons per pixel per period of the *sum*. Each binary frame gets the n-th part of it, so the mean count at flux `f`
+    is `n (1 - exp(-f / n))`. All else follows from `BinaryResponse`, of n times as many frames.
+
+    Attributes:
+        n: how many binary frames are summed.
+    """
+
+    n: int
+
+    def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the expected count of one sum: `n (1 - exp(-flux / n))`."""
+        return np.asarray(self.n * BinaryResponse().mean_count(flux / np.float32(self.n)), dtype=np.float32)
+
+    def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return the maximum-likelihood flux `-n ln(1 - mean_count / n)`; a pixel that is always lit has `n ln(2 n frames)`."""
+        return np.asarray(self.n * BinaryResponse().flux(mean_count / np.float32(self.n), self.n * frames), dtype=np.float32)
+
+    def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return what `BinaryResponse` gives for all binary frames, from 0 to pi/2."""
+        return BinaryResponse().stabilised(flux / np.float32(self.n), self.n * frames)
+
+    def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Return `1 / (2 sqrt(n frames))`."""
+        return BinaryResponse().stabilised_std(self.n * frames)

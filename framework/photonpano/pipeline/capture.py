@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shutil
 from contextlib import suppress
 from typing import TYPE_CHECKING, BinaryIO, Protocol, runtime_checkable
 
 import numpy as np
 
+from photonpano.atomic import atomic_path, require_space, resumable_path
 from photonpano.errors import InputError, OutputError
-from photonpano.pipeline.atomic import atomic_path, resumable_path
 from photonpano.pipeline.packed_frames import PackedFrames
 from photonpano.pipeline.threads import in_order
 from photonpano.protocols import LinearlyCorrectedSource
@@ -109,7 +108,7 @@ def _write_capture(
 ) -> None:
     packed = PackedFrames(source)
     there = temporary.stat().st_size if temporary.exists() else 0
-    _require_space(final, packed.n_bytes + truth_bytes - there)
+    require_space(final, packed.n_bytes + truth_bytes - there)
     # Made before it is known what is in it: another process that writes to it must not be disturbed.
     with temporary.open("r+b" if temporary.exists() else "x+b") as file:
         _lock(file, final)
@@ -140,16 +139,3 @@ def _lock(file: BinaryIO, final: Path) -> None:
         except BlockingIOError as error:
             remedy = "wait for it, or choose another name"
             raise OutputError(f"cannot write {final}: another process is writing it; {remedy}") from error
-
-
-def _require_space(path: Path, needed: int) -> None:
-    free = shutil.disk_usage(path.parent).free
-    if needed > free:
-        raise OutputError(
-            f"cannot write {path}: it takes {_size(needed)}, and its disk has {_size(free)} free; "
-            "free some space or choose another folder"
-        )
-
-
-def _size(n_bytes: int) -> str:
-    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.1f} MB"

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from photonpano.atomic import atomic_folder, atomic_path
 from photonpano.errors import OutputError
-from photonpano.pipeline.atomic import atomic_folder, atomic_path
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -9,6 +9,7 @@ import pytest
 
 from photonpano.contributions import SourceContext
 from photonpano.errors import InputError
+from photonpano.protocols import PackedSource
 from photonpano.testing.conformance import Conformance, raising_nothing
 from photonpano.testing.sameness import fingerprint, global_chance, in_threads
 from photonpano.values import FrameSpan, StreamInfo
@@ -119,6 +120,20 @@ class SourceConformance(Conformance):
             for span in _spans(source):
                 difference = _difference(source.counts(span), source.frames(span).sum(axis=0, dtype=np.uint32))
                 assert not difference, f"counts(span) must be the sum of frames(span); for {span}, {difference}"
+
+    def test_packed_frames_are_the_frames(self) -> None:
+        """Of a `photonpano.PackedSource`: what numpy packs along the width, zeros after it, and the caller's own."""
+        with self.opened() as source:
+            if not isinstance(source, PackedSource):
+                return
+            for span in _spans(source):
+                packed, expected = source.packed(span), np.packbits(source.frames(span), axis=-1)
+                assert packed.dtype == np.uint8, f"packed() returns uint8, got {packed.dtype}"
+                difference = _difference(packed, expected)
+                assert not difference, f"packed(span) must be numpy.packbits(frames(span), axis=-1); for {span}, {difference}"
+                packed[...] = 255
+                difference = _difference(source.packed(span), expected)
+                assert not difference, f"after a caller wrote to what packed() had returned, it gives another: {difference}"
 
     def test_spans_neither_overlap_nor_leave_gaps(self) -> None:
         """A span is half-open: `[start, stop)`."""

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import gzip
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,11 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonpano import FrameSpan, InputError, SourceContext
+from photonpano import FrameSpan, InputError, OutputError, SourceContext
+from photonpano.reading import PackedFileSource
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig, PackedNpySource
+from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 
 
 def cube(n: int = 40, height: int = 6, width: int = 24, seed: int = 0) -> np.ndarray:
@@ -26,9 +30,9 @@ def saved(path: Path, array: np.ndarray, **options: Any) -> Path:
     return path
 
 
-def opened(path: Path, **config: Any) -> PackedNpySource:
+def opened(path: Path, **config: Any) -> PackedFileSource:
     source = PACKED_NPY.build(PackedNpyConfig(path=path, **config), SourceContext())
-    assert isinstance(source, PackedNpySource)
+    assert isinstance(source, PackedFileSource)
     return source
 
 
@@ -71,6 +75,87 @@ def test_many_threads_may_read_at_once(tmp_path: Path) -> None:
         assert all(pool.map(read, range(4)))
 
 
+@pytest.mark.parametrize("width", [24, 19])
+def test_one_channel_of_a_capture_in_colour(tmp_path: Path, width: int) -> None:
+    channels = [cube(width=width, seed=seed) for seed in range(3)]
+    path = saved(tmp_path / "cube.npy", np.packbits(np.stack(channels, axis=-1), axis=2))
+    for channel, frames in enumerate(channels):
+        with opened(path, width=width, channel=channel) as source:
+            np.testing.assert_array_equal(source.frames(source.info.span), frames)
+            np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), frames[3:30].sum(axis=0))
+            np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
+
+
+def test_a_channel_of_a_capture_without_colour_is_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", PACKED)
+    assert_refused(f"{path} has the shape (40, 6, 3) and no channels; leave out channel: 2", path, channel=2)
+
+
+@pytest.fixture
+def gzipped(tmp_path: Path) -> Path:
+    path = tmp_path / "cube.npy.gz"
+    path.write_bytes(gzip.compress(saved(tmp_path / "cube.npy", PACKED).read_bytes()))
+    (tmp_path / "cube.npy").unlink()
+    return path
+
+
+def test_compressed_captures_are_unpacked_once(gzipped: Path, caplog: pytest.LogCaptureFixture) -> None:
+    beside = gzipped.with_name("cube.npy.gz.unpacked.npy")
+    message = f"{gzipped} is unpacked to {beside.name}, once"
+
+    def read() -> list[str]:
+        caplog.clear()
+        with opened(gzipped) as source:
+            np.testing.assert_array_equal(source.frames(source.info.span), cube())
+        return caplog.messages
+
+    assert list(PACKED_NPY.check(PackedNpyConfig(path=gzipped))) == []
+    assert not beside.exists()
+    assert read() == [message]
+    assert read() == []
+    assert sorted(gzipped.parent.iterdir()) == [gzipped, beside]
+    os.utime(gzipped, (beside.stat().st_mtime + 10,) * 2)
+    assert read() == [message]
+    os.truncate(beside, 100)
+    assert read() == [message]
+
+
+@pytest.mark.parametrize(
+    ("damaged", "words"),
+    [
+        (lambda content: content[:-12], "is cut short or damaged: gzip cannot unpack it; copy it again"),
+        (lambda content: content[:15], "holds no .npy file; compress one that numpy.save has written"),
+        (lambda content: content[:-6] + b"wrong!", "is cut short or damaged: gzip cannot unpack it; copy it again"),
+        (lambda _: gzip.compress(b"text"), "holds no .npy file; compress one that numpy.save has written"),
+        (
+            lambda content: gzip.compress(gzip.decompress(content)[:-1]),
+            "is damaged: the header of its array promises 848 bytes, there are 847; copy or record it again",
+        ),
+        (
+            lambda content: gzip.compress(gzip.decompress(content) + b"1"),
+            "is damaged: the header of its array promises 848 bytes, there are more; copy or record it again",
+        ),
+    ],
+)
+def test_compressed_captures_that_are_damaged_leave_nothing_behind(gzipped: Path, damaged: Callable, words: str) -> None:
+    gzipped.write_bytes(damaged(gzipped.read_bytes()))
+    with pytest.raises(InputError) as caught:
+        opened(gzipped)
+    assert str(caught.value) == f"{gzipped} {words}"
+    assert list(gzipped.parent.iterdir()) == [gzipped]
+
+
+def test_a_disk_without_room_is_told_before_anything_is_unpacked(gzipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=847))
+    with pytest.raises(OutputError) as caught:
+        opened(gzipped)
+    beside = gzipped.with_name("cube.npy.gz.unpacked.npy")
+    assert str(caught.value) == (
+        f"cannot write {beside}: it takes 0.0 MB, and its disk has 0.0 MB free; free some space or choose another folder"
+    )
+    assert list(gzipped.parent.iterdir()) == [gzipped]
+
+
 def test_a_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
     with opened(saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))) as source:
         for read in (source.counts, source.frames):
@@ -92,11 +177,12 @@ WRONG_ARRAYS = {
     ),
     "colour": (
         np.zeros((4, 6, 3, 3), np.uint8),
-        "{path} has 4 dimensions (4, 6, 3, 3), as colour captures have; save one channel, such as cube[..., 0]",
+        "{path} is a capture in colour, of shape (4, 6, 3, 3); choose a channel: 0, 1 or 2",
     ),
     "flat": (
         np.zeros((4, 6), np.uint8),
-        "{path} has the shape (4, 6); a packed capture has 3 dimensions: frames, height, bytes of a row",
+        "{path} has the shape (4, 6); a packed capture has 3 dimensions, frames, height and bytes of a row, and one of colour "
+        "a fourth, of 3 channels",
     ),
     "no frames": (
         np.zeros((0, 6, 3), np.uint8),
@@ -134,7 +220,6 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     ("content", "guess"),
     [
         (b"", ": it is empty"),
-        (b"\x1f\x8b\x08\x00 something", ": it is compressed with gzip; unpack it with gunzip"),
         (b"PK\x03\x04 something", ": it is an archive; save the array in it with numpy.save"),
         (b"\x93NUMPY\x01\x00\x10\x00{'descr': broken", " that can be read: its header is damaged; write it again"),
         (bytes(1000), ", by its first bytes; write it with numpy.save"),
@@ -178,12 +263,12 @@ def test_frames_that_were_not_packed_are_recognised_by_their_width(tmp_path: Pat
 def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     np.save(path, np.zeros((100, 16, 2), np.uint8))
-    with PackedNpySource(PackedNpyConfig(path=path)) as source:
+    with opened(path) as source:
         os.truncate(path, 1000)
         assert not source.counts(FrameSpan(0, 10)).any()
         with pytest.raises(InputError) as caught:
             source.counts(FrameSpan(10, 100))
-    assert str(caught.value) == (f"{path} has become shorter: frames 10 to 99 are no longer in it; copy or record it again")
+    assert str(caught.value) == f"{path} has become shorter while it was read; copy or record it again"
 
 
 def test_a_negative_shape_is_refused(tmp_path: Path) -> None:

@@ -227,11 +227,10 @@ def test_plugins_list(invoke: Callable[..., Any]) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     head, *rows = result.stdout.splitlines()
     assert head.split() == ["KIND", "NAME", "PLUGIN", "SUMMARY"]
-    assert [row.split()[:4] for row in rows] == [
-        ["source", "auto", "photonpano", "0.1.0"],
-        ["source", "packed-npy", "photonpano", "0.1.0"],
-        ["source", "simulator", "photonpano", "0.1.0"],
-    ]
+    names = [row.split()[1] for row in rows if row.split()[0::2][:2] == ["source", "photonpano"]]
+    assert len(names) == len(rows)
+    assert names == sorted(names)
+    assert {"auto", "packed-npy", "simulator", "swissspad-half"} <= set(names)
 
 
 @pytest.mark.usefixtures("odd_catalog")
@@ -303,7 +302,13 @@ def test_plugins_show(finished: Path, invoke: Callable[..., Any]) -> None:
     head, facts, table, snippet = text.split("\n\n")
     assert head.startswith("packed-npy: ")
     assert facts == "kind    source\nplugin  photonpano 0.1.0 (core = photonpano_core.hooks)"
-    assert [line.split()[0] for line in table.splitlines()] == ["KEY", "path", "frame_rate_hz", "width"]
+    assert [line.split()[0] for line in table.splitlines()] == [
+        "KEY",
+        "path",
+        "frame_rate_hz",
+        "width",
+        "channel",
+    ]
     assert "required" in table
     plan = parse_spec("version: 1\n" + snippet.replace('"<a path>"', "cube.npy"), directory=finished)
     assert plan.source.contribution.name == "packed-npy"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonpano.photometry import packed_counts
+from photonpano.photometry import packed_along_width, packed_counts, reversed_bits
 
 
 @settings(deadline=None)
@@ -17,6 +17,21 @@ def test_equals_the_sum_of_the_frames(n: int, height: int, width: int, seed: int
     counts = packed_counts(np.packbits(frames, axis=-1), width)
     assert counts.dtype == np.uint32
     np.testing.assert_array_equal(counts, frames.sum(axis=0, dtype=np.uint32).reshape(height, width))
+
+
+@pytest.mark.parametrize("n", [1, 9, 300])
+def test_the_first_pixel_may_be_the_lowest_bit(n: int) -> None:
+    frames = np.random.default_rng(n).integers(0, 2, (n, 3, 43), dtype=np.uint8)
+    packed = np.packbits(frames, axis=-1, bitorder="little")
+    np.testing.assert_array_equal(packed_counts(packed, 43, bit_order="little"), frames.sum(axis=0))
+    np.testing.assert_array_equal(reversed_bits(packed), np.packbits(frames, axis=-1))
+    np.testing.assert_array_equal(reversed_bits(packed[:, ::-1]), np.packbits(frames, axis=-1)[:, ::-1])
+
+
+@pytest.mark.parametrize("width", [1, 16, 43])
+def test_frames_packed_along_the_height(width: int) -> None:
+    frames = np.random.default_rng(width).integers(0, 2, (5, 24, width), dtype=np.uint8)
+    np.testing.assert_array_equal(packed_along_width(np.packbits(frames, axis=1)), np.packbits(frames, axis=2))
 
 
 def test_lit_padding_bits_do_not_count() -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano.photometry import BinaryResponse
+from photonpano.photometry import BinaryResponse, BinarySumResponse
 
 RESPONSE = BinaryResponse()
 
@@ -61,3 +61,23 @@ def test_few_frames_in_the_dark_look_as_bright_as_many() -> None:
     )
     assert few == pytest.approx(many, abs=0.004)
     assert np.arcsin(np.sqrt(rng.binomial(40, 0.1, 200_000) / 40)).mean() < many - 0.008
+
+
+@pytest.mark.parametrize("n", [1, 15, 255])
+def test_sums_of_binary_frames_follow_the_model_of_binary_frames(n: int) -> None:
+    response, flux = BinarySumResponse(n), f32(0, 0.02 * n, 0.5 * n, 2 * n)
+    rng = np.random.default_rng(n)
+    sums = rng.binomial(n, -np.expm1(-flux / n), (200_000 // n, 4))
+    np.testing.assert_allclose(sums.mean(axis=0), response.mean_count(flux), rtol=0.02)
+    np.testing.assert_allclose(response.flux(response.mean_count(flux), 1000), flux, rtol=1e-4)
+    np.testing.assert_allclose(response.flux(f32(n), 1), n * np.log(2 * n), rtol=1e-3)
+
+
+@pytest.mark.parametrize("flux", [0.05, 1.0, 20.0])
+def test_sums_of_binary_frames_have_uniform_noise_once_stabilised(flux: float) -> None:
+    response, n_frames = BinarySumResponse(15), 40
+    sums = np.random.default_rng(0).binomial(15 * n_frames, -np.expm1(-flux / 15), 50_000)
+    estimates = response.flux((sums / n_frames).astype(np.float32), n_frames)
+    values = response.stabilised(estimates, np.float32(n_frames))
+    np.testing.assert_allclose(values.std(), response.stabilised_std(n_frames), rtol=0.06)
+    np.testing.assert_allclose(values.mean(), response.stabilised(f32(flux), 1e9)[0], atol=0.02)

@@ -90,6 +90,25 @@ class ReusesItsBuffer(Honest):
         return self.buffer
 
 
+class Packed(Honest):
+    def packed(self, span):
+        return np.packbits(self.frames(span), axis=-1)
+
+
+class PacksFromTheRight(Packed):
+    def packed(self, span):
+        return np.packbits(self.frames(span), axis=-1, bitorder="little")
+
+
+class LendsPackedFrames(Packed):
+    def __init__(self, context):
+        super().__init__(context)
+        self.kept = super().packed(self.info.span)
+
+    def packed(self, span):
+        return self.kept[span.start : span.stop]
+
+
 class SharesAPosition(Honest):
     def frames(self, span):
         self.position = span.start
@@ -151,6 +170,8 @@ BROKEN = [
         r"for frames 0 to 0, \d+ pixels differ, first the one at row 0",
         {},
     ),
+    ("test_packed_frames_are_the_frames", PacksFromTheRight, r"packed.span. must be numpy.packbits.* \d+ pixels differ", {}),
+    ("test_packed_frames_are_the_frames", LendsPackedFrames, "after a caller wrote to what packed.. had returned", {}),
     (
         "test_spans_neither_overlap_nor_leave_gaps",
         CountsOneMore,
@@ -202,10 +223,10 @@ def test_every_check_catches_something(checks_of):
     assert checks_of(SourceConformance, Conformance) == {check for check, *_ in BROKEN}
 
 
-@pytest.mark.parametrize("bit_depth", [1, 10])
-def test_an_honest_one_passes(bit_depth, checks_of, complaint):
+@pytest.mark.parametrize(("honest", "bit_depth"), [(Honest, 1), (Packed, 1), (Honest, 10)])
+def test_an_honest_one_passes(honest, bit_depth, checks_of, complaint):
     def build(context):
-        source = MemorySource(FRAMES.copy())
+        source = honest(context)
         if bit_depth > 1:
             source._frames = subject.known_frames()
             source.info = replace(source.info, kind="intensity", bit_depth=bit_depth)

@@ -93,6 +93,20 @@ def _becoming(final: Path, temporary: Path) -> Iterator[None]:
         raise OutputError(_message(final, error)) from error
 
 
+def require_space(final: Path, n_bytes: int) -> None:
+    """Refuse to begin a file that its disk has no room for.
+
+    Raises:
+        OutputError: fewer than `n_bytes` are free.
+    """
+    free = shutil.disk_usage(final.parent).free
+    if n_bytes > free:
+        raise OutputError(
+            f"cannot write {final}: it takes {_size(n_bytes)}, and its disk has {_size(free)} free; "
+            "free some space or choose another folder"
+        )
+
+
 def _flush_to_disk(path: Path) -> None:
     """Wait for the disk: some file systems tell only now that they are full, and a rename may overtake the data."""
     descriptor = os.open(path, os.O_RDWR)
@@ -120,3 +134,7 @@ def _message(final: Path, error: OSError) -> str:
         return f"cannot write {final}: there is no folder {final.parent}; create it or choose another"
     remedy = _REMEDIES.get(error.errno or 0)
     return f"cannot write {final}: {reason}" + (f"; {remedy}" if remedy else "")
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.1f} MB"

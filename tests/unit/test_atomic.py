@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from photonpano import OutputError
-from photonpano.pipeline.atomic import atomic_path
+from photonpano.atomic import atomic_path
 
 
 def test_the_file_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ _FILLS_THE_DISK = """
 import resource, signal, sys
 from pathlib import Path
 from photonpano import OutputError
-from photonpano.pipeline.atomic import atomic_path
+from photonpano.atomic import atomic_path
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))

@@ -1,0 +1,101 @@
+"""Headers of .npy files, read without their data, and without trusting them."""
+
+from __future__ import annotations
+
+import math
+from typing import IO, TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from photonpano.errors import InputError
+
+if TYPE_CHECKING:
+    from gzip import GzipFile
+    from pathlib import Path
+
+
+class NpyHeader(NamedTuple):
+    """What a .npy file says of its array.
+
+    Attributes:
+        shape: the shape.
+        dtype: the type of the values.
+        fortran_order: whether the first index runs fastest.
+        offset: where the data begins, in bytes.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+    fortran_order: bool
+    offset: int
+
+    @property
+    def file_bytes(self) -> int:
+        """The size of a file that holds all of it."""
+        return self.offset + math.prod(self.shape) * self.dtype.itemsize
+
+
+def npy_header(path: Path) -> NpyHeader:
+    """Read the header of a .npy file.
+
+    Raises:
+        InputError: it cannot be read, or is something else.
+    """
+    try:
+        with path.open("rb") as file:
+            header = read_npy_header(file)
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}; check the path") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name the .npy file in it") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    if header is None:
+        raise InputError(f"{path} is not a .npy file{_guess(path)}")
+    return header
+
+
+def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
+    """Return the header at the beginning of an open file, None if there is none that can be read.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        # Version 3 differs only for structured types, which no capture has.
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read(file)
+        return NpyHeader(shape, dtype, fortran_order, file.tell())
+    except OSError:
+        raise
+    except Exception:  # a damaged header makes numpy's parser raise nearly anything
+        return None
+
+
+def require_whole(path: Path, header: NpyHeader) -> None:
+    """Refuse a .npy file that is shorter than its header promises.
+
+    Raises:
+        InputError: it is.
+    """
+    size = path.stat().st_size
+    if size < header.file_bytes:
+        raise InputError(
+            f"{path} is cut short: its header {header.shape} promises {header.file_bytes} bytes, the file has {size}; "
+            "copy or record it again"
+        )
+
+
+def _guess(path: Path) -> str:
+    with path.open("rb") as file:
+        start = file.read(4)
+    if not start:
+        return ": it is empty"
+    if start.startswith(b"\x1f\x8b"):
+        return ": it is compressed with gzip; unpack it with gunzip"
+    if start.startswith(b"PK"):
+        return ": it is an archive; save the array in it with numpy.save"
+    if start.startswith(b"\x93NUM"):
+        return " that can be read: its header is damaged; write it again"
+    return ", by its first bytes; write it with numpy.save"

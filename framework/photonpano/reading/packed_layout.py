@@ -1,0 +1,85 @@
+"""How the pixels of binary frames lie in the bytes of a file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import numpy as np
+
+from photonpano.photometry import BitOrder, packed_counts, reversed_bits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from photonpano.values import Counts
+
+Pixels = TypeVar("Pixels", bound=np.generic)
+
+
+class Arrangement(Protocol):
+    """Puts blocks of stored images where they belong."""
+
+    def __call__(self, images: NDArray[Pixels], /) -> NDArray[Pixels]:
+        """Return (..., height, columns) of (..., rows, columns), where a column is a pixel or a byte of eight.
+
+        What is in a byte stays together. It must not write to what it is given.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLayout:
+    """How the pixels of a binary frame lie in its bytes.
+
+    Whatever is only a matter of order is done once to a sum of frames, and not to each of them.
+
+    Attributes:
+        frame_shape: (height, width) of the image.
+        stored_shape: the shape of the bytes of a frame. They are its packed rows, unless `to_rows` makes those.
+        bit_order: which bit of a byte its first pixel is.
+        arranged: makes images of stored ones; None if the rows are those of the image.
+        to_rows: makes (n, rows, bytes of a row), packed along the width, of (n, *stored_shape). None if that is how they are
+            stored.
+    """
+
+    frame_shape: tuple[int, int]
+    stored_shape: tuple[int, ...]
+    bit_order: BitOrder = "big"
+    arranged: Arrangement | None = None
+    to_rows: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of a frame in the file."""
+        return math.prod(self.stored_shape)
+
+    def rows(self, stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the packed rows (n, rows, bytes of a row) of stored frames (n, *stored_shape)."""
+        return stored if self.to_rows is None else self.to_rows(stored)
+
+    def add_counts(self, rows: NDArray[np.uint8], sums: Counts | None) -> Counts:
+        """Add packed rows to sums of them, which `image` turns into sums of the image."""
+        return packed_counts(rows, 8 * rows.shape[-1], sums, self.bit_order)
+
+    def unpacked(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the frames (n, H, W) that packed rows hold."""
+        return self.image(np.unpackbits(rows, axis=-1, bitorder=self.bit_order))
+
+    def packed(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the frames (n, H, ceil(W / 8)), packed as numpy does; they may share memory with `rows`."""
+        packed = rows if self.bit_order == "big" else reversed_bits(rows)
+        if self.arranged is not None:
+            packed = self.arranged(packed)
+        if beyond := -self.frame_shape[1] % 8:
+            packed = packed.copy()
+            packed[..., -1] &= 0xFF << beyond & 0xFF
+        return packed
+
+    def image(self, pixels: NDArray[Pixels]) -> NDArray[Pixels]:
+        """Return (..., H, W) of pixels (..., rows, 8 times the bytes of a row)."""
+        arranged = pixels if self.arranged is None else self.arranged(pixels)
+        return np.ascontiguousarray(arranged[..., : self.frame_shape[1]])

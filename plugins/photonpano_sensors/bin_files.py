@@ -1,0 +1,79 @@
+"""Captures in .bin files: packed frames without a header, one file or a folder of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from photonpano import Config, InputError, SpecPath
+from photonpano.reading import FrameFile, PackedFileSource, files_in
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from photonpano.reading import FrameLayout
+
+
+class BinConfig(Config):
+    """A capture in .bin files."""
+
+    path: SpecPath = Field(description="a .bin file, or a folder of them: nested ones too, in natural order (0, 2, 10)")
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
+
+
+def opened(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> PackedFileSource:
+    """Open a capture; see `frame_files` for what is refused."""
+    return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
+
+
+def checked(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Sequence[str]:
+    """Return what opening a capture would raise."""
+    try:
+        frame_files(config.path, layout, footer_bytes)
+    except InputError as error:
+        return (str(error),)
+    return ()
+
+
+def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[FrameFile]:
+    """Return the files of a capture and how many frames their sizes say they hold.
+
+    Args:
+        path: a file, or a folder.
+        layout: how a frame lies in its bytes.
+        footer_bytes: how many bytes may follow the frames of a file.
+
+    Raises:
+        InputError: there is none; one holds no whole number of frames; or one but the last has another size than the first,
+            or the last is longer, so that frames are missing or the order is wrong.
+    """
+    files = files_in(path, ".bin")
+    sizes = [file.stat().st_size for file in files]
+    found = []
+    for file, size in zip(files, sizes, strict=True):
+        n_frames, rest = divmod(size, layout.stored_bytes)
+        if not n_frames or rest not in (0, footer_bytes):
+            allowed = f", with or without {footer_bytes} more" if footer_bytes else ""
+            raise InputError(
+                f"{file} has {size:,} bytes, which is no whole number of frames of {layout.stored_bytes:,} bytes{allowed}; "
+                "it is cut short, or of another camera: copy it again, or choose another source"
+            )
+        found.append(FrameFile(file, n_frames))
+    for each in found[1:]:
+        if each.n_frames > found[0].n_frames or (each.n_frames < found[0].n_frames and each is not found[-1]):
+            raise InputError(
+                f"{each.path} holds {each.n_frames:,} frames and {found[0].path.name}, the first, {found[0].n_frames:,}; only "
+                "the last file of a capture may hold fewer: copy it again, or take out the files of other captures"
+            )
+    return found
+
+
+def sizes_of(path: Path) -> list[int]:
+    """Return the sizes of the .bin files at a path, in order, in bytes; none where there are none."""
+    try:
+        files = files_in(path, ".bin")
+        return [file.stat().st_size for file in files if file.suffix.lower() == ".bin"]
+    except (InputError, OSError):
+        return []

@@ -1,0 +1,100 @@
+"""Frames in one MATLAB file: of version 5 to 7, or of 7.3, which is HDF5."""
+
+from __future__ import annotations
+
+import importlib.util
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from photonpano import InputError
+from photonpano.reading import read_start
+from photonpano_sensors.damage import reading
+from photonpano_sensors.mat5 import mat5_array
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_VARIABLE = "OUTPUT"
+_BLOCK_FRAMES = 64
+
+
+class _Variable(NamedTuple):
+    """The variable of an open file: its shape as MATLAB has it, and what reads its frames, in order: (n, width, height)."""
+
+    shape: tuple[int, ...]
+    read: Callable[[int, int], NDArray[Any]]
+
+
+class MatFrames:
+    """The frames of a file, found without reading them.
+
+    Attributes:
+        shape: (frames, height, width).
+
+    Raises:
+        InputError: the file is damaged, or has no frames in a variable OUTPUT (height, width, frames).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        start = read_start(path, 10)
+        self._variable = _hdf_variable if start == b"MATLAB 7.3" or start.startswith(b"\x89HDF") else _mat5_variable
+        with reading(path, "a MATLAB file"), self._variable(path) as variable:
+            self.shape = _frame_order(path, variable.shape)
+
+    def packed(self) -> NDArray[np.uint8]:
+        """Return all frames, (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width.
+
+        Raises:
+            InputError: the file is damaged, or holds values other than 0 and 1.
+        """
+        n_frames, height, width = self.shape
+        packed = np.empty((n_frames, height, -(-width // 8)), np.uint8)
+        with reading(self._path, "a MATLAB file"), self._variable(self._path) as variable:
+            for start in range(0, n_frames, _BLOCK_FRAMES):
+                stop = min(start + _BLOCK_FRAMES, n_frames)
+                frames = variable.read(start, stop).swapaxes(1, 2)
+                lit = np.ascontiguousarray(frames == 1)
+                if not np.all(lit | (frames == 0)):
+                    raise InputError(f"{self._path} holds values other than 0 and 1: its frames are not binary")
+                packed[start:stop] = np.packbits(lit, axis=-1)
+        return packed
+
+
+@contextmanager
+def _mat5_variable(path: Path) -> Iterator[_Variable]:
+    with mat5_array(path, _VARIABLE) as array:
+        if array is None:
+            raise _missing(path)
+        yield _Variable(array.shape, lambda start, stop: array.read((stop - start, array.shape[1], array.shape[0])))
+
+
+@contextmanager
+def _hdf_variable(path: Path) -> Iterator[_Variable]:
+    if importlib.util.find_spec("h5py") is None:
+        raise InputError(f"{path} is a file of MATLAB 7.3, which takes h5py: pip install photonpano[hdf5]")
+    import h5py
+
+    with h5py.File(path) as file:
+        if _VARIABLE not in file:
+            raise _missing(path)
+        values = file[_VARIABLE]
+        # MATLAB's dimensions are there in reverse.
+        yield _Variable(values.shape[::-1], lambda start, stop: values[start:stop] if values.ndim == 3 else values[()][None])
+
+
+def _missing(path: Path) -> InputError:
+    return InputError(f"{path} has no variable {_VARIABLE}; its frames must be (height, width, frames) of that name")
+
+
+def _frame_order(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """Return (frames, height, width) of MATLAB's (height, width, frames), whose last dimension it drops if it is 1."""
+    if len(shape) not in (2, 3) or min(shape) < 1:
+        raise InputError(f"{path} has {_VARIABLE} of shape {shape}; frames are (height, width, frames)")
+    height, width, n_frames = (*shape, 1)[:3]
+    return int(n_frames), int(height), int(width)

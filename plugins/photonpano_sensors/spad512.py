@@ -1,0 +1,38 @@
+"""Source `spad512`: the .bin files of the SPAD512 of Pi Imaging."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from photonpano import Recognised, SourceContribution
+from photonpano.reading import FrameLayout
+from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LAYOUT = FrameLayout((512, 512), (512, 64))
+FOOTER_BYTES = 4
+_FILE_SIZES = {1000 * LAYOUT.stored_bytes: "1000 frames", 256 * LAYOUT.stored_bytes + FOOTER_BYTES: "256 frames and a footer"}
+"""Sizes by which a file is recognised; 256 frames without a footer are as long as the files of SwissSPAD2."""
+
+
+class Spad512Config(BinConfig):
+    """A capture of the SPAD512, 512 x 512 px."""
+
+
+def _recognise(path: Path) -> Recognised | None:
+    sizes = sizes_of(path)
+    if not sizes or sizes[0] not in _FILE_SIZES or checked(Spad512Config(path=path), LAYOUT, FOOTER_BYTES):
+        return None
+    return Recognised({"path": str(path)}, f"{sizes[0]:,} bytes a file, which are {_FILE_SIZES[sizes[0]]} of 512 x 512 px")
+
+
+SPAD512 = SourceContribution(
+    name="spad512",
+    summary="Binary frames of the SPAD512, 512 x 512 px, in .bin files of 1000, or of 256 with a footer",
+    config=Spad512Config,
+    build=lambda config, _: opened(config, LAYOUT, FOOTER_BYTES),
+    check=lambda config: checked(config, LAYOUT, FOOTER_BYTES),
+    recognise=_recognise,
+)

@@ -1,0 +1,108 @@
+"""Sources `swissspad-half` and `swissspad-full`: the .bin files of SwissSPAD2."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+import numpy as np
+
+from photonpano import Recognised, SourceContribution
+from photonpano.reading import FrameLayout, files_in
+from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+Pixels = TypeVar("Pixels", bound=np.generic)
+
+_ZONES = 4
+_FILE_BYTES = 512 * 256 * 64
+"""Bytes of a file, of 512 frames of the half array or 256 of the full one."""
+_SAMPLES = 64
+"""So many full-array frames of the file, or pairs of half-array ones, are looked at to tell the two apart."""
+_BRIGHTEST = 0.9
+"""Brighter pixels count as if they were as bright as this share of all: hot ones must not outweigh the scene."""
+_STANDARD_ERRORS = 5.0
+
+
+class SwissSpadHalfConfig(BinConfig):
+    """A capture of half of SwissSPAD2, 256 x 512 px."""
+
+
+class SwissSpadFullConfig(BinConfig):
+    """A capture of all of SwissSPAD2, 512 x 512 px."""
+
+
+def _joined(images: NDArray[Pixels]) -> NDArray[Pixels]:
+    """Join the zones of the full array: each gives a quarter of the columns of the top half, then of the bottom half.
+
+    The bottom half is read out from the outside to the inside, as the top half is.
+    """
+    *lead, rows, columns = images.shape
+    zones = images.reshape(*lead, rows, _ZONES, 2, columns // (2 * _ZONES))
+    joined = np.empty((*lead, 2 * rows, columns // 2), images.dtype)
+    halves = joined.reshape(*lead, 2, rows, _ZONES, columns // (2 * _ZONES))
+    halves[..., 0, :, :, :] = zones[..., 0, :]
+    halves[..., 1, :, :, :] = zones[..., ::-1, :, 1, :]
+    return joined
+
+
+HALF = FrameLayout((256, 512), (256, 64), "little")
+FULL = FrameLayout((512, 512), (256, 128), "little", arranged=_joined)
+
+
+def _recognise(path: Path, array: Literal["half", "full"]) -> Recognised | None:
+    sizes = sizes_of(path)
+    if not sizes or {*sizes[:-1], max(sizes)} != {_FILE_BYTES}:  # the last may be shorter
+        return None
+    try:
+        found, because = _array_of(files_in(path, ".bin")[0])
+    except OSError:
+        return None
+    if found is not None and found != array:
+        return None
+    return Recognised({"path": str(path)}, f"files of {_FILE_BYTES:,} bytes, {because}")
+
+
+def _array_of(path: Path) -> tuple[Literal["half", "full"] | None, str]:
+    """Tell whose file it is, from what neighbours are like, and say why.
+
+    A frame of the full array is as long as two of the half. If they are two, then pixels of the first and the second half of
+    the bytes are the same pixels at nearly the same time, and nothing is more alike. If they are one, these are 128 rows
+    apart, and pixels two rows apart are more alike. (Not one row: odd and even rows may differ by themselves.)
+    """
+    frames = np.memmap(path, np.uint8, "r").reshape(-1, *FULL.stored_shape)[:: _FILE_BYTES // FULL.stored_bytes // _SAMPLES]
+    sums = np.unpackbits(frames, axis=-1, bitorder="little").sum(axis=0, dtype=np.float64)
+    first, second = np.split(np.minimum(sums, np.quantile(sums, _BRIGHTEST)), 2)
+    halves, rows = _alikeness(first, second), _alikeness(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]]))
+    numbers = f"correlations of {np.tanh(halves):.2f} between the halves of their frames, {np.tanh(rows):.2f} between rows"
+    if abs(halves - rows) < _STANDARD_ERRORS * np.sqrt(2 / first.size):
+        return None, f"which the half and the full array have; {numbers} do not tell which"
+    return ("half", numbers) if halves > rows else ("full", numbers)
+
+
+def _alikeness(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Return the correlation on Fisher's scale, where its standard error is 1 / sqrt(pixels)."""
+    if not first.std() or not second.std():
+        return 0.0
+    return float(np.arctanh(min(np.corrcoef(first.ravel(), second.ravel())[0, 1], 0.999999)))
+
+
+SWISSSPAD_HALF = SourceContribution(
+    name="swissspad-half",
+    summary="Binary frames of half of SwissSPAD2, 256 x 512 px, in .bin files of 512",
+    config=SwissSpadHalfConfig,
+    build=lambda config, _: opened(config, HALF),
+    check=lambda config: checked(config, HALF),
+    recognise=lambda path: _recognise(path, "half"),
+)
+SWISSSPAD_FULL = SourceContribution(
+    name="swissspad-full",
+    summary="Binary frames of all of SwissSPAD2, 512 x 512 px, in .bin files of 256",
+    config=SwissSpadFullConfig,
+    build=lambda config, _: opened(config, FULL),
+    check=lambda config: checked(config, FULL),
+    recognise=lambda path: _recognise(path, "full"),
+)

@@ -1,0 +1,198 @@
+"""Source `visionsim`: a .npy file of binary frames with the transforms.json that visionsim writes beside it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
+from photonpano.photometry import packed_along_width
+from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, npy_header, read_json, require_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+_TRANSFORMS = "transforms.json"
+_GREEN = 1
+
+
+class VisionsimConfig(Config):
+    """A capture that visionsim has simulated."""
+
+    path: SpecPath = Field(description=f"the {_TRANSFORMS} beside the .npy file, or their folder")
+    channel: int | None = Field(
+        None, ge=0, le=2, description="which of the three channels of a capture in colour is used: 0, 1 or 2"
+    )
+    frame_rate_hz: float | None = Field(
+        None, gt=0, description=f"frames a second, in Hz; by default what {_TRANSFORMS} says as fps, if it does"
+    )
+
+
+class _Part(BaseModel):
+    """What may be said of all frames, or of each."""
+
+    model_config = ConfigDict(frozen=True)
+
+    file_path: Path | None = None
+    bitpack_dim: Literal[1, 2] | None = None
+    offset: int | None = Field(None, ge=0)
+
+
+class _Transforms(_Part):
+    """A transforms.json, as far as it says how frames are stored. The poses in it are not used."""
+
+    h: int = Field(ge=1)
+    w: int = Field(ge=1)
+    c: Literal[1, 3] = 1
+    fps: float | None = Field(None, gt=0, allow_inf_nan=False)
+    bitpack: bool | None = None
+    frames: tuple[_Part, ...] = Field(min_length=1)
+
+
+def _open(config: VisionsimConfig) -> PackedFileSource:
+    files, layout, fps = _read(config)
+    return PackedFileSource(files, layout, config.frame_rate_hz or fps)
+
+
+def _read(config: VisionsimConfig) -> tuple[list[FrameFile], FrameLayout, float | None]:
+    """Return all that can be told without the frames."""
+    path = config.path / _TRANSFORMS if config.path.is_dir() else config.path
+    transforms = read_json(path, _Transforms)
+    frames = [_completed(each, transforms, path) for each in transforms.frames]
+    packing = {each.bitpack_dim for each in frames}
+    if len(packing) > 1:
+        raise InputError(f"{path} says that some frames are packed otherwise than others, which this source cannot read")
+    if (transforms.c == 3) != (config.channel is not None):
+        raise InputError(f"{path} says that frames have c: {transforms.c}; " + _CHANNEL_REMEDIES[transforms.c])
+    layout = _layout(transforms, packing.pop(), config.channel, path)
+    return _files(frames, transforms, layout, path.parent), layout, transforms.fps
+
+
+_CHANNEL_REMEDIES = {1: "leave out the channel", 3: "choose a channel: 0, 1 or 2"}
+
+
+def _completed(frame: _Part, transforms: _Transforms, path: Path) -> _Part:
+    """Return a frame with what is said of all."""
+    packing = frame.bitpack_dim or transforms.bitpack_dim
+    if transforms.bitpack is False:
+        packing = None
+    elif transforms.bitpack and packing is None:
+        raise InputError(f"{path} says that frames are packed, and not along which dimension; add bitpack_dim: 1 or 2")
+    file = frame.file_path or transforms.file_path
+    if file is None:
+        raise InputError(f"{path} names no file_path; add that of the .npy file")
+    if file.suffix != ".npy" or "\0" in file.name:
+        raise InputError(f"{path} names {file}, not a .npy file; convert the images with visionsim")
+    return _Part(file_path=file, bitpack_dim=packing, offset=frame.offset)
+
+
+def _files(frames: Sequence[_Part], transforms: _Transforms, layout: FrameLayout, folder: Path) -> list[FrameFile]:
+    """Return runs of frames that follow each other in a file."""
+    runs: list[tuple[Path, int, int]] = []
+    for index, frame in enumerate(frames):
+        assert frame.file_path is not None, "it was completed"
+        place = index if frame.offset is None else frame.offset
+        if runs and runs[-1][0] == frame.file_path and sum(runs[-1][1:]) == place:
+            runs[-1] = (frame.file_path, runs[-1][1], runs[-1][2] + 1)
+        else:
+            runs.append((frame.file_path, place, 1))
+    headers = {file: _header(folder / file, transforms, layout) for file in dict.fromkeys(run[0] for run in runs)}
+    found = []
+    for file, start, n_frames in runs:
+        header = headers[file]
+        if start + n_frames > header.n_frames:
+            raise InputError(
+                f"{folder / _TRANSFORMS} speaks of frame {start + n_frames - 1} of {file}, which has {header.n_frames}; "
+                "write it again"
+            )
+        found.append(FrameFile(header.path, n_frames, header.offset + start * layout.stored_bytes))
+    return found
+
+
+def _header(path: Path, transforms: _Transforms, layout: FrameLayout) -> FrameFile:
+    """Return all frames of a .npy file."""
+    header = npy_header(path)
+    expected = layout.stored_shape
+    if header.shape[1:] != expected and not (transforms.c == 1 and header.shape[1:] == expected[:-1]):
+        raise InputError(
+            f"{path} holds frames of shape {header.shape[1:]}, and the {_TRANSFORMS} beside it promises {expected}; correct "
+            "its h, w, c, bitpack or bitpack_dim"
+        )
+    if header.dtype not in (np.uint8, np.bool_) or header.fortran_order:
+        raise InputError(
+            f"{path} holds {header.dtype} values{' in Fortran order' if header.fortran_order else ''}; binary frames are uint8 "
+            "or bool in C order"
+        )
+    require_whole(path, header)
+    return FrameFile(path, header.shape[0], header.offset)
+
+
+def _layout(transforms: _Transforms, packed_dim: int | None, channel: int | None, path: Path) -> FrameLayout:
+    """Return how frames lie in the file; `channel` and `path` are for colour and for errors."""
+    height, width, last = transforms.h, transforms.w, channel or 0
+
+    def along_width(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return stored[..., last]
+
+    def along_height(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return packed_along_width(stored[..., last])[:, :height]
+
+    def not_packed(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        values = stored[..., last]
+        # 255 becomes 0 here, 0 becomes 1, 1 becomes 2.
+        if (values + np.uint8(1)).max() > 2:
+            raise InputError(f"{path} describes frames with values other than 0, 1 and 255: they are not binary")
+        return np.packbits(values, axis=2)
+
+    stored, to_rows = {
+        None: ((height, width), not_packed),
+        1: ((math.ceil(height / 8), width), along_height),
+        2: ((height, math.ceil(width / 8)), along_width),
+    }[packed_dim]
+    return FrameLayout((height, width), (*stored, transforms.c), to_rows=to_rows)
+
+
+def _check(config: VisionsimConfig) -> Sequence[str]:
+    try:
+        _read(config)
+    except InputError as error:
+        return (str(error),)
+    return ()
+
+
+def _recognise(path: Path) -> Recognised | None:
+    """Take a folder with a transforms.json, that file, and a .npy file that it names."""
+    transforms = (path if path.is_dir() else path.parent) / _TRANSFORMS
+    if not transforms.is_file():
+        return None
+    for channel in (None, _GREEN):
+        config = VisionsimConfig(path=transforms, channel=channel)
+        try:
+            files, _, _ = _read(config)
+            with _open(config) as source:
+                source.frames(FrameSpan(0, 1))  # which fails if they are not binary
+        except InputError:
+            continue
+        if path not in (transforms, transforms.parent, *(file.path for file in files)):
+            return None
+        because = f"a {_TRANSFORMS} and the .npy file of binary frames that it names"
+        if channel is None:
+            return Recognised({"path": str(transforms)}, because)
+        return Recognised({"path": str(transforms), "channel": channel}, f"{because}, of whose channels the middle one is used")
+    return None
+
+
+VISIONSIM = SourceContribution(
+    name="visionsim",
+    summary="Binary frames that visionsim has simulated: a .npy file and its transforms.json",
+    config=VisionsimConfig,
+    build=lambda config, _: _open(config),
+    check=_check,
+    recognise=_recognise,
+)

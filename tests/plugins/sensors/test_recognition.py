@@ -1,0 +1,143 @@
+"""Sources know their own captures, and leave those of others alone."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, SourceContext, discover
+from photonpano.photometry import BinaryResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from photonpano import Recognised, Source
+
+NAMES = "packed-npy swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5"
+SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}
+
+
+def recognised(path: Path) -> dict[str, Recognised]:
+    """Return who takes a path for its own."""
+    answers = {name: source.recognise(path) for name, source in SOURCES.items()}
+    return {name: answer for name, answer in answers.items() if answer is not None}
+
+
+def opened(name: str, keys: Any) -> Source:
+    source = SOURCES[name]
+    return source.build(source.config.model_validate(dict(keys)), SourceContext())
+
+
+def recorded(flux: np.ndarray, n_frames: int, seed: int = 0) -> np.ndarray:
+    """Return frames of a camera that stands still, 4 % of whose pixels are hot."""
+    rng = np.random.default_rng(seed)
+    lit = np.where(rng.random(flux.shape) < 0.04, 1, BinaryResponse().mean_count(flux)).astype(np.float32)
+    return np.stack([rng.random(flux.shape, np.float32) < lit for _ in range(n_frames)]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.05])
+@pytest.mark.parametrize(("name", "rows"), [("swissspad-half", 256), ("swissspad-full", 512)])
+def test_the_arrays_of_swissspad_are_told_apart(
+    tmp_path: Path, bin_file: Callable, street: np.ndarray, name: str, rows: int, brightness: float
+) -> None:
+    frames = recorded(street[100 : 100 + rows, 300:812] * brightness, 512 * 256 // rows)
+    for number in (2, 10):
+        (tmp_path / f"filename{number}.bin").write_bytes(bin_file(name, frames))
+    for path in (tmp_path, tmp_path / "filename2.bin"):
+        found = recognised(path)
+        assert set(found) == {name}
+        with opened(name, found[name].keys) as source:
+            np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)), frames[:3])
+
+
+@pytest.mark.parametrize("scene", ["noise", "stripes", "nothing"])
+def test_where_frames_do_not_tell_both_arrays_are_named(tmp_path: Path, bin_file: Callable, scene: str) -> None:
+    rng = np.random.default_rng(0)
+    stripes = np.tile(np.sin(np.arange(512) / 9) ** 2, (256, 1))
+    share = {"noise": 0.3, "stripes": stripes, "nothing": 0.0}[scene]
+    frames = (rng.random((512, 256, 512), np.float32) < share).astype(np.uint8)
+    path = tmp_path / "frames.bin"
+    path.write_bytes(bin_file("swissspad-half", frames))
+    found = recognised(path)
+    assert set(found) == {"swissspad-half", "swissspad-full"}
+    assert all(answer.because.endswith("do not tell which") for answer in found.values())
+
+
+@pytest.mark.parametrize("n_frames", [256, 1000])
+def test_spad512_is_known_by_the_size_of_its_files(tmp_path: Path, n_frames: int) -> None:
+    path = tmp_path / "frames.bin"
+    path.write_bytes(bytes(n_frames * 32768 + 4 * (n_frames == 256)))
+    assert set(recognised(path)) == {"spad512"}
+    with opened("spad512", recognised(path)["spad512"].keys) as source:
+        assert source.info.n_frames == n_frames
+
+
+def test_sparse_frames_are_known_by_their_end(tmp_path: Path, bin_file: Callable) -> None:
+    frames = np.random.default_rng(0).random((4, 512, 512)) < 0.01
+    (tmp_path / "sparse.bin").write_bytes(bin_file("spad512-sparse", frames))
+    assert set(recognised(tmp_path)) == {"spad512-sparse"}
+
+
+FRAMES = np.random.default_rng(0).integers(0, 2, (6, 10, 16), dtype=np.uint8)
+
+
+def test_packed_npy_files_are_known_by_their_header(tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.packbits(FRAMES, axis=-1))
+    found = recognised(tmp_path / "cube.npy")
+    assert set(found) == {"packed-npy"}
+    assert found["packed-npy"].because == "uint8 of shape (6, 10, 2) in a .npy file"
+    (tmp_path / "cube.npy.gz").write_bytes(gzip.compress((tmp_path / "cube.npy").read_bytes()))
+    assert set(recognised(tmp_path / "cube.npy.gz")) == {"packed-npy"}
+    np.save(tmp_path / "colour.npy", np.repeat(np.packbits(FRAMES, axis=-1)[..., None], 3, axis=-1))
+    found = recognised(tmp_path / "colour.npy")
+    assert found["packed-npy"].keys == {"path": str(tmp_path / "colour.npy"), "channel": 1}
+    assert (
+        found["packed-npy"].because == "uint8 of shape (6, 10, 2, 3) in a .npy file, of whose channels the middle one is used"
+    )
+
+
+def test_frames_that_are_not_packed_are_left_alone(tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", FRAMES)
+    assert recognised(tmp_path / "cube.npy") == {}
+    (tmp_path / "cube.npy.gz").write_bytes(gzip.compress((tmp_path / "cube.npy").read_bytes()))
+    assert recognised(tmp_path / "cube.npy.gz") == {}
+
+
+def test_a_transforms_json_says_what_the_npy_file_beside_it_holds(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.packbits(FRAMES, axis=1))
+    np.save(tmp_path / "other.npy", np.packbits(FRAMES, axis=1))
+    transforms = {"h": 10, "w": 16, "bitpack_dim": 1, "file_path": "frames.npy", "frames": [{}] * 6}
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms))
+    for path in (tmp_path, tmp_path / "transforms.json", tmp_path / "frames.npy"):
+        found = recognised(path)
+        assert set(found) == {"visionsim"}
+        with opened("visionsim", found["visionsim"].keys) as source:
+            np.testing.assert_array_equal(source.frames(source.info.span), FRAMES)
+    assert recognised(tmp_path / "other.npy") == {}
+
+
+def test_grey_frames_of_visionsim_are_left_alone(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", FRAMES * 100)
+    (tmp_path / "transforms.json").write_text(json.dumps({"h": 10, "w": 16, "file_path": "frames.npy", "frames": [{}] * 6}))
+    assert recognised(tmp_path) == {}
+
+
+def test_folders_of_matlab_and_files_of_ubicept_are_known_by_their_names(tmp_path: Path) -> None:
+    (tmp_path / "part_1.mat").write_bytes(b"anything")
+    assert set(recognised(tmp_path)) == {"mat-parts"}
+    (tmp_path / "capture.ubi.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    assert set(recognised(tmp_path / "capture.ubi.h5")) == {"ubicept-h5"}
+
+
+def test_other_files_are_nobodys(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty.bin").touch()
+    (tmp_path / "text.bin").write_bytes(b"some text of no length in particular")
+    (tmp_path / "capture.ubi.h5").write_bytes(b"no HDF5")
+    for path in (*tmp_path.iterdir(), tmp_path / "nothing"):
+        assert recognised(path) == {}
