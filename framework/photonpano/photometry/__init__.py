@@ -3,11 +3,12 @@
 from photonpano.photometry.contrast import signal_to_noise
 from photonpano.photometry.likeness import correlation_without_noise, noise_free_correlation
 from photonpano.photometry.packed import packed_counts
-from photonpano.photometry.responses import BinaryResponse
+from photonpano.photometry.responses import BinaryResponse, IntensityResponse
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
+    "IntensityResponse",
     "correlation_without_noise",
     "linear_to_srgb",
     "noise_free_correlation",

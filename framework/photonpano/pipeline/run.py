@@ -158,24 +158,26 @@ def require_photons(source: Source) -> None:
     """Look at a few frames all over the capture, and refuse one that is all dark or all lit.
 
     Raises:
-        InputError: no pixel, or every pixel, is lit in all of them.
+        InputError: no pixel, or every pixel, is lit in all of them; of grey levels, all are black, or saturated.
     """
     n_frames, valid = source.info.n_frames, source.valid
     spans = [source.info.span]
     if n_frames > _PROBES * _PROBE_FRAMES:
         starts = np.linspace(0, n_frames - _PROBE_FRAMES, _PROBES).astype(int)
         spans = [FrameSpan(int(start), int(start) + _PROBE_FRAMES) for start in starts]
-    lit = sum(int(source.counts(span)[valid].sum()) for span in spans)
     seen = sum(len(span) for span in spans)
-    if lit == 0:
+    mean_count = sum(source.counts(span)[valid] for span in spans) / np.float32(seen)
+    none, most = source.response.mean_count(np.array([0, np.inf], np.float32)).tolist()
+    binary = source.info.kind == "binary"
+    if mean_count.max() <= none:
         raise InputError(
-            f"no pixel is lit in any of {seen} frames looked at all over the capture; "
+            f"no pixel is {'lit' if binary else 'brighter than black'} in any of {seen} frames looked at all over the capture; "
             "check that the file is the right one, and that the lens was open"
         )
-    if source.info.kind == "binary" and lit == seen * int(valid.sum()):
+    if mean_count.min() >= most:
         raise InputError(
-            f"every pixel is lit in all of {seen} frames looked at all over the capture, so that no flux can be told; "
-            "check the layout of the file, or expose less"
+            f"every pixel is {'lit' if binary else 'saturated'} in all of {seen} frames looked at all over the capture, "
+            "so that no flux can be told; check the layout of the file, or expose less"
         )
 
 
