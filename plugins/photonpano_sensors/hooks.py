@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from photonpano import SourceContribution, hookimpl
+from photonpano_sensors.intensity.contributions import INTENSITY_SOURCES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -13,4 +14,4 @@ if TYPE_CHECKING:
 @hookimpl
 def photonpano_sources() -> Iterator[SourceContribution[Any]]:
     """Offer captures as cameras and their programs write them."""
-    yield from ()
+    yield from INTENSITY_SOURCES
