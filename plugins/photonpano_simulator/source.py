@@ -106,10 +106,11 @@ class SimulatorSource:
         """Return where the frame lies while its shutter is open, (n, 3, 3): evenly in time, about a pixel apart."""
         at = self._homographies[index]
         if not self._sensor.exposure or len(self._homographies) == 1:
-            return at[None]
+            return np.asarray(at[None])
         last = len(self._homographies) - 1
-        velocity = np.gradient(self._homographies[max(index - 1, 0) : min(index + 2, last + 1)], axis=0)[min(index, 1)]
-        way: NDArray[np.float64] = velocity * self._sensor.exposure
+        before, after = max(index - 1, 0), min(index + 1, last)
+        velocity: NDArray[np.float64] = (self._homographies[after] - self._homographies[before]) / (after - before)
+        way = velocity * self._sensor.exposure
         there = inverse(at - way / 2) @ (at + way / 2)
         n = max(1, int(np.ceil(corner_displacements(there, np.eye(3), self.info.frame_shape).max())))
         return np.asarray(at + way * ((np.arange(n) + 0.5) / n - 0.5)[:, None, None])
