@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from photonpano_sensors.intensity.configs import VideoConfig
     from photonpano_sensors.intensity.summing import Levels
 
-_KEPT_BYTES = 128 * 1024**2
+_KEPT_BYTES = 256 * 1024**2
 """Decoded frames are kept up to this."""
 
 

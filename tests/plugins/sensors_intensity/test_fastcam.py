@@ -17,6 +17,8 @@ from photonpano_sensors.intensity.mraw import FastcamMrawSource
 
 REAL = Path(__file__).parents[2] / "data" / "photron"
 BEAM, CIH = (REAL / "beam.cihx").read_bytes(), (REAL / "sample_60k_16bit.cih").read_bytes()
+PIECES = [b"-1", b"1e999", b"\xb2", b"<cih>", b"&x;", b" : "]
+"""What headers are damaged with, beside bytes by chance."""
 
 
 @pytest.mark.parametrize("name", ["beam", "ball_12bit"])
@@ -60,9 +62,7 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, len(content)))
         stop = min(len(content), start + draw(st.integers(0, 40)))
-        content[start:stop] = draw(
-            st.binary(max_size=20) | st.sampled_from([b"-1", b"1e999", b"\xb2", b"<cih>", b"&x;", b" : "])
-        )
+        content[start:stop] = draw(st.binary(max_size=20) | st.sampled_from(PIECES))
     return bytes(content)
 
 

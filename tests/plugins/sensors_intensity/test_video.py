@@ -31,7 +31,7 @@ FORMATS = {
         "a.mp4",
         "libx265",
         "yuvj420p",
-        {"crf": 1, "x265-params": "keyint=10:open-gop=1:log-level=none"},
+        {"x265-params": "crf=1:keyint=10:open-gop=1:log-level=none"},
     ),
     "MPEG-4 in AVI": ("a.avi", "mpeg4", "yuv420p", {"g": 12, "qscale": 1}),
     "MJPEG in AVI": ("a.avi", "mjpeg", "yuvj420p", {"qmin": 1, "qmax": 1}),

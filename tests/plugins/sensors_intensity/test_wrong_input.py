@@ -143,8 +143,8 @@ CASES = {
         "a.cihx",
         cut_mraw,
         AT_CHECK.format(
-            "DIR/a.mraw is cut short: 4 frames of 80x1024 pixels of 16 bits, as a.cihx promises, are 655360 bytes, the file has "
-            "655260; copy or record it again"
+            "DIR/a.mraw is cut short: 4 frames of 80x1024 pixels of 16 bits, as a.cihx promises, are 655360 bytes, "
+            "the file has 655260; copy or record it again"
         ),
     ),
     "no header": Case(
@@ -168,7 +168,8 @@ CASES = {
         "a.cihx",
         beam(),
         AT_OPENING.format(
-            "black_level 5000 and white_level 4095 do not suit levels of 12 bits: black must be below white, and white at most 4095"
+            "black_level 5000 and white_level 4095 do not suit levels of 12 bits: "
+            "black must be below white, and white at most 4095"
         ),
         ", response: {black_level: 5000}",
     ),
