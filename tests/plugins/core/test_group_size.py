@@ -57,7 +57,7 @@ def test_fast_motion_leaves_sixteen_frames() -> None:
 
 def test_grey_frames_may_stand_alone() -> None:
     """At 500 frames a second the image may move by tens of px from one to the next."""
-    assert choice(2000, 10.0, shortest=1)[0] == 4
+    assert choice(20, 10.0, shortest=1)[0] == 4
     assert choice(2000, 100.0, shortest=1) == (
         1,
         f"at 1e+02 px a frame ({HOW}) they are blurred by 100 px, 0.39 of the shorter side of a frame, and at a flux of 2e+03 "
@@ -65,6 +65,14 @@ def test_grey_frames_may_stand_alone() -> None:
     )
     resampler = built(StreamInfo(80, 254, 496, None, "intensity", 8), capture=lambda: CaptureSummary(2000, 38.0, HOW))
     assert {len(group.span) for group in resampler.groups(80, 1)} == {1}
+
+
+def test_plenty_of_light_makes_groups_sharp() -> None:
+    size, reason = choice(2000, 0.5, shortest=1)
+    assert size == 10  # 0.02 of 254 px
+    assert reason.endswith("they hold 2e+04 photons a pixel, so that less blur is worth more than more light")
+    assert choice(50, 0.5, shortest=1)[0] == 20  # 1000 photons
+    assert choice(0.5, 0.05)[0] == 762  # which are too few
 
 
 def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None:
