@@ -126,9 +126,9 @@ def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture
 def write_video(tmp_path: Path) -> Callable[..., Path]:
     """Write the levels of frames, as they are, as the luma of a video."""
-    av = pytest.importorskip("av")
 
     def write(frames: np.ndarray, name: str, codec: str, pixels: str, **options: Any) -> Path:
+        av = pytest.importorskip("av")
         with av.open(str(tmp_path / name), "w") as container:
             stream = container.add_stream(codec, rate=30, options={key: str(value) for key, value in options.items()})
             stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixels

@@ -56,6 +56,7 @@ class ResponseConfig(Config):
 class IntensityConfig(Config):
     """What all captures of grey levels share."""
 
+    path: SpecPath = Field(description="the capture")
     frame_rate_hz: float | None = Field(
         None, gt=0, description="frames a second while recording, in Hz; by default what the file says, if it does"
     )
