@@ -21,12 +21,15 @@ if TYPE_CHECKING:
     from photonpano_sensors.intensity.summing import Levels
     from photonpano_sensors.intensity.video_index import VideoIndex
 
-_SEEK = 4
-"""To seek costs about as much as to decode so many frames."""
 
+class _Decoder:
+    """Decodes a video from a key frame on.
 
-class Decoder:
-    """Decodes a video from a key frame on: one thread at a time."""
+    Attributes:
+        next: the frame that is decoded next.
+        turn: held by the thread that decodes.
+        users: how many threads decode, or wait for their turn.
+    """
 
     def __init__(self, index: VideoIndex, threads: int) -> None:
         """Open the video for itself.
@@ -40,27 +43,18 @@ class Decoder:
         self._stream.codec_context.thread_type = "AUTO"
         self._stream.codec_context.thread_count = threads
         self._frames: Iterator[VideoFrame] = self._container.decode(self._stream)
+        self._seeks = False
         self.next = 0
+        self.turn = Lock()
+        self.users = 0
 
-    def cost(self, frame: int) -> int:
-        """Return how many frames have to be decoded to get at one; seeking costs something too."""
-        key = self._index.key_before(frame)
-        return frame - self.next if key <= self.next <= frame else frame - key + _SEEK
+    def comes_to(self, frame: int) -> bool:
+        """Tell whether decoding on is the way to a frame, rather than beginning at the key frame before it."""
+        return self._index.key_before(frame) <= self.next <= frame
 
-    def seek(self, frame: int) -> None:
-        """Go to the key frame before a frame, unless decoding on comes to it as well."""
-        key = self._index.key_before(frame)
-        if key <= self.next <= frame:
-            return
-        # An index may be so coarse, or so wrong, that seeking leads past the key frame.
-        for start in (key, 0):
-            self._container.seek(int(self._index.times[start]), stream=self._stream)
-            self._frames = self._container.decode(self._stream)
-            first = next(self._frames, None)
-            if first is not None and self._place(first) <= key:
-                self._frames = chain([first], self._frames)
-                break
-        self.next = key
+    def begin_before(self, frame: int) -> None:
+        """Have the next frame be the key frame before a frame; whoever decodes then does the seeking."""
+        self.next, self._seeks = self._index.key_before(frame), True
 
     def decode(self) -> tuple[int, Levels]:
         """Decode the next frame, and return its place and its levels.
@@ -70,11 +64,13 @@ class Decoder:
         """
         due = self.next
         try:
+            if self._seeks:
+                self._seek(due)
             frame = next((frame for frame in self._frames if self._place(frame) >= due), None)
         except av.FFmpegError:
             frame = None
         if frame is None or frame.is_corrupt or self._place(frame) > due:
-            self.next = len(self._index.times)  # whoever comes next has to seek
+            self.next = len(self._index.times)  # whoever comes next has to begin anew
             raise InputError(f"frame {due} of {self._index.path} is damaged or missing; export or copy it again")
         self.next = due + 1
         return due, _luma(frame, self._index)
@@ -82,6 +78,17 @@ class Decoder:
     def close(self) -> None:
         """Let go of the file."""
         self._container.close()
+
+    def _seek(self, key: int) -> None:
+        self._seeks = False
+        # An index may be so coarse, or so wrong, that seeking leads past the key frame.
+        for start in (key, 0):
+            self._container.seek(int(self._index.times[start]), stream=self._stream)
+            self._frames = self._container.decode(self._stream)
+            first = next(self._frames, None)
+            if first is not None and self._place(first) <= key:
+                self._frames = chain([first], self._frames)
+                return
 
     def _place(self, frame: VideoFrame) -> int:
         """Return which frame it is; -1 if it does not say, or is none of the index."""
@@ -93,9 +100,12 @@ class Decoder:
 class DecodedFrames:
     """The frames of a video, those decoded last kept up to a number of bytes. May be used from several threads.
 
-    Groups overlap, and the threads that merge them go along the video side by side: a decoder for each goes on where it is, and
-    what one has decoded the others find here. A frame is decoded by the decoder that is nearest before it, even if that is
-    at work for somebody else, who will soon be done.
+    Groups overlap, and the threads that merge them go along the video side by side. What one of them has decoded the others
+    find here. Who needs more takes the decoder that comes to it next, even if that is at work for somebody else,
+    who will soon be done; only where none does, one that nobody uses begins anew at a key frame.
+
+    Attributes:
+        n_decoded: how many frames were decoded so far.
     """
 
     def __init__(self, index: VideoIndex, threads: int, capacity_bytes: int) -> None:
@@ -103,14 +113,14 @@ class DecodedFrames:
 
         Args:
             index: of the video.
-            threads: how many ask for frames at once.
+            threads: how many threads are expected to ask for frames at once.
             capacity_bytes: how much is kept.
         """
         self._index = index
         self._threads = threads
         self._kept = max(1, capacity_bytes // (index.height * index.width * (1 if index.encoding.bits <= 8 else 2)))
         self._frames: OrderedDict[int, Levels] = OrderedDict()
-        self._decoders: list[tuple[Decoder, Lock]] = []
+        self._decoders: list[_Decoder] = []
         self._lock = Lock()
         self.n_decoded = 0
 
@@ -120,28 +130,53 @@ class DecodedFrames:
         Raises:
             InputError: it is damaged or missing.
         """
-        with self._lock:
-            if (known := self._known(frame)) is not None:
-                return known
-            decoder, turn = self._nearest(frame)
-        with turn:
+        while True:
             with self._lock:
-                # Whoever had the decoder before may have come by.
                 if (known := self._known(frame)) is not None:
                     return known
-            decoder.seek(frame)
-            while True:
-                place, levels = decoder.decode()
+                decoder = self._decoder_for(frame)
+                decoder.users += 1
+            try:
+                with decoder.turn:
+                    levels = self._decoded(decoder, frame)
+            finally:
                 with self._lock:
-                    self.n_decoded += 1
-                    self._keep(place, levels)
-                if place == frame:
-                    return levels
+                    decoder.users -= 1
+            if levels is not None:
+                return levels
 
     def close(self) -> None:
         """Let go of the file."""
-        for decoder, _ in self._decoders:
+        for decoder in self._decoders:
             decoder.close()
+
+    def _decoded(self, decoder: _Decoder, frame: int) -> Levels | None:
+        """Decode until a frame; None if somebody else decoded it with this decoder, and it is no longer kept."""
+        while decoder.next <= frame:
+            place, levels = decoder.decode()
+            with self._lock:
+                self.n_decoded += 1
+                self._keep(place, levels)
+            if place == frame:
+                return levels
+        with self._lock:
+            return self._known(frame)
+
+    def _decoder_for(self, frame: int) -> _Decoder:
+        """Return the decoder that comes to a frame next, or one that will begin at the key frame before it."""
+        coming = [decoder for decoder in self._decoders if decoder.comes_to(frame)]
+        idle = [decoder for decoder in self._decoders if not decoder.users]
+        if coming:
+            chosen = max(coming, key=lambda decoder: decoder.next)
+        elif idle and len(self._decoders) >= self._threads:
+            chosen = idle[0]
+            chosen.begin_before(frame)
+        else:
+            chosen = _Decoder(self._index, self._threads)
+            chosen.begin_before(frame)
+        # The one that nobody has used for the longest time comes first.
+        self._decoders = [decoder for decoder in self._decoders if decoder is not chosen] + [chosen]
+        return chosen
 
     def _known(self, frame: int) -> Levels | None:
         known = self._frames.get(frame)
@@ -154,16 +189,6 @@ class DecodedFrames:
         self._frames.move_to_end(frame)
         while len(self._frames) > self._kept:
             self._frames.popitem(last=False)
-
-    def _nearest(self, frame: int) -> tuple[Decoder, Lock]:
-        """Return the decoder that gets at a frame soonest; where all have to seek, the one that was longest without work."""
-        best = min(self._decoders, key=lambda each: each[0].cost(frame), default=None)
-        from_key = frame - self._index.key_before(frame) + _SEEK
-        if (best is None or best[0].cost(frame) >= from_key) and len(self._decoders) < self._threads:
-            best = Decoder(self._index, self._threads), Lock()
-        assert best is not None
-        self._decoders = [each for each in self._decoders if each is not best] + [best]
-        return best
 
 
 def _luma(frame: VideoFrame, index: VideoIndex) -> Levels:

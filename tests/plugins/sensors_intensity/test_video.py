@@ -104,7 +104,8 @@ def test_overlapping_groups_are_decoded_about_once(moving: Callable, write_video
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(merge, range(0, 190, 10)))
     decoded.close()
-    assert 200 <= decoded.n_decoded < 280
+    # A thread that falls behind finds what it needs forgotten; each of two groups decoded by itself would be 380 and more.
+    assert 200 <= decoded.n_decoded <= (200 if threads == 1 else 360)
 
 
 def test_no_more_is_kept_than_allowed(moving: Callable, write_video: Callable) -> None:
