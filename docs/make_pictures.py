@@ -13,6 +13,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import av
 import cv2
 import numpy as np
 import tifffile
@@ -68,6 +69,18 @@ STREET = {
     },
 }
 """The camera goes to and fro over the street in a tenth of a second, in a trembling hand, in little light."""
+HIGH_SPEED = {
+    "version": 1,
+    "source": {
+        "use": "camera-simulator",
+        "with": {
+            "path": {"kind": "pan", "length_px": 900, "angle_deg": 4, "shake": {"rms_px": 3.0, "frequencies_hz": [3, 5, 8]}},
+            "flux": 1000,
+            "sensor": {"exposure": 0.5},
+        },
+    },
+}
+"""A conventional camera goes along the street in 0.4 seconds."""
 GROUP_SIZE = 125
 LEVELS = ("one level", "two levels", "three levels")
 WAYS = ("scan", "constant groups", "naive average")
@@ -108,6 +121,11 @@ def main() -> None:
     save("baselines.png", baselines(folder))
     save("hot-pixels.png", hot_pixels(folder))
 
+    video = filmed(parse_spec(HIGH_SPEED), folder / "high-speed.mp4")
+    source = {"use": "video", "with": {"path": str(video.absolute()), "frame_rate_hz": 500}}
+    finish(parse_spec({"version": 1, "source": source}, output=in_folder(folder, "high speed")), "high speed", video)
+    save("high-speed.png", high_speed(folder, source))
+
 
 def in_folder(folder: Path, name: str) -> Path:
     """Return the run folder of a run."""
@@ -120,6 +138,19 @@ def written(plan: Plan, cube: Path) -> Path:
         with open_source(plan) as source:
             write_packed(source, cube)
     return cube
+
+
+def filmed(plan: Plan, path: Path) -> Path:
+    """Write a simulated capture as a video, as a camera does, and its truth."""
+    if not path.exists():
+        with open_source(plan) as source, av.open(str(path), "w") as container:
+            stream: Any = container.add_stream("libx264", rate=30)
+            stream.height, stream.width, stream.pix_fmt = *source.info.frame_shape, "yuv420p"
+            for frame in source.frames(source.info.span):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+            container.mux(stream.encode())
+            np.savez(truth_path(path), **source.truth())
+    return path
 
 
 def finish(plan: Plan, name: str, cube: Path) -> None:
@@ -168,6 +199,19 @@ def readme(folder: Path, cube: Path) -> Picture:
             labelled(panorama.astype(np.uint8), f"the same {n_frames} frames, as a panorama"),
         ]
     )
+
+
+def high_speed(folder: Path, section: dict[str, Any]) -> Picture:
+    """Return a frame of a video, and its panorama."""
+    flux = tifffile.imread(in_folder(folder, "high speed") / "panorama.tiff")
+    white = float(np.nanquantile(flux, 0.995))
+    with open_source(parse_spec({"version": 1, "source": section})) as source:
+        n_frames, middle = source.info.n_frames, source.info.n_frames // 2
+        frame = source.response.flux(source.counts(FrameSpan(middle, middle + 1)).astype(np.float32), 1)
+    panorama = picture(flux, white)
+    beneath = np.full((frame.shape[0], panorama.shape[1]), 255, np.uint8)
+    beneath[:, : frame.shape[1]] = picture(frame, white)
+    return stacked([labelled(beneath, f"one frame of {n_frames}"), labelled(panorama, f"the {n_frames} frames, as a panorama")])
 
 
 def levels(folder: Path, cube: Path) -> Picture:

@@ -121,3 +121,26 @@ def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFacto
     from photonpano.spec import parse_spec
 
     return api.run(parse_spec(small_spec, output=tmp_path_factory.mktemp("runs") / "small"))
+
+
+@pytest.fixture
+def write_video(tmp_path: Path) -> Callable[..., Path]:
+    """Write the levels of frames, as they are, as the luma of a video."""
+
+    def write(frames: np.ndarray, name: str, codec: str, pixels: str, **options: Any) -> Path:
+        av = pytest.importorskip("av")
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream(codec, rate=30, options={key: str(value) for key, value in options.items()})
+            stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixels
+            for levels in frames:
+                frame = av.VideoFrame(levels.shape[1], levels.shape[0], pixels)
+                luma = np.zeros((levels.shape[0], frame.planes[0].line_size), np.uint8)
+                flat = levels.reshape(len(levels), -1).view(np.uint8)
+                luma[:, : flat.shape[1]] = flat
+                for plane, content in zip(frame.planes, [luma] + 2 * [None], strict=False):
+                    plane.update(np.full(plane.buffer_size, 128, np.uint8) if content is None else content)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        return tmp_path / name
+
+    return write

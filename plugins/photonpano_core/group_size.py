@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from photonpano_core.grouping import SHORTEST
+from photonpano_core.grouping import shortest_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,6 +21,10 @@ _KNOWN_FROM = 3
 """From this level on even a trembling hand is known, whose period would forbid long groups before."""
 _DARK_BLUR = 2.0
 """In the dark, so many times the blur is allowed."""
+_SHARP = 0.02
+"""Where light is plentiful, groups are so short that they are blurred by this share only: 8 times as many take their time."""
+_PLENTY = 1000.0
+"""So many photons a pixel are plenty."""
 _GROUPS = 8
 """The first level has at least so many groups, where the capture is long enough."""
 _LEAST = 1e-9
@@ -54,9 +58,9 @@ class AutoResampler:
             InputError: the capture is shorter than the shortest group.
         """
         if self._size is None:
-            shorter_side = min(self._context.stream.frame_shape)
+            stream = self._context.stream
             capture = self._context.capture()
-            size, reason = choose_group_size(capture, n_frames, shorter_side)
+            size, reason = choose_group_size(capture, n_frames, min(stream.frame_shape), shortest_of(stream))
             self._doubled = self._densifies and capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
             if self._doubled:
                 reason += f"; from level {_KNOWN_FROM} on, where the motion is known, they are twice as long for more light"
@@ -67,32 +71,37 @@ class AutoResampler:
         return self._of_size(self._size * (2 if twice else 1)).groups(n_frames, level + (1 if twice else 0))
 
 
-def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int) -> tuple[int, str]:
+def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int, shortest: int) -> tuple[int, str]:
     """Return the group size for a capture, in frames, and a clause that gives the reason.
 
     The blur of a group of m frames at v px a frame is m v px. It may be 0.15 of the shorter side of a frame, and up to twice
-    that as long as a pixel gets fewer than 3 photons. There are at least 16 frames in a group, and at least 8 groups.
+    that as long as a pixel gets fewer than 3 photons; it is kept to 0.02 where a pixel gets 1000 all the same. There are at
+    least `shortest` frames in a group, and at least 8 groups.
     """
     if capture.speed_px is None:
-        size, bound = _bounded(_UNKNOWN, n_frames)
+        size, bound = _bounded(_UNKNOWN, n_frames, shortest)
         return size, f"{capture.how}, so {_UNKNOWN} frames are assumed{bound}"
     allowed = _BLUR * shorter_side_px / max(capture.speed_px, _LEAST)
-    wanted = min(max(allowed, _DARK / max(capture.flux, _LEAST)), _DARK_BLUR * allowed)
-    size, bound = _bounded(wanted, n_frames)
+    photons = max(capture.flux, _LEAST)
+    wanted, light = allowed, ""
+    if allowed * photons < _DARK:
+        wanted, light = min(_DARK / photons, _DARK_BLUR * allowed), ", for which more blur is allowed in the dark"
+    elif allowed * photons > _PLENTY:
+        wanted, light = max(_PLENTY / photons, allowed * _SHARP / _BLUR), ", so that less blur is worth more than more light"
+    size, bound = _bounded(wanted, n_frames, shortest)
     blur_px = size * capture.speed_px
-    dark = ", for which more blur is allowed in the dark" if wanted > max(allowed, SHORTEST) else ""
     return size, (
         f"at {capture.speed_px:.2g} px a frame ({capture.how}) they are blurred by {blur_px:.3g} px, "
         f"{blur_px / shorter_side_px:.2g} of the shorter side of a frame, and at a flux of {capture.flux:.2g} they hold "
-        f"{size * capture.flux:.3g} photons a pixel{dark}{bound}"
+        f"{size * capture.flux:.3g} photons a pixel{light if size != shortest else ''}{bound}"
     )
 
 
-def _bounded(wanted: float, n_frames: int) -> tuple[int, str]:
+def _bounded(wanted: float, n_frames: int, shortest: int) -> tuple[int, str]:
     """Return the nearest size that suits the capture, and what to say if it is not the one that was wanted."""
-    most = max(SHORTEST, n_frames // _GROUPS)
+    most = max(shortest, n_frames // _GROUPS)
     if wanted > most:
         return most, f"; longer ones would be fewer than {_GROUPS}"
-    if wanted < SHORTEST:
-        return SHORTEST, "; shorter ones would tell nothing"
+    if wanted < shortest:
+        return shortest, "; shorter ones would tell nothing" if shortest > 1 else ""
     return round(wanted), ""

@@ -13,12 +13,18 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano import StreamInfo
     from photonpano_core.configs import GroupedConfig
 
-SHORTEST = 16
-"""Groups whose length is chosen by us get no shorter than this: too few photons tell nothing."""
+_SHORTEST = {"binary": 16, "intensity": 1}
+"""Groups whose length is chosen by us get no shorter than this: too few binary frames tell nothing, a grey one is a picture."""
 _SHORTEST_END = 4
 """Those at the ends may: otherwise the motion there is not measured at all."""
+
+
+def shortest_of(stream: StreamInfo) -> int:
+    """Return the least frames of a group whose length is chosen by us."""
+    return _SHORTEST[stream.kind]
 
 
 def size_of(config: GroupedConfig) -> int:

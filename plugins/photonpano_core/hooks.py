@@ -27,7 +27,7 @@ from photonpano_core.configs import (
 )
 from photonpano_core.constant_groups import ConstantGroupsResampler
 from photonpano_core.group_size import AutoResampler
-from photonpano_core.grouping import SHORTEST, too_short
+from photonpano_core.grouping import shortest_of, too_short
 from photonpano_core.midpoint import MidpointResampler
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.sliding_window import SlidingWindowResampler
@@ -158,7 +158,7 @@ def _of_size(
 
 
 def _check_groups(config: GroupedConfig, stream: StreamInfo) -> list[str]:
-    problem = too_short(SHORTEST if config.group_size == "auto" else config.group_size, stream.n_frames)
+    problem = too_short(shortest_of(stream) if config.group_size == "auto" else config.group_size, stream.n_frames)
     return [problem] if problem else []
 
 

@@ -112,7 +112,10 @@ class DirectConfig(Config):
         description="a pair whose images, with photon noise taken out, correlate less than this after alignment is not located",
     )
     max_noise_ratio: float = Field(
-        100.0, gt=1, description="a pair that differs by more than this many times its photon noise is not located"
+        100.0,
+        gt=1,
+        description="a pair that differs by more than this many times its photon noise is not located, "
+        "unless there is so much light that blur explains it",
     )
     max_std_px: float = Field(
         15.0,

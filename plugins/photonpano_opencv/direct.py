@@ -30,6 +30,9 @@ _EXACT_PX = 0.1
 """A layer that tells corners to this is good enough."""
 _COARSE_TOLERANCE = 12
 """The coarser levels of the pyramid only start the finest, and may stop this much earlier."""
+_BLURRED_APART = 0.1
+"""Motion blurs exposures of the same place differently: in much light they differ by up to this share of their contrast, which
+is any number of times the photon noise."""
 
 
 class DirectLocator:
@@ -74,11 +77,16 @@ class DirectLocator:
                 return NotLocated(aligned)
         scale, homography, quality = _best(found)
         alike = agreement(moving.details, fixed.details, rescaled(homography, 0.5**moving.judge))
-        return self._judged(homography, quality, scale, alike)
+        # In pixels of the layer, of which noise is the less the larger they are.
+        contrast = moving.details.contrast * (0.5**moving.judge / scale) ** 2
+        return self._judged(homography, quality, scale, alike, contrast)
 
-    def _judged(self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float) -> Located | NotLocated:
-        """Say what is to be said of an alignment, whose quality is that of a layer of this scale."""
+    def _judged(
+        self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float, contrast: float
+    ) -> Located | NotLocated:
+        """Say what is to be said of an alignment, whose quality and contrast are those of a layer of this scale."""
         config, std_px = self._config, quality.std_px / scale
+        max_noise_ratio = max(config.max_noise_ratio, _BLURRED_APART * contrast)
         evidence = {
             "agreement": alike,
             "noise_ratio": quality.noise_ratio,
@@ -91,10 +99,11 @@ class DirectLocator:
                 if alike
                 else "where the images overlap after alignment, nothing stands out from photon noise"
             )
-        elif quality.noise_ratio > config.max_noise_ratio:
-            reason = (
-                f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, "
+        elif quality.noise_ratio > max_noise_ratio:
+            reason = f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, " + (
                 f"more than max_noise_ratio = {config.max_noise_ratio:g}"
+                if max_noise_ratio == config.max_noise_ratio
+                else f"more than the {max_noise_ratio:.0f} times that blur explains"
             )
         elif std_px > config.max_std_px:
             reason = f"the photons tell where corners lie to {std_px:.2g} px, worse than max_std_px = {config.max_std_px:g}"

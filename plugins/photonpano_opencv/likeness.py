@@ -33,6 +33,12 @@ class Details(NamedTuple):
     weight: NDArray[np.float32]
     gain: float
 
+    @property
+    def contrast(self) -> float:
+        """The mean square of what was seen over the variance of its noise."""
+        seen = self.weight > 0
+        return float(np.mean(np.square(self.image[seen]) * self.weight[seen])) / self.gain if seen.any() else 0.0
+
 
 def details_of(layer: Layer) -> Details:
     """Return the details of a layer."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from photonpano import SourceContribution, hookimpl
+from photonpano_sensors.intensity.contributions import INTENSITY_SOURCES
 from photonpano_sensors.single_photon import SINGLE_PHOTON
 
 if TYPE_CHECKING:
@@ -15,3 +16,4 @@ if TYPE_CHECKING:
 def photonpano_sources() -> Iterator[SourceContribution[Any]]:
     """Offer captures as cameras and their programs write them."""
     yield from SINGLE_PHOTON
+    yield from INTENSITY_SOURCES

@@ -125,8 +125,27 @@ class Sensor(Config):
     mask_hot_pixels: bool = Field(False, description="whether the capture says which pixels are hot, so that they are not used")
 
 
-class SimulatorConfig(Config):
-    """A single-photon camera that turns before a scene."""
+class IntensitySensor(Config):
+    """A conventional camera, whose pixels count photons, which are read with noise as grey levels."""
+
+    bits: Literal[8, 10, 12, 16] = Field(8, description="bits of a grey level")
+    quantum_efficiency: float = Field(1.0, gt=0, le=1, description="detected share of the photons that reach a pixel")
+    full_well: float = Field(
+        10_000.0, ge=1, le=1e9, description="detected photons at the highest level, at which a pixel saturates"
+    )
+    read_noise: float = Field(20.0, ge=0, le=1e6, description="standard deviation of the noise of reading, in photons")
+    black_level: int = Field(0, ge=0, le=200, description="the grey level of no light")
+    exposure: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of the frame period in which the shutter is open, so that motion blurs the frame; how long that is "
+        "does not change the flux, which is that of a frame",
+    )
+
+
+class SimulationConfig(Config):
+    """What simulations of all cameras share."""
 
     scene: Annotated[StreetScene | PhotoScene, Field(discriminator="kind")] = Field(StreetScene(), description="what is seen")
     path: Annotated[PanPath | ScanPath | LoopPath | SplinePath | HandShakePath | FilePath, Field(discriminator="kind")] = Field(
@@ -145,7 +164,27 @@ class SimulatorConfig(Config):
     focal_length_px: float = Field(
         4464.0, ge=100, le=1e6, description="focal length of the camera, in px: how strong the perspective of its turning is"
     )
-    sensor: Sensor = Field(Sensor(), description="the single-photon camera")
     seed: int | None = Field(
         None, ge=0, description="photons, hot pixels and shake derive from it; by default the seed of the run"
     )
+
+
+class SimulatorConfig(SimulationConfig):
+    """A single-photon camera that turns before a scene."""
+
+    sensor: Sensor = Field(Sensor(), description="the single-photon camera")
+
+
+class CameraSimulatorConfig(SimulationConfig):
+    """A conventional high-speed camera that turns before a scene."""
+
+    flux: float = Field(
+        2000.0,
+        gt=0,
+        le=1e9,
+        description="photons that reach a pixel in a frame, on average over the whole scene; the sensor detects "
+        "quantum_efficiency times as many",
+    )
+    n_frames: int = Field(200, ge=1, le=10_000_000, description="number of frames")
+    frame_rate_hz: float = Field(500.0, gt=0, le=1e9, description="frames a second, in Hz")
+    sensor: IntensitySensor = Field(IntensitySensor(), description="the camera")

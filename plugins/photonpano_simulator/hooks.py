@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from photonpano import InputError, SourceContribution, hookimpl
-from photonpano_simulator.config import FilePath, PhotoScene, SimulatorConfig, StreetScene
+from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig, StreetScene
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -17,15 +17,15 @@ _CHECKED_FRAMES = 5000
 """Frames of a path that are checked before a run: enough to see that it leaves the scene."""
 
 
-def _build(config: SimulatorConfig, context: SourceContext) -> SimulatorSource:
+def _build(config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> SimulatorSource:
     from photonpano_simulator.source import SimulatorSource
 
     return SimulatorSource(config, context)
 
 
-def _check(config: SimulatorConfig) -> Sequence[str]:
+def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
     """Look for missing files, and for a path that leaves the scene where its size is known."""
-    files = [config.sensor.dark_rates, config.sensor.hot_pixels]
+    files = [config.sensor.dark_rates, config.sensor.hot_pixels] if isinstance(config.sensor, Sensor) else []
     if isinstance(config.scene, PhotoScene):
         files.append(config.scene.file)
     if isinstance(config.path, FilePath):
@@ -45,12 +45,19 @@ def _check(config: SimulatorConfig) -> Sequence[str]:
 
 
 @hookimpl
-def photonpano_sources() -> Iterator[SourceContribution[SimulatorConfig]]:
-    """Offer the simulator."""
+def photonpano_sources() -> Iterator[SourceContribution[Any]]:
+    """Offer the simulators."""
     yield SourceContribution(
         name="simulator",
         summary="A simulated single-photon camera that turns before a photograph or a street that is built in",
         config=SimulatorConfig,
+        build=_build,
+        check=_check,
+    )
+    yield SourceContribution(
+        name="camera-simulator",
+        summary="A simulated conventional camera, with photon noise and read noise, before the same scenes",
+        config=CameraSimulatorConfig,
         build=_build,
         check=_check,
     )

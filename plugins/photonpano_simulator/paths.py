@@ -21,7 +21,7 @@ from photonpano_simulator.files import read_homographies
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from photonpano_simulator.config import Shake, SimulatorConfig
+    from photonpano_simulator.config import Shake, SimulationConfig
 
     FloatArray = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ _DENSE = 100_000
 """Points of a curve before it is sampled at constant speed: the error is far below a thousandth of a pixel."""
 
 
-def camera_path(config: SimulatorConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
+def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
     """Return the true homographies of all frames: (T, 3, 3), frame pixels to scene pixels.
 
     Raises:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from photonpano.photometry import BinaryResponse
 from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.files import read_mask, read_rates
 
@@ -19,14 +20,21 @@ class SpadSensor:
     """Pixels that are 1 with the probability `1 - exp(-(q * flux + dark))` (paper, equation 2), and 0 else.
 
     Attributes:
+        response: how flux becomes counts.
         dark_rates: (H, W) float32, dark counts per frame period, those of hot pixels included.
         hot: (H, W) bool, the hot pixels.
+        valid: (H, W) bool, false for hot pixels that the capture tells of.
 
     Raises:
         InputError: a file of rates or of hot pixels cannot be used.
     """
 
+    kind: Literal["binary"] = "binary"
+    bits = 1
+    exposure = 0.0
+
     def __init__(self, config: Sensor, frame_shape: tuple[int, int], seed: int) -> None:
+        self.response = BinaryResponse()
         rng = generator(seed, Draw.HOT_PIXELS)
         self.hot: NDArray[np.bool_] = rng.random(frame_shape) < config.hot_fraction
         if config.hot_pixels is not None:
@@ -38,6 +46,11 @@ class SpadSensor:
         hot_rates = np.exp(rng.uniform(float(low), float(high), frame_shape)).astype(np.float32)
         self.dark_rates[self.hot] += hot_rates[self.hot]
         self._minus_dark_rates = -self.dark_rates
+        self.valid: NDArray[np.bool_] = ~self.hot if config.mask_hot_pixels else np.ones(frame_shape, np.bool_)
+
+    def truth(self) -> dict[str, NDArray[np.generic]]:
+        """Return what else is true: `dark_rates` and `hot_pixels`."""
+        return {"dark_rates": self.dark_rates, "hot_pixels": self.hot}
 
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
         """Take a frame.

@@ -13,6 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
+from photonpano import open_source, parse_spec
 from photonpano.cli.app import app
 from photonpano.pipeline.capture import truth_path
 
@@ -50,6 +51,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}
     | {"source.with.flux": 0.5, "resample.with.group_size": 50, "graph.skips": "[1, 2]"},
+    "high-speed-video": {"resample.with.group_size": 8},
     "photograph": SMALL
     | {"source.with.n_frames": 300, "source.with.scene.width": 640}
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
@@ -57,8 +59,13 @@ RUNS: dict[str, dict[str, Any]] = {
 """Specs to run, and what makes them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Those whose levels have no more groups than the first."""
-NEEDS = {"colmap": "pycolmap", "kornia": "kornia"}
+NEEDS = {"colmap": "pycolmap", "high-speed-video": "av", "kornia": "kornia"}
 """Libraries that may be missing; the specs that need them are run where they are installed."""
+
+
+STREET = {"kind": "street", "width": 1024, "height": 682}
+CAMERA = {"scene": STREET, "path": {"kind": "pan", "length_px": 120}, "n_frames": 60, "frame_shape": [128, 160]}
+"""What the example of a video was taken with."""
 
 
 def photonpano(*arguments: str | Path, **overrides: Any) -> str:
@@ -110,9 +117,13 @@ def test_captures_can_be_simulated(name, examples, tmp_path):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_specs_run(name, examples, tmp_path):
+def test_specs_run(name, examples, tmp_path, write_video):
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
+    if name == "high-speed-video":
+        with open_source(parse_spec({"version": 1, "source": {"use": "camera-simulator", "with": CAMERA}})) as camera:
+            video = write_video(camera.frames(camera.info.span), "a.mp4", "libx264", "yuvj420p")
+        shutil.copy(video, examples / "high-speed.mp4")
     photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **RUNS[name])
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     groups = [level["groups"] for level in record["levels"]]

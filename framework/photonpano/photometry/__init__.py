@@ -3,13 +3,14 @@
 from photonpano.photometry.contrast import signal_to_noise
 from photonpano.photometry.likeness import correlation_without_noise, noise_free_correlation
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
-from photonpano.photometry.responses import BinaryResponse, BinarySumResponse
+from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, IntensityResponse
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
     "BinarySumResponse",
     "BitOrder",
+    "IntensityResponse",
     "correlation_without_noise",
     "linear_to_srgb",
     "noise_free_correlation",

@@ -48,9 +48,10 @@ def contrast_of(exposure: VirtualExposure) -> Contrast:
     if np.fmax.reduce(exposure.flux, axis=None) <= 0:
         return Contrast(0.0, "no pixel saw a photon; is the shutter closed, or the file the right one?")
     darkest = exposure.response.mean_count(np.fmin.reduce(exposure.flux, axis=None, keepdims=True))
+    brightest = exposure.response.mean_count(np.array([np.inf], np.float32))
     # Half a frame is taken to be dark in a pixel that is always lit; one whole dark frame is the next there can be.
-    if 1 - darkest.item() < 0.75 / longest:
-        return Contrast(0.0, "every pixel is lit in every frame, so that its flux is unknown; use a darker aperture")
+    if brightest.item() - darkest.item() < 0.75 / longest:
+        return Contrast(0.0, "every pixel is as bright as can be told, so that its flux is unknown; use a darker aperture")
     return Contrast(signal_to_noise(exposure))
 
 

@@ -21,20 +21,22 @@ def require_photons(source: Source) -> None:
     """Look at a few frames all over the capture, and refuse one that is all dark or all lit.
 
     Raises:
-        InputError: no pixel, or every pixel, is lit in all of them.
+        InputError: no pixel, or every pixel, is lit in all of them; of grey levels, all are black, or saturated.
     """
     valid, spans = source.valid, _spread(source.info)
-    lit = sum(int(source.counts(span)[valid].sum()) for span in spans)
     seen = sum(map(len, spans))
-    if lit == 0:
+    mean_count = sum(source.counts(span)[valid] for span in spans) / np.float32(seen)
+    none, most = source.response.mean_count(np.array([0, np.inf], np.float32)).tolist()
+    binary = source.info.kind == "binary"
+    if mean_count.max() <= none:
         raise InputError(
-            f"no pixel is lit in any of {seen} frames looked at all over the capture; "
+            f"no pixel is {'lit' if binary else 'brighter than black'} in any of {seen} frames looked at all over the capture; "
             "check that the file is the right one, and that the lens was open"
         )
-    if source.info.kind == "binary" and lit == seen * int(valid.sum()):
+    if mean_count.min() >= most:
         raise InputError(
-            f"every pixel is lit in all of {seen} frames looked at all over the capture, so that no flux can be told; "
-            "check the layout of the file, or expose less"
+            f"every pixel is {'lit' if binary else 'saturated'} in all of {seen} frames looked at all over the capture, "
+            "so that no flux can be told; check the layout of the file, or expose less"
         )
 
 

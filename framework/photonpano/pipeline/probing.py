@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from photonpano.values import FloatArray, FluxImage
 
 _PLACES = 12
-_SPANS = (4, 8, 16, 32, 64, 128, 256)
+_SPANS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 """Frames that are summed. What crosses the image in the shortest is too fast to be located by anything."""
+_SHORTEST = {"binary": 4, "intensity": 1}
+"""Fewer binary frames than this are noise, whose shifts may agree by chance."""
 _SHARE = 6
 """No span is longer than this part of the capture."""
 _SIDE = 64
@@ -54,7 +56,7 @@ def summarise(source: Source, threads: int = 1) -> CaptureSummary:
         threads: how many places are looked at once; the result does not depend on it.
     """
     n_frames = source.info.n_frames
-    lengths = [length for length in _SPANS if length <= n_frames // _SHARE]
+    lengths = [length for length in _SPANS if _SHORTEST[source.info.kind] <= length <= n_frames // _SHARE]
     if not lengths:
         flux = _mean_flux(source, [_mean_count(source, source.info.span)], n_frames)
         return CaptureSummary(flux, None, f"{n_frames} frames are too few to tell a motion")

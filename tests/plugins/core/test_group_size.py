@@ -15,8 +15,8 @@ from photonpano_core.midpoint import MidpointResampler
 HOW = "the second fastest of 12 places, from sums of 64 frames"
 
 
-def choice(flux: float, speed_px: float | None, n_frames: int = 10_000, how: str = HOW) -> tuple[int, str]:
-    return choose_group_size(CaptureSummary(flux, speed_px, how), n_frames, 254)
+def choice(flux: float, speed_px: float | None, n_frames: int = 10_000, how: str = HOW, shortest: int = 16) -> tuple[int, str]:
+    return choose_group_size(CaptureSummary(flux, speed_px, how), n_frames, 254, shortest)
 
 
 def built(stream: StreamInfo, name: str = "midpoint", **context: Any) -> Any:
@@ -55,6 +55,26 @@ def test_fast_motion_leaves_sixteen_frames() -> None:
     )
 
 
+def test_grey_frames_may_stand_alone() -> None:
+    """At 500 frames a second the image may move by tens of px from one to the next."""
+    assert choice(20, 10.0, shortest=1)[0] == 4
+    assert choice(2000, 100.0, shortest=1) == (
+        1,
+        f"at 1e+02 px a frame ({HOW}) they are blurred by 100 px, 0.39 of the shorter side of a frame, and at a flux of 2e+03 "
+        "they hold 2e+03 photons a pixel",
+    )
+    resampler = built(StreamInfo(80, 254, 496, None, "intensity", 8), capture=lambda: CaptureSummary(2000, 38.0, HOW))
+    assert {len(group.span) for group in resampler.groups(80, 1)} == {1}
+
+
+def test_plenty_of_light_makes_groups_sharp() -> None:
+    size, reason = choice(2000, 0.5, shortest=1)
+    assert size == 10  # 0.02 of 254 px
+    assert reason.endswith("they hold 2e+04 photons a pixel, so that less blur is worth more than more light")
+    assert choice(50, 0.5, shortest=1)[0] == 20  # 1000 photons
+    assert choice(0.5, 0.05)[0] == 762  # which are too few
+
+
 def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None:
     how = "no motion can be told at any of 12 places"
     assert choice(0.01, None, how=how) == (500, f"{how}, so 500 frames are assumed")
@@ -71,7 +91,7 @@ def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None
     side=st.integers(8, 1024),
 )
 def test_any_capture_gets_a_size_within_bounds(flux: float, speed_px: float | None, n_frames: int, side: int) -> None:
-    size, reason = choose_group_size(CaptureSummary(flux, speed_px, HOW), n_frames, side)
+    size, reason = choose_group_size(CaptureSummary(flux, speed_px, HOW), n_frames, side, 16)
     assert 16 <= size <= max(16, n_frames // 8)
     assert "\n" not in reason
     if speed_px and size > 16:

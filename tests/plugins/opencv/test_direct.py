@@ -4,20 +4,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated
+from photonpano import FrameSpan, Group, Located, NotLocated, VirtualExposure
 from photonpano.evaluation import pair_bound_px
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
-from photonpano.photometry import BinaryResponse
+from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_opencv.configs import DirectConfig
 from photonpano_opencv.direct import DirectLocator
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from photonpano import VirtualExposure
 
 SHAPE = (160, 240)
 STILL = np.eye(3)
@@ -160,3 +159,22 @@ def test_images_that_correlate_but_differ_by_more_than_noise_are_not_located(see
     assert isinstance(failure, NotLocated)
     assert failure.evidence["agreement"] > 0.9
     assert "times the photon noise, more than max_noise_ratio = 100" in failure.reason
+
+
+def test_in_much_light_images_that_blur_tells_apart_are_located(street: np.ndarray) -> None:
+    """A few thousand photons a pixel: the difference is some hundred times the photon noise, and small against the scene."""
+    response = IntensityResponse(photons_per_level=40.0, black_level=0.0, saturation_level=1e4, read_noise=20.0)
+
+    def seen(left: int, blur_px: float, brightness: float = 1.0) -> VirtualExposure:
+        flux = brightness * 20_000 * cv2.GaussianBlur(street, (0, 0), blur_px)[280:440, left : left + 240]
+        noisy = np.random.default_rng(left).normal(flux, np.sqrt(flux)).astype(np.float32)
+        span = FrameSpan(0, 1)
+        return VirtualExposure(noisy, np.ones_like(noisy), Group(span, 0), 1.0, response)
+
+    motion = register(seen(400, 0.8), seen(402, 1.1), STILL)
+    assert isinstance(motion, Located)
+    assert motion.evidence["noise_ratio"] > 100
+    np.testing.assert_allclose(motion.homography[:2, 2], [-2, 0], atol=0.2)
+    flickering = register(seen(400, 0.8), seen(402, 0.8, brightness=0.5), STILL)
+    assert isinstance(flickering, NotLocated)
+    assert "times that blur explains" in flickering.reason

@@ -5,15 +5,16 @@ from __future__ import annotations
 from photonpano import discover
 from photonpano.testing import SourceConformance
 
+CATALOG = discover()
+SMALL = {"scene": {"kind": "street", "width": 256, "height": 171}, "n_frames": 60, "frame_shape": [40, 52]}
+
 
 class TestSimulator(SourceConformance):
-    contribution = discover().find("source", "simulator").contribution
+    contribution = CATALOG.find("source", "simulator").contribution
     config = {
-        "scene": {"kind": "street", "width": 256, "height": 171},
+        **SMALL,
         "path": {"kind": "pan", "length_px": 40, "shake": {"rms_px": 1}},
         "sensor": {"hot_fraction": 0.01, "mask_hot_pixels": True},
-        "n_frames": 60,
-        "frame_shape": [40, 52],
     }
     wrong = (
         {"scene": {"kind": "photo", "file": "there-is-no-such-file.png"}},
@@ -21,3 +22,13 @@ class TestSimulator(SourceConformance):
         {"sensor": {"hot_pixels": "there-is-no-such-file.npy"}},
         {"path": {"kind": "pan", "length_px": 4000}},
     )
+
+
+class TestConventionalCamera(SourceConformance):
+    contribution = CATALOG.find("source", "camera-simulator").contribution
+    config = {**SMALL, "path": {"kind": "pan", "length_px": 90}, "sensor": {"exposure": 0.5}}
+    wrong = ({"path": {"kind": "pan", "length_px": 4000}},)
+
+
+class TestConventionalCameraOf12Bits(TestConventionalCamera):
+    config = {**TestConventionalCamera.config, "sensor": {"bits": 12}}

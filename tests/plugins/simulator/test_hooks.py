@@ -14,7 +14,7 @@ from photonpano_simulator.hooks import photonpano_sources
 if TYPE_CHECKING:
     from pathlib import Path
 
-(SIMULATOR,) = photonpano_sources()
+SIMULATOR, CAMERA = photonpano_sources()
 
 
 def problems(**settings: Any) -> list[str]:
@@ -40,6 +40,12 @@ def test_the_defaults_are_a_small_demo() -> None:
     config = SimulatorConfig()
     assert (config.n_frames, config.frame_shape, config.scene.kind, config.path.kind) == (2000, (254, 496), "street", "pan")
     assert problems() == []
+
+
+def test_the_conventional_camera_is_a_small_demo_too() -> None:
+    config = CAMERA.config()
+    assert (config.n_frames, config.frame_rate_hz, config.sensor.bits) == (200, 500, 8)
+    assert CAMERA.check(config) == []
 
 
 def test_relative_paths_count_from_the_spec(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano.photometry import BinaryResponse, BinarySumResponse
+from photonpano.photometry import BinaryResponse, BinarySumResponse, IntensityResponse
 
 RESPONSE = BinaryResponse()
 
@@ -81,3 +81,33 @@ def test_sums_of_binary_frames_have_uniform_noise_once_stabilised(flux: float) -
     values = response.stabilised(estimates, np.float32(n_frames))
     np.testing.assert_allclose(values.std(), response.stabilised_std(n_frames), rtol=0.06)
     np.testing.assert_allclose(values.mean(), response.stabilised(f32(flux), 1e9)[0], atol=0.02)
+
+
+GREY = IntensityResponse(photons_per_level=40.0, black_level=16.0, saturation_level=235.0, read_noise=25.0)
+
+
+def test_grey_levels_grow_with_the_flux_until_they_saturate() -> None:
+    np.testing.assert_allclose(GREY.mean_count(f32(0, 400, 1e9, np.inf, np.nan)), [16, 26, 235, 235, np.nan])
+    np.testing.assert_allclose(GREY.flux(f32(16, 26, 235, 250, np.nan), 1), [0, 400, 8760, 8760, np.nan])
+
+
+def test_levels_below_black_are_negative_flux_so_that_averages_of_noise_are_right() -> None:
+    np.testing.assert_allclose(GREY.flux(f32(15.5), 1), [-20])
+
+
+@pytest.mark.parametrize("n_frames", [1, 4, 30])
+@pytest.mark.parametrize("flux", [0.0, 100.0, 2000.0])
+def test_the_noise_of_grey_levels_is_what_the_response_says(flux: float, n_frames: int) -> None:
+    """Photons and reading together; where single frames are read with more noise than light, their distribution is cut off."""
+    rng = np.random.default_rng(0)
+    photons = rng.poisson(flux, (n_frames, 40_000)) + rng.normal(0, GREY.read_noise, (n_frames, 40_000))
+    levels = (16 + photons / GREY.photons_per_level).mean(axis=0).astype(np.float32)
+    stabilised = GREY.stabilised(GREY.flux(levels, n_frames), n_frames)
+    assert stabilised.dtype == np.float32
+    expected = float(GREY.stabilised_std(n_frames))
+    assert stabilised.std() == pytest.approx(expected, rel=0.05)
+    np.testing.assert_allclose(stabilised.mean(), GREY.stabilised(f32(flux), 1e6), atol=0.05 * expected + 0.02)
+
+
+def test_pixels_that_were_never_seen_do_no_harm() -> None:
+    assert np.isnan(GREY.stabilised(f32(np.nan), f32(0))).all()

@@ -28,7 +28,7 @@ def exposed(counts: np.ndarray, frames: int) -> VirtualExposure:
 @given(st.integers(1, 100_000))
 def test_an_exposure_that_is_lit_in_every_frame_is_blank(frames: int) -> None:
     assert contrast_of(exposed(np.full((4, 6), frames), frames)).blank == (
-        "every pixel is lit in every frame, so that its flux is unknown; use a darker aperture"
+        "every pixel is as bright as can be told, so that its flux is unknown; use a darker aperture"
     )
 
 

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photonpano import InputError
+from photonpano import InputError, StreamInfo
+from photonpano.photometry import IntensityResponse
 from photonpano.pipeline.inspection import require_photons
 
 DARK = (
@@ -39,3 +40,14 @@ def test_masked_pixels_do_not_count(memory_source: type, value: int) -> None:
     frames[:, 2, 3], valid[2, 3] = 1 - value, False
     with pytest.raises(InputError):
         require_photons(memory_source(frames, valid))
+
+
+@pytest.mark.parametrize(("level", "text"), [(16, "no pixel is brighter than black"), (235, "every pixel is saturated")])
+def test_grey_levels_are_judged_by_black_and_white(memory_source: type, level: int, text: str) -> None:
+    source = memory_source(np.full((40, 4, 8), level, np.uint8))
+    source.info, source.response = StreamInfo(40, 4, 8, None, "intensity", 8), IntensityResponse(40.0, 16.0, 235.0, 20.0)
+    with pytest.raises(InputError, match=f"^{text} in"):
+        require_photons(source)
+    source = memory_source(np.full((40, 4, 8), 100, np.uint8))
+    source.info, source.response = StreamInfo(40, 4, 8, None, "intensity", 8), IntensityResponse(40.0, 16.0, 235.0, 20.0)
+    require_photons(source)

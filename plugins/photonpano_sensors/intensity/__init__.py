@@ -1,0 +1,1 @@
+"""Captures of conventional high-speed cameras: grey levels instead of single photons."""

@@ -1,0 +1,142 @@
+"""Headers of Photron cameras: .cih, which is text, and .cihx, which holds XML among other bytes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+from photonpano import InputError
+from photonpano_sensors.intensity.levels import Encoding
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+_MOST_BYTES = 4 * 1024**2
+"""Headers are a few kB; whatever is larger is something else."""
+_BITS = (8, 12, 16)
+_COUNT = re.compile(r"\d{1,9}")
+_RATE = re.compile(r"\d{1,9}(\.\d{1,9})?")
+_KEYS = {
+    "width": ("Image Width", "imageDataInfo/resolution/width"),
+    "height": ("Image Height", "imageDataInfo/resolution/height"),
+    "frames": ("Total Frame", "frameInfo/totalFrame"),
+    "bits": ("Color Bit", "imageDataInfo/colorInfo/bit"),
+    "effective bits": ("EffectiveBit Depth", "imageDataInfo/effectiveBit/depth"),
+    "effective side": ("EffectiveBit Side", "imageDataInfo/effectiveBit/side"),
+    "format": ("File Format", "imageFileInfo/fileFormat"),
+    "rate": ("Record Rate(fps)", "recordInfo/recordRate"),
+    "step": ("Save Step", "frameInfo/skipFrame"),
+}
+"""What the headers call what they tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the header of a recording tells.
+
+    Attributes:
+        n_frames: frames in the .mraw file.
+        height: rows of a frame.
+        width: columns of a frame.
+        bits: of a pixel in the file: 8, 12 or 16.
+        encoding: what the levels mean; fewer bits than those of the file where the camera has fewer.
+        frame_rate_hz: frames a second in the file, of which some may have been left out when it was saved.
+    """
+
+    n_frames: int
+    height: int
+    width: int
+    bits: int
+    encoding: Encoding
+    frame_rate_hz: float | None
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame in the .mraw file."""
+        return self.height * self.width * self.bits // 8
+
+
+def read_header(path: Path) -> Header:
+    """Read a .cih or .cihx file.
+
+    Raises:
+        InputError: it is missing, is something else, or tells of frames that cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}; check the path") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    if len(content) > _MOST_BYTES:
+        raise InputError(f"{path} is too large for a header of a Photron camera")
+    return _header(path, _of_xml(path, content) if path.suffix.lower() == ".cihx" else _of_text(content))
+
+
+def _of_text(content: bytes) -> Callable[[str], str | None]:
+    """Return what finds the value of a .cih file."""
+    lines = (line.partition(":") for line in content.decode("utf-8", errors="replace").splitlines())
+    values: dict[str, str] = {}
+    for key, _, value in lines:
+        values.setdefault(key.strip(), value.strip())
+    return lambda what: values.get(_KEYS[what][0])
+
+
+def _of_xml(path: Path, content: bytes) -> Callable[[str], str | None]:
+    """Return what finds the value of a .cihx file.
+
+    What stands before `<cih>` is cut off, a document type included: so there are no entities that could be expanded.
+    """
+    start, end = content.find(b"<cih>"), content.rfind(b"</cih>")
+    if not 0 <= start < end:
+        raise InputError(f"{path} is no header of a Photron camera: it has no part between <cih> and </cih>")
+    try:
+        root = ElementTree.fromstring(content[start : end + len(b"</cih>")].decode("utf-8", errors="replace"))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path} is damaged: {error}; copy it again") from error
+    return lambda what: root.findtext(_KEYS[what][1])
+
+
+def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
+    name = path.suffix.lower() == ".cihx"
+
+    def value(what: str) -> str:
+        found = (value_of(what) or "").strip()
+        if not found:
+            raise InputError(f"{path} does not tell {_KEYS[what][name]!r}; is it the header of a recording, and whole?")
+        return found
+
+    def count(what: str) -> int:
+        found = value(what)
+        if not (_COUNT.fullmatch(found) and int(found)):
+            raise InputError(f"{path}: {_KEYS[what][name]!r} must be a whole number above 0, got {found:.40}")
+        return int(found)
+
+    if value("format").lower() != "mraw":
+        raise InputError(
+            f"{path} belongs to a recording of the format {value('format'):.40}, not MRaw; "
+            "read .avi files with the source video, .tif and .png files with image-folder"
+        )
+    bits = count("bits")
+    if bits not in _BITS:
+        colour = "; colour is not supported: save the recording as raw or monochrome" if bits in (24, 36, 48) else ""
+        raise InputError(f"{path}: pixels of {bits} bits cannot be read, only of 8, 12 or 16{colour}")
+    height, width = count("height"), count("width")
+    if height * width * bits % 8:
+        raise InputError(f"{path}: frames of {height}x{width} pixels of {bits} bits are no whole number of bytes")
+    effective = count("effective bits")
+    if effective > bits:
+        raise InputError(f"{path}: pixels of {bits} bits cannot hold {effective} effective ones")
+    rate, step = (value_of("rate") or "").strip(), (value_of("step") or "").strip()
+    rate_hz = float(rate) if _RATE.fullmatch(rate) else 0.0
+    every = int(step) if _COUNT.fullmatch(step) else 1
+    side = value("effective side").lower()
+    if side not in ("lower", "higher"):
+        raise InputError(f"{path}: {_KEYS['effective side'][name]!r} must be Lower or Higher, got {side:.40}")
+    white = 2**effective - 1
+    encoding = Encoding(effective, 0.0, white) if side == "lower" else Encoding(bits, 0.0, white << (bits - effective))
+    return Header(count("frames"), height, width, bits, encoding, rate_hz / max(every, 1) or None)

@@ -1,0 +1,84 @@
+"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from photonpano import Config, SpecPath
+
+Gamma = Annotated[float, Field(gt=0, le=10)]
+
+
+class ResponseConfig(Config):
+    """How a camera turns photons into the grey levels of its file."""
+
+    curve: Literal["linear", "srgb"] | Gamma = Field(
+        "linear",
+        description="the curve that the levels were encoded with, which is undone before frames are summed: linear for raw "
+        "levels, srgb, or the exponent that makes them linear, such as 2.2",
+    )
+    curve_file: SpecPath | None = Field(
+        None,
+        description="a measured curve in place of it: a text file with a number for each level from 0 on, proportional to the "
+        "light",
+    )
+    black_level: float | None = Field(
+        None, ge=0, description="the level of no light; by default 0, and 16 (of 8 bits) in a video of limited range"
+    )
+    white_level: float | None = Field(
+        None,
+        gt=0,
+        description="the level above which nothing is told; by default the highest there is, and 235 (of 8 bits) in a video of "
+        "limited range",
+    )
+    saturation_photons: float = Field(
+        10_000.0,
+        gt=0,
+        le=1e9,
+        description="detected photons per pixel and frame at white_level: the unit of the flux, and how strong photon noise is",
+    )
+    read_noise: float = Field(
+        20.0,
+        ge=0,
+        le=1e6,
+        description="standard deviation of what reading a pixel adds, in photons; quantisation is added to it",
+    )
+
+    @model_validator(mode="after")
+    def _one_curve(self) -> Self:
+        if self.curve_file is not None and self.curve != "linear":
+            raise ValueError(f"curve_file takes the place of the curve {self.curve}; leave out one of them")
+        return self
+
+
+class IntensityConfig(Config):
+    """What all captures of grey levels share."""
+
+    path: SpecPath = Field(description="the capture")
+    frame_rate_hz: float | None = Field(
+        None, gt=0, description="frames a second while recording, in Hz; by default what the file says, if it does"
+    )
+    response: ResponseConfig = Field(ResponseConfig(), description="how photons become grey levels")
+
+
+class VideoConfig(IntensityConfig):
+    """A video file of any camera."""
+
+    path: SpecPath = Field(description="the video, such as an .mp4 or .avi file")
+
+
+class FastcamMrawConfig(IntensityConfig):
+    """Raw frames of a Photron FASTCAM."""
+
+    path: SpecPath = Field(description="the .cih or .cihx file, or the .mraw file; they lie side by side under one name")
+
+
+class ImageFolderConfig(IntensityConfig):
+    """A picture for each frame."""
+
+    path: SpecPath = Field(
+        description="a folder of .png or .tif files, one a frame in natural order (2 before 10), or one .tif file with a page "
+        "for each frame"
+    )

@@ -1,0 +1,98 @@
+"""The sources of grey levels, offered without importing what they need."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from photonpano import InputError, Requirement, SourceContribution
+from photonpano_sensors.intensity.configs import FastcamMrawConfig, ImageFolderConfig, VideoConfig
+from photonpano_sensors.intensity.recognition import (
+    is_file,
+    recognise_mraw,
+    recognise_pictures,
+    recognise_video,
+    refuse_mdat,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from photonpano import Source, SourceContext
+
+
+def _build_video(config: VideoConfig, context: SourceContext) -> Source:
+    from photonpano_sensors.intensity.video import VideoSource
+
+    return VideoSource(config, context)
+
+
+def _check_video(config: VideoConfig) -> Sequence[str]:
+    """Look at the file's name alone: to index its packets takes as long as to read it."""
+    try:
+        refuse_mdat(config.path)
+    except InputError as error:
+        return (str(error),)
+    return () if is_file(config.path) else (f"there is no file {config.path}; check the path",)
+
+
+def _build_mraw(config: FastcamMrawConfig, context: SourceContext) -> Source:
+    from photonpano_sensors.intensity.mraw import FastcamMrawSource
+
+    del context
+    return FastcamMrawSource(config)
+
+
+def _check_mraw(config: FastcamMrawConfig) -> Sequence[str]:
+    from photonpano_sensors.intensity.mraw import open_recording
+
+    try:
+        open_recording(config.path)
+    except InputError as error:
+        return (str(error),)
+    return ()
+
+
+def _build_pictures(config: ImageFolderConfig, context: SourceContext) -> Source:
+    from photonpano_sensors.intensity.pictures import ImageFolderSource
+
+    del context
+    return ImageFolderSource(config)
+
+
+def _check_pictures(config: ImageFolderConfig) -> Sequence[str]:
+    from photonpano_sensors.intensity.pictures import ImageFolderSource
+
+    try:
+        ImageFolderSource(config).close()
+    except InputError as error:
+        return (str(error),)
+    return ()
+
+
+INTENSITY_SOURCES: tuple[SourceContribution[Any], ...] = (
+    SourceContribution(
+        name="video",
+        summary="Grey frames of a video, such as an MP4 or AVI file of a high-speed camera",
+        config=VideoConfig,
+        build=_build_video,
+        check=_check_video,
+        recognise=recognise_video,
+        requires=(Requirement("av", "photonpano[video]"),),
+    ),
+    SourceContribution(
+        name="fastcam-mraw",
+        summary="Raw frames of a Photron FASTCAM: .mraw with .cih or .cihx",
+        config=FastcamMrawConfig,
+        build=_build_mraw,
+        check=_check_mraw,
+        recognise=recognise_mraw,
+    ),
+    SourceContribution(
+        name="image-folder",
+        summary="Grey PNG or TIFF files, one a frame, or the pages of a TIFF file",
+        config=ImageFolderConfig,
+        build=_build_pictures,
+        check=_check_pictures,
+        recognise=recognise_pictures,
+    ),
+)

@@ -1,0 +1,208 @@
+"""Frames of a video, decoded as rarely as can be."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from itertools import chain
+from threading import Lock
+from typing import TYPE_CHECKING
+
+import av
+import numpy as np
+
+from photonpano import InputError
+from photonpano_sensors.intensity.video_index import open_video
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from av import VideoFrame
+
+    from photonpano_sensors.intensity.summing import Levels
+    from photonpano_sensors.intensity.video_index import VideoIndex
+
+
+class _Decoder:
+    """Decodes a video from a key frame on.
+
+    Attributes:
+        next: the frame that is decoded next.
+        turn: held by the thread that decodes.
+        users: how many threads decode, or wait for their turn.
+    """
+
+    def __init__(self, index: VideoIndex, threads: int) -> None:
+        """Open the video for itself.
+
+        Raises:
+            InputError: it is no longer there.
+        """
+        self._index = index
+        self._container = open_video(index.path)
+        self._stream = self._container.streams.video[0]
+        self._stream.codec_context.thread_type = "AUTO"
+        self._stream.codec_context.thread_count = threads
+        self._frames: Iterator[VideoFrame] = self._container.decode(self._stream)
+        self._seeks = False
+        self.next = 0
+        self.turn = Lock()
+        self.users = 0
+
+    def comes_to(self, frame: int) -> bool:
+        """Tell whether decoding on is the way to a frame, rather than beginning at the key frame before it."""
+        return self._index.key_before(frame) <= self.next <= frame
+
+    def begin_before(self, frame: int) -> None:
+        """Have the next frame be the key frame before a frame; whoever decodes then does the seeking."""
+        self.next, self._seeks = self._index.key_before(frame), True
+
+    def decode(self) -> tuple[int, Levels]:
+        """Decode the next frame, and return its place and its levels.
+
+        Raises:
+            InputError: it is damaged or missing.
+        """
+        due = self.next
+        try:
+            if self._seeks:
+                self._seek(due)
+            frame = next((frame for frame in self._frames if self._place(frame) >= due), None)
+        except av.FFmpegError:
+            frame = None
+        if frame is None or frame.is_corrupt or self._place(frame) > due:
+            self.next = len(self._index.times)  # whoever comes next has to begin anew
+            raise InputError(f"frame {due} of {self._index.path} is damaged or missing; export or copy it again")
+        self.next = due + 1
+        return due, _luma(frame, self._index)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._container.close()
+
+    def _seek(self, key: int) -> None:
+        self._seeks = False
+        # An index may be so coarse, or so wrong, that seeking leads past the key frame.
+        for start in (key, 0):
+            self._container.seek(int(self._index.times[start]), stream=self._stream)
+            self._frames = self._container.decode(self._stream)
+            first = next(self._frames, None)
+            if first is not None and self._place(first) <= key:
+                self._frames = chain([first], self._frames)
+                return
+
+    def _place(self, frame: VideoFrame) -> int:
+        """Return which frame it is; -1 if it does not say, or is none of the index."""
+        times = self._index.times
+        place = len(times) if frame.pts is None else int(np.searchsorted(times, frame.pts))
+        return place if place < len(times) and times[place] == frame.pts else -1
+
+
+class DecodedFrames:
+    """The frames of a video, those decoded last kept up to a number of bytes. May be used from several threads.
+
+    Groups overlap, and the threads that merge them go along the video side by side. What one of them has decoded the others
+    find here. Who needs more takes the decoder that comes to it next, even if that is at work for somebody else,
+    who will soon be done; only where none does, one that nobody uses begins anew at a key frame.
+
+    Attributes:
+        n_decoded: how many frames were decoded so far.
+    """
+
+    def __init__(self, index: VideoIndex, threads: int, capacity_bytes: int) -> None:
+        """Prepare to decode.
+
+        Args:
+            index: of the video.
+            threads: how many threads are expected to ask for frames at once.
+            capacity_bytes: how much is kept.
+        """
+        self._index = index
+        self._threads = threads
+        self._kept = max(1, capacity_bytes // (index.height * index.width * (1 if index.encoding.bits <= 8 else 2)))
+        self._frames: OrderedDict[int, Levels] = OrderedDict()
+        self._decoders: list[_Decoder] = []
+        self._lock = Lock()
+        self.n_decoded = 0
+
+    def __getitem__(self, frame: int) -> Levels:
+        """Return a frame, (H, W), which is not to be written to.
+
+        Raises:
+            InputError: it is damaged or missing.
+        """
+        while True:
+            with self._lock:
+                if (known := self._known(frame)) is not None:
+                    return known
+                decoder = self._decoder_for(frame)
+                decoder.users += 1
+            try:
+                with decoder.turn:
+                    levels = self._decoded(decoder, frame)
+            finally:
+                with self._lock:
+                    decoder.users -= 1
+            if levels is not None:
+                return levels
+
+    def close(self) -> None:
+        """Let go of the file."""
+        for decoder in self._decoders:
+            decoder.close()
+
+    def _decoded(self, decoder: _Decoder, frame: int) -> Levels | None:
+        """Decode until a frame; None if somebody else decoded it with this decoder, and it is no longer kept."""
+        while decoder.next <= frame:
+            place, levels = decoder.decode()
+            with self._lock:
+                self.n_decoded += 1
+                self._keep(place, levels)
+            if place == frame:
+                return levels
+        with self._lock:
+            return self._known(frame)
+
+    def _decoder_for(self, frame: int) -> _Decoder:
+        """Return the decoder that comes to a frame next, or one that will begin at the key frame before it."""
+        coming = [decoder for decoder in self._decoders if decoder.comes_to(frame)]
+        idle = [decoder for decoder in self._decoders if not decoder.users]
+        if coming:
+            chosen = max(coming, key=lambda decoder: decoder.next)
+        elif idle and len(self._decoders) >= self._threads:
+            chosen = idle[0]
+            chosen.begin_before(frame)
+        else:
+            chosen = _Decoder(self._index, self._threads)
+            chosen.begin_before(frame)
+        # The one that nobody has used for the longest time comes first.
+        self._decoders = [decoder for decoder in self._decoders if decoder is not chosen] + [chosen]
+        return chosen
+
+    def _known(self, frame: int) -> Levels | None:
+        known = self._frames.get(frame)
+        if known is not None:
+            self._frames.move_to_end(frame)
+        return known
+
+    def _keep(self, frame: int, levels: Levels) -> None:
+        self._frames[frame] = levels
+        self._frames.move_to_end(frame)
+        while len(self._frames) > self._kept:
+            self._frames.popitem(last=False)
+
+
+def _luma(frame: VideoFrame, index: VideoIndex) -> Levels:
+    """Return the levels of a frame: (H, W), a copy."""
+    if (frame.height, frame.width) != (index.height, index.width):
+        raise InputError(
+            f"{index.path} changes from {index.height}x{index.width} to {frame.height}x{frame.width} pixels; "
+            "export it with frames of one size"
+        )
+    if frame.format.name != index.pixel_format:
+        frame = frame.reformat(format=index.pixel_format)
+    plane = frame.planes[0]
+    dtype = np.dtype("u1" if index.encoding.bits <= 8 else "<u2")
+    rows = np.frombuffer(memoryview(plane), dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    levels: Levels = rows[: index.height, : index.width].copy()
+    levels.flags.writeable = False
+    return levels

@@ -1,0 +1,206 @@
+"""Source `image-folder`: a picture for each frame, or a TIFF file with a page for each."""
+
+from __future__ import annotations
+
+import struct
+from threading import Lock
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+import tifffile
+
+from photonpano import InputError
+from photonpano_sensors.intensity.levels import Encoding
+from photonpano_sensors.intensity.recognition import pictures_in
+from photonpano_sensors.intensity.source import IntensitySource
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from photonpano import FrameSpan
+    from photonpano_sensors.intensity.configs import ImageFolderConfig
+    from photonpano_sensors.intensity.summing import Levels
+
+    Image = NDArray[np.generic]
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}
+"""What the colour types of PNG other than grey stand for."""
+_DAMAGED = (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, struct.error)
+"""What tifffile raises when it is given anything."""
+
+
+class _Form(NamedTuple):
+    """What all frames of a capture have in common."""
+
+    height: int
+    width: int
+    bits: int
+
+    def __str__(self) -> str:
+        return f"{self.height}x{self.width} pixels of {self.bits} bits"
+
+
+class _Pictures(Protocol):
+    """Frames that are pictures.
+
+    Attributes:
+        n_frames: how many.
+        form: that of each.
+    """
+
+    n_frames: int
+    form: _Form
+
+    def read(self, index: int) -> Image:
+        """Return a frame: (H, W)."""
+        ...
+
+    def close(self) -> None:
+        """Let go of files."""
+        ...
+
+
+class ImageFolderSource(IntensitySource):
+    """Pictures of grey levels of 8 or 16 bits, each read when it is asked for.
+
+    Raises:
+        InputError: there is none, one cannot be read or is not grey, or they differ in size or bits.
+    """
+
+    def __init__(self, config: ImageFolderConfig) -> None:
+        self._pictures: _Pictures = _Folder(config.path) if config.path.is_dir() else _Pages(config.path)
+        form = self._pictures.form
+        shape = self._pictures.n_frames, form.height, form.width
+        super().__init__(config, shape, None, Encoding.full(form.bits))
+
+    def close(self) -> None:
+        """Let go of files."""
+        self._pictures.close()
+
+    def _read(self, span: FrameSpan, levels: Levels) -> None:
+        for target, index in zip(levels, range(span.start, span.stop), strict=True):
+            target[...] = self._pictures.read(index)
+
+
+class _Folder:
+    """A file for each frame."""
+
+    def __init__(self, path: Path) -> None:
+        self._files = pictures_in(path)
+        if not self._files:
+            raise InputError(f"{path} holds no .png or .tif files; name the folder that the frames are in")
+        self.n_frames = len(self._files)
+        self.form = _common((f"{file}", _form_of(file)) for file in self._files)
+
+    def read(self, index: int) -> Image:
+        file = self._files[index]
+        try:
+            levels = cv2.imdecode(np.frombuffer(_content(file), np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            levels = None
+        if levels is None:
+            raise InputError(f"{file} is damaged: frame {index} cannot be read; copy it again")
+        if levels.shape != self.form[:2] or 8 * levels.itemsize != self.form.bits:
+            raise InputError(f"{file} has changed: it had {self.form} when the capture was opened")
+        return levels
+
+    def close(self) -> None:
+        """Do nothing: files are open while they are read."""
+
+
+class _Pages:
+    """A page of a TIFF file for each frame."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = Lock()
+        self._file = _tiff(path)
+        try:
+            self.n_frames = len(self._file.pages)
+            self.form = _common((f"page {k} of {path}", _form_of_page(path, page)) for k, page in enumerate(self._file.pages))
+        except _DAMAGED as error:
+            self.close()
+            raise InputError(f"{path} is damaged: {error}; copy it again") from error
+        except InputError:
+            self.close()
+            raise
+
+    def read(self, index: int) -> Image:
+        try:
+            with self._lock:
+                return np.asarray(self._file.pages[index].asarray())
+        except _DAMAGED as error:
+            raise InputError(f"page {index} of {self._path} cannot be read: {error}") from error
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
+    """Return the form that all have.
+
+    Raises:
+        InputError: they differ.
+    """
+    first: tuple[str, _Form] | None = None
+    for name, form in forms:
+        if first is None:
+            first = name, form
+        elif form != first[1]:
+            raise InputError(f"{name} has {form}, and {first[0]} has {first[1]}; frames are alike: remove what is none")
+    assert first is not None
+    return first[1]
+
+
+def _form_of(file: Path) -> _Form:
+    """Return the form of a picture from its header."""
+    if file.suffix.lower() != ".png":
+        with _tiff(file) as tiff:
+            try:
+                if len(tiff.pages) > 1:
+                    raise InputError(f"{file} has {len(tiff.pages)} pages; name the file itself if each is a frame")
+                return _form_of_page(file, tiff.pages[0])
+            except _DAMAGED as error:
+                raise InputError(f"{file} is damaged: {error}; copy it again") from error
+    header = _content(file, 26)
+    if len(header) < 26 or not header.startswith(_PNG):
+        raise InputError(f"{file} is not a PNG file, by its first bytes; remove it, or save it again")
+    width, height, bits, colours = struct.unpack(">IIBB", header[16:])
+    if colours:
+        raise InputError(f"{file} has {_PNG_COLOURS.get(colours, 'colours')}; convert the frames to grey")
+    return _grey(file, _Form(height, width, bits))
+
+
+def _form_of_page(file: Path, page: tifffile.TiffPage | tifffile.TiffFrame) -> _Form:
+    page = page.aspage()
+    if page.samplesperpixel != 1 or page.photometric != tifffile.PHOTOMETRIC.MINISBLACK:
+        raise InputError(f"{file} has colours, or white as 0; convert the frames to grey")
+    return _grey(file, _Form(page.imagelength, page.imagewidth, page.bitspersample))
+
+
+def _grey(file: Path, form: _Form) -> _Form:
+    if form.bits not in (8, 16):
+        raise InputError(f"{file} has {form}; convert the frames to 8 or 16 bits")
+    return form
+
+
+def _tiff(path: Path) -> tifffile.TiffFile:
+    try:
+        return tifffile.TiffFile(path)
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}; check the path") from error
+    except _DAMAGED as error:
+        raise InputError(f"{path} is neither a folder nor a TIFF file that can be read: {error}") from error
+
+
+def _content(file: Path, size: int = -1) -> bytes:
+    try:
+        with file.open("rb") as opened:
+            return opened.read(size)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror}") from error

@@ -1,0 +1,112 @@
+"""What the sources of grey levels take for their own, told by names and first bytes."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from photonpano import InputError, Recognised
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PICTURES = (".png", ".tif", ".tiff")
+_CONTAINERS = (
+    ("an AVI file", re.compile(rb"RIFF....AVI ", re.DOTALL)),
+    ("an MP4 or MOV file", re.compile(rb"....(ftyp|moov|mdat|wide|free)", re.DOTALL)),
+    ("a Matroska or WebM file", re.compile(rb"\x1a\x45\xdf\xa3")),
+)
+_TIFF = re.compile(rb"II[\x2a\x2b]\0|MM\0[\x2a\x2b]")
+_DIGITS = re.compile(r"(\d+)")
+
+
+def recognise_video(path: Path) -> Recognised | None:
+    """Take files that begin as videos do."""
+    start = _start_of(path)
+    for name, pattern in _CONTAINERS:
+        if pattern.match(start):
+            return Recognised({"path": path}, f"by its first bytes it is {name}")
+    return None
+
+
+def recognise_mraw(path: Path) -> Recognised | None:
+    """Take headers and frames of Photron cameras; those of an Infinicam as well, of which opening says what to do."""
+    suffix = path.suffix.lower()
+    if not is_file(path):
+        return None
+    if suffix == ".mdat":
+        return Recognised({"path": path}, "Photron's cameras write .mdat files")
+    if suffix == ".mraw" and (header := header_beside(path)):
+        return Recognised({"path": path}, f"{header.name} beside it is its header")
+    if suffix in (".cih", ".cihx") and (mraw := mraw_beside(path) or _beside(path, ".mdat")):
+        return Recognised({"path": path}, f"{mraw.name} beside it holds the frames")
+    return None
+
+
+def recognise_pictures(path: Path) -> Recognised | None:
+    """Take folders of pictures, and TIFF files."""
+    if _TIFF.match(_start_of(path)):
+        return Recognised({"path": path}, "by its first bytes it is a TIFF file")
+    found = pictures_in(path)
+    return Recognised({"path": path}, f"it holds {len(found)} {found[0].suffix} files") if found else None
+
+
+def refuse_mdat(path: Path) -> None:
+    """Say what to do with the raw files of an Infinicam.
+
+    Raises:
+        InputError: the path is one, or the header of one.
+    """
+    header_of = _beside(path, ".mdat") if path.suffix.lower() in (".cih", ".cihx") and not mraw_beside(path) else None
+    if path.suffix.lower() == ".mdat" or header_of is not None:
+        raise InputError(
+            f"{header_of or path} is compressed by the camera, and only Photron's own library for Windows decodes it; "
+            "export it as AVI or MP4 in the camera's viewer, and read that with the source video"
+        )
+
+
+def header_beside(mraw: Path) -> Path | None:
+    """Return the header of an .mraw file; None if there is none."""
+    return _beside(mraw, ".cihx") or _beside(mraw, ".cih")
+
+
+def mraw_beside(header: Path) -> Path | None:
+    """Return the .mraw file of a header; None if there is none."""
+    return _beside(header, ".mraw")
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Return the pictures of a folder in natural order; none if it is no folder that can be read."""
+    try:
+        pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURES]
+    except OSError:
+        return []
+    return sorted(pictures, key=lambda file: natural(file.name))
+
+
+def natural(name: str) -> list[int | str]:
+    """Return a key that sorts names with numbers as people do: 2 before 10."""
+    # Every other part is a number, so that numbers are compared with numbers.
+    return [int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(name))]
+
+
+def _beside(path: Path, suffix: str) -> Path | None:
+    candidates = (path.with_suffix(each) for each in (suffix, suffix.upper()))
+    return next((each for each in candidates if is_file(each)), None)
+
+
+def is_file(path: Path) -> bool:
+    """Tell whether there is such a file, as far as the system lets us see."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def _start_of(path: Path) -> bytes:
+    """Return the first bytes of a file; nothing of what cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError:
+        return b""

@@ -1,0 +1,106 @@
+"""What all sources of grey levels share: linear levels, sums, and reading in parts."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from photonpano import FrameSpan, InputError, StreamInfo
+from photonpano_sensors.intensity.levels import linear_levels
+from photonpano_sensors.intensity.summing import add_levels, add_linear
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from photonpano_sensors.intensity.configs import IntensityConfig
+    from photonpano_sensors.intensity.levels import Encoding
+    from photonpano_sensors.intensity.summing import Levels
+
+_PART_BYTES = 4 * 1024**2
+"""So much is held at a time while frames are summed."""
+_MOST_COUNT = 2**32 - 1
+
+
+class IntensitySource(ABC):
+    """Grey levels that are linear in flux: a `photonpano.Source`.
+
+    A pixel that saturates counts with the saturation level, so that its flux is the least that it was: a sum does not tell in
+    which of its frames a pixel saturated.
+    """
+
+    def __init__(
+        self, config: IntensityConfig, shape: tuple[int, int, int], frame_rate_hz: float | None, encoding: Encoding
+    ) -> None:
+        """Prepare to read.
+
+        Args:
+            config: what the spec says.
+            shape: frames, height and width of the capture.
+            frame_rate_hz: what the file says, used unless the spec says something else.
+            encoding: what the file says of its levels.
+
+        Raises:
+            InputError: the response of the spec does not suit the levels.
+        """
+        linear = linear_levels(config.response, encoding)
+        self.info = StreamInfo(*shape, config.frame_rate_hz or frame_rate_hz, "intensity", linear.bits)
+        self.response = linear.response
+        self.valid: NDArray[np.bool_] = np.ones(self.info.frame_shape, np.bool_)
+        self.valid.flags.writeable = False
+        self._table = linear.table
+        self._one_byte = encoding.bits <= 8
+
+    @abstractmethod
+    def _read(self, span: FrameSpan, levels: Levels) -> None:
+        """Fill an array (n, H, W) with the levels of a span that is known to be there, as the file has them.
+
+        Raises:
+            InputError: they cannot be read.
+        """
+
+    def frames(self, span: FrameSpan) -> Levels:
+        """Return the frames of a span, in linear levels: (n, H, W)."""
+        self.info.require(span)
+        levels = self._levels_of(span)
+        return levels if self._table is None else self._table[levels]
+
+    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
+        """Sum the frames of a span: (H, W) uint32.
+
+        Raises:
+            InputError: there are so many that the sum might not fit.
+        """
+        self.info.require(span)
+        most = _MOST_COUNT // (2**self.info.bit_depth - 1)
+        if len(span) > most:
+            raise InputError(f"{span} are too many to be summed at {self.info.bit_depth} bits; use groups of {most} at most")
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        step = max(1, _PART_BYTES // (counts.size * (1 if self._one_byte else 2)))
+        for start in range(span.start, span.stop, step):
+            levels = self._levels_of(FrameSpan(start, min(start + step, span.stop)))
+            flat = levels.reshape(len(levels), -1)
+            if self._table is None:
+                add_levels(flat, counts.reshape(-1))
+            else:
+                add_linear(flat, self._table, counts.reshape(-1))
+        return counts
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of files."""
+
+    def _levels_of(self, span: FrameSpan) -> Levels:
+        shape = len(span), *self.info.frame_shape
+        levels: Levels = np.empty(shape, np.uint8) if self._one_byte else np.empty(shape, np.uint16)
+        self._read(span, levels)
+        return levels
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

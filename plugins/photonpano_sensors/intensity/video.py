@@ -1,0 +1,38 @@
+"""Source `video`: grey frames of a video file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from photonpano_sensors.intensity.decoding import DecodedFrames
+from photonpano_sensors.intensity.source import IntensitySource
+from photonpano_sensors.intensity.video_index import index_of
+
+if TYPE_CHECKING:
+    from photonpano import FrameSpan, SourceContext
+    from photonpano_sensors.intensity.configs import VideoConfig
+    from photonpano_sensors.intensity.summing import Levels
+
+_KEPT_BYTES = 256 * 1024**2
+"""Decoded frames are kept up to this."""
+
+
+class VideoSource(IntensitySource):
+    """Frames of a video in the order in which they are shown. Of colours, the luma is taken.
+
+    Raises:
+        InputError: the file is missing, is not a video, or ends early.
+    """
+
+    def __init__(self, config: VideoConfig, context: SourceContext) -> None:
+        index = index_of(config.path)
+        super().__init__(config, (len(index.times), index.height, index.width), index.frame_rate_hz, index.encoding)
+        self.decoded = DecodedFrames(index, context.threads, _KEPT_BYTES)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self.decoded.close()
+
+    def _read(self, span: FrameSpan, levels: Levels) -> None:
+        for target, frame in zip(levels, range(span.start, span.stop), strict=True):
+            target[...] = self.decoded[frame]

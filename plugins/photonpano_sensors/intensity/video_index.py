@@ -1,0 +1,156 @@
+"""Which frames a video holds, told from its packets without decoding any."""
+
+from __future__ import annotations
+
+import re
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import av
+import numpy as np
+
+from photonpano import InputError
+from photonpano_sensors.intensity.levels import Encoding
+from photonpano_sensors.intensity.recognition import refuse_mdat
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from av.container import InputContainer
+    from av.video.format import VideoFormat
+    from numpy.typing import NDArray
+
+_LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")
+"""Formats of pixels whose first plane is the luma, as it stands."""
+_FULL_RANGE = re.compile(r"yuvj|gray")
+_JPEG_RANGE = 2
+"""What FFmpeg calls levels that are all used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VideoIndex:
+    """What the packets of a video tell.
+
+    Attributes:
+        path: the file.
+        times: (n,) when each frame is shown, in units of the stream, increasing.
+        keys: (k,) the frames from which decoding can start; the first is 0.
+        height: rows of a frame.
+        width: columns of a frame.
+        pixel_format: what frames are converted to, whose first plane is the luma.
+        encoding: what the levels of the luma mean.
+        frame_rate_hz: at which the video is played.
+    """
+
+    path: Path
+    times: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    height: int
+    width: int
+    pixel_format: str
+    encoding: Encoding
+    frame_rate_hz: float | None
+
+    def key_before(self, frame: int) -> int:
+        """Return the frame at which decoding has to start for a frame."""
+        return int(self.keys[np.searchsorted(self.keys, frame, side="right") - 1])
+
+
+def index_of(path: Path) -> VideoIndex:
+    """Read the packets of the first video stream of a file.
+
+    Raises:
+        InputError: the file is missing, is not a video, or ends early.
+    """
+    refuse_mdat(path)
+    with opened(path) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        try:
+            # An empty packet ends the stream; others are of frames that editing has cut away.
+            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
+        except av.FFmpegError as error:
+            raise InputError(f"{path} is damaged: {error.strerror}; export or copy it again") from error
+        times = np.array([packet.dts if packet.pts is None else packet.pts for packet in packets], dtype=np.float64)
+        if not len(times):
+            raise InputError(f"{path} has no frames; export or copy it again")
+        if np.isnan(times).any() or len(np.unique(times)) < len(times):
+            raise InputError(f"{path} does not tell when each frame is shown; export it again, as MP4 or AVI")
+        if len(times) < stream.frames:
+            raise InputError(
+                f"{path} is cut short: it promises {stream.frames} frames and holds {len(times)}; export or copy it again"
+            )
+        order = np.argsort(times)
+        keys = np.flatnonzero(np.array([packet.is_keyframe for packet in packets])[order])
+        if not len(keys) or keys[0]:
+            raise InputError(f"{path} does not begin with a frame that stands alone; export it again")
+        if context.format is None or not context.width * context.height:
+            raise InputError(f"{path}: the size of its frames cannot be told; export it again")
+        pixel_format = _pixel_format(context.format)
+        rate = stream.average_rate
+        return VideoIndex(
+            path,
+            times[order].astype(np.int64),
+            keys,
+            context.height,
+            context.width,
+            pixel_format,
+            _encoding(pixel_format, context.color_range == _JPEG_RANGE),
+            float(rate) if rate else None,
+        )
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[InputContainer]:
+    """Open a video for a while.
+
+    Raises:
+        InputError: see `open_video`.
+    """
+    container = open_video(path)
+    try:
+        yield container
+    finally:
+        container.close()
+
+
+def open_video(path: Path) -> InputContainer:
+    """Open a file that has a video stream.
+
+    Raises:
+        InputError: it is missing, or has none.
+    """
+    try:
+        container = av.open(str(path), metadata_errors="replace")
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}; check the path") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name the video in it, or read pictures with the source image-folder") from error
+    except (av.FFmpegError, OSError) as error:
+        raise InputError(
+            f"{path} is not a video that FFmpeg reads, or its end is missing ({error.strerror}); export or copy it again"
+        ) from error
+    if not container.streams.video:
+        container.close()
+        raise InputError(f"{path} holds no pictures; name a video")
+    return container
+
+
+def _pixel_format(stored: VideoFormat) -> str:
+    """Return the format that frames are converted to: their own where its first plane is the luma."""
+    if _LUMA_FIRST.fullmatch(stored.name):
+        return stored.name
+    if "yuv" in stored.name or "yvu" in stored.name or "uyv" in stored.name:
+        # Luma and colours take turns: set apart, the levels stay as they are.
+        return "yuv422p"
+    return "gray16le" if stored.components[0].bits > 8 else "gray"
+
+
+def _encoding(pixel_format: str, full_range: bool) -> Encoding:
+    depth = re.search(r"(?:p|gray)(\d+)le", pixel_format)
+    bits = int(depth[1]) if depth else 8
+    if full_range or _FULL_RANGE.match(pixel_format):
+        return Encoding.full(bits)
+    return Encoding(bits, 16.0 * 2 ** (bits - 8), 235.0 * 2 ** (bits - 8))

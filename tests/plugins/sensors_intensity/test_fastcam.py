@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from photonpano import InputError
+from photonpano_sensors.intensity.cih import read_header
+from photonpano_sensors.intensity.configs import FastcamMrawConfig
+from photonpano_sensors.intensity.levels import Encoding
+from photonpano_sensors.intensity.mraw import FastcamMrawSource
+
+REAL = Path(__file__).parents[2] / "data" / "photron"
+BEAM, CIH = (REAL / "beam.cihx").read_bytes(), (REAL / "sample_60k_16bit.cih").read_bytes()
+PIECES = [b"-1", b"1e999", b"\xb2", b"<cih>", b"&x;", b" : "]
+"""What headers are damaged with, beside bytes by chance."""
+
+
+@pytest.mark.parametrize("name", ["beam", "ball_12bit"])
+@pytest.mark.filterwarnings("ignore::UserWarning")  # pyMRAW warns of recordings that it was not made for
+def test_frames_are_those_that_pymraw_reads(name: str) -> None:
+    reader = pytest.importorskip("pyMRAW")
+    known, _ = reader.load_video(str(REAL / f"{name}.cihx"))
+    with FastcamMrawSource(FastcamMrawConfig(path=REAL / f"{name}.mraw")) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), known)
+        np.testing.assert_array_equal(source.counts(source.info.span), known.sum(axis=0, dtype=np.uint32))
+
+
+def test_headers_tell_what_the_camera_did() -> None:
+    header = read_header(REAL / "ball_12bit.cihx")
+    assert (header.n_frames, header.height, header.width, header.bits) == (3, 384, 384, 12)
+    assert (header.encoding, header.frame_rate_hz) == (Encoding.full(12), 30_000)
+    header = read_header(REAL / "sample_60k_16bit.cih")
+    assert (header.n_frames, header.height, header.width, header.bits) == (12, 368, 896, 16)
+    assert header.encoding == Encoding.full(12)
+    assert header.frame_rate_hz == 60_000 / 36  # one frame in 36 was saved
+
+
+def test_levels_in_the_higher_bits_are_known(tmp_path: Path) -> None:
+    (tmp_path / "a.cih").write_bytes(CIH.replace(b"EffectiveBit Side : Lower", b"EffectiveBit Side : Higher"))
+    assert read_header(tmp_path / "a.cih").encoding == Encoding(16, 0, 0xFFF0)
+
+
+def test_entities_are_not_expanded(tmp_path: Path) -> None:
+    """A document type is cut off, or makes the header a damaged one."""
+    entities = b'<!DOCTYPE a [<!ENTITY a "999"><!ENTITY b "&a;&a;"><!ENTITY c "&b;&b;">]>'
+    bomb = BEAM.replace(b"<cih>", entities + b"<cih>", 1).replace(b"<width>1024</width>", b"<width>&c;</width>")
+    (tmp_path / "a.cihx").write_bytes(bomb)
+    with pytest.raises(InputError, match="undefined entity"):
+        read_header(tmp_path / "a.cihx")
+
+
+@st.composite
+def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
+    """Draw a header of which parts were overwritten, cut out or repeated."""
+    content = bytearray(whole)
+    for _ in range(draw(st.integers(1, 4))):
+        start = draw(st.integers(0, len(content)))
+        stop = min(len(content), start + draw(st.integers(0, 40)))
+        content[start:stop] = draw(st.binary(max_size=20) | st.sampled_from(PIECES))
+    return bytes(content)
+
+
+@pytest.mark.parametrize(("suffix", "whole"), [(".cihx", BEAM), (".cih", CIH)])
+@settings(
+    max_examples=int(os.environ.get("FUZZ_EXAMPLES", "150")),
+    deadline=None,
+    derandomize="FUZZ_EXAMPLES" not in os.environ,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(data=st.data())
+def test_a_damaged_header_is_an_input_error_or_none(suffix: str, whole: bytes, data: st.DataObject) -> None:
+    texts = st.text(max_size=300).map(lambda text: f"<cih>{text}</cih>".encode())
+    content = data.draw(damaged(whole) | st.binary(max_size=300) | texts)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"a{suffix}"
+        path.write_bytes(content)
+        try:
+            header = read_header(path)
+        except InputError:
+            return
+    assert header.n_frames > 0
+    assert header.frame_bytes > 0
+    assert header.encoding.black < header.encoding.white < 2**header.encoding.bits
+    assert header.frame_rate_hz is None or header.frame_rate_hz > 0

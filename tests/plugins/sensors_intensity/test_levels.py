@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from photonpano import FrameSpan, InputError
+from photonpano.photometry import srgb_to_linear
+from photonpano_sensors.intensity.configs import FastcamMrawConfig, ResponseConfig
+from photonpano_sensors.intensity.levels import Encoding, linear_levels
+from photonpano_sensors.intensity.mraw import FastcamMrawSource
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from photonpano_sensors.intensity.levels import LinearLevels
+
+LIMITED = Encoding(8, 16.0, 235.0)
+
+
+def levels(encoding: Encoding = LIMITED, **keys: Any) -> LinearLevels:
+    return linear_levels(ResponseConfig(**keys), encoding)
+
+
+def flux_of_levels(linear: LinearLevels) -> np.ndarray:
+    """Return the flux of each level of the file."""
+    table = np.arange(256) if linear.table is None else linear.table
+    return linear.response.flux(table.astype(np.float32), 1)
+
+
+def test_linear_levels_stay_as_they_are() -> None:
+    linear = levels(saturation_photons=219.0, read_noise=3.0)
+    assert (linear.bits, linear.table) == (8, None)
+    np.testing.assert_allclose(flux_of_levels(linear)[[0, 16, 17, 235]], [-16, 0, 1, 219])
+    # Rounding to whole levels has the variance of 1/12.
+    assert linear.response.read_noise == pytest.approx(np.sqrt(9 + 1 / 12))
+
+
+@pytest.mark.parametrize(
+    ("curve", "light"), [("srgb", srgb_to_linear), (2.2, lambda encoded: encoded**2.2), (1.0, lambda encoded: encoded)]
+)
+def test_curves_are_undone(curve: Any, light: Any) -> None:
+    linear = levels(curve=curve, saturation_photons=1000.0)
+    flux = flux_of_levels(linear)
+    encoded = (np.arange(16, 236) - 16) / 219
+    assert linear.bits == 16
+    np.testing.assert_allclose(flux[16:236], 1000 * light(encoded), atol=0.02)
+    np.testing.assert_allclose(flux[:16], -flux[32:16:-1], atol=0.02)
+    assert (np.diff(flux) >= 0).all()
+
+
+def test_noise_around_black_averages_to_nothing() -> None:
+    """It would not if what lies below black were cut off."""
+    linear = levels(curve="srgb")
+    dark = np.clip(np.rint(16 + np.random.default_rng(0).normal(0, 4, 100_000)), 0, 255).astype(np.uint8)
+    assert linear.table is not None
+    mean = linear.table[dark].mean(dtype=np.float64)
+    assert abs(linear.response.flux(np.float32([mean]), 1)[0]) < 5 * 10_000 * (4 / 219 / 12.92) / np.sqrt(100_000)
+
+
+def test_a_measured_curve_is_scaled_to_black_and_white(tmp_path: Path) -> None:
+    file = tmp_path / "curve.txt"
+    np.savetxt(file, 7 + 3 * np.arange(256.0) ** 2)
+    flux = flux_of_levels(levels(Encoding.full(8), curve_file=file, saturation_photons=255.0**2, black_level=10))
+    np.testing.assert_allclose(flux[[10, 255]], [0, 255**2])
+    np.testing.assert_allclose(np.diff(flux), (2 * np.arange(255) + 1) * 255**2 / (255**2 - 100), atol=2.1)
+
+
+WRONG_CURVES = {
+    "abc": "FILE is not a text file of numbers, one for each level",
+    "1 2 3": "FILE holds 3 numbers; the levels of the capture are 256",
+    " ".join(["1"] * 255 + ["0"]): "FILE: the numbers must be finite, and none smaller than the one before",
+    " ".join(["nan"] * 256): "FILE: the numbers must be finite, and none smaller than the one before",
+    " ".join(["1"] * 256): "FILE: the curve does not rise from the black level to the white level",
+}
+
+
+@pytest.mark.parametrize(("content", "golden"), WRONG_CURVES.items(), ids=range(len(WRONG_CURVES)))
+def test_a_curve_that_is_none_is_refused(tmp_path: Path, content: str, golden: str) -> None:
+    file = tmp_path / "curve.txt"
+    file.write_text(content)
+    with pytest.raises(InputError) as raised:
+        levels(curve_file=file)
+    assert str(raised.value) == golden.replace("FILE", str(file))
+
+
+def test_a_curve_that_is_missing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^there is no file .*curve.txt; check the path$"):
+        levels(curve_file=tmp_path / "curve.txt")
+
+
+@pytest.mark.parametrize(("black", "white"), [(235, 235), (0, 256), (300, 310)])
+def test_black_and_white_have_to_suit_the_bits(black: float, white: float) -> None:
+    with pytest.raises(InputError, match="do not suit levels of 8 bits: black must be below white, and white at most 255"):
+        levels(black_level=black, white_level=white)
+
+
+def test_a_curve_is_named_once() -> None:
+    with pytest.raises(ValidationError, match="curve_file takes the place of the curve srgb; leave out one of them"):
+        ResponseConfig(curve="srgb", curve_file="curve.txt")
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb"])
+def test_saturated_pixels_tell_the_least_that_they_saw(tmp_path: Path, curve: Any) -> None:
+    (tmp_path / "a.cih").write_text(
+        "File Format : MRaw\nTotal Frame : 2\nImage Width : 2\nImage Height : 2\nColor Bit : 8\n"
+        "EffectiveBit Depth : 8\nEffectiveBit Side : Lower\n"
+    )
+    np.array([[[255, 0], [250, 240]], [[255, 0], [240, 240]]], np.uint8).tofile(tmp_path / "a.mraw")
+    response = ResponseConfig(white_level=240, saturation_photons=500, curve=curve)
+    with FastcamMrawSource(FastcamMrawConfig(path=tmp_path / "a.cih", response=response)) as source:
+        flux = source.response.flux((source.counts(FrameSpan(0, 2)) / 2).astype(np.float32), 2)
+    np.testing.assert_allclose(flux, [[500, 0], [500, 500]], rtol=1e-5)

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError, SourceContext
+from photonpano_sensors.intensity.configs import ResponseConfig, VideoConfig
+
+pytest.importorskip("av")
+
+from photonpano_sensors.intensity.decoding import DecodedFrames
+from photonpano_sensors.intensity.video import VideoSource
+from photonpano_sensors.intensity.video_index import index_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+def opened(path: Path, threads: int = 1, **keys: Any) -> VideoSource:
+    return VideoSource(VideoConfig(path=path, **keys), SourceContext(threads=threads))
+
+
+FORMATS = {
+    "H.264 with frames that need later ones": ("a.mp4", "libx264", "yuvj420p", {"g": 12, "bf": 3, "crf": 1}),
+    "H.264 in two-frame groups": ("a.mp4", "libx264", "yuvj420p", {"g": 2, "bf": 1, "crf": 1}),
+    "H.265 with open groups": (
+        "a.mp4",
+        "libx265",
+        "yuvj420p",
+        {"x265-params": "crf=1:keyint=10:open-gop=1:log-level=none"},
+    ),
+    "MPEG-4 in AVI": ("a.avi", "mpeg4", "yuv420p", {"g": 12, "qscale": 1}),
+    "MJPEG in AVI": ("a.avi", "mjpeg", "yuvj420p", {"qmin": 1, "qmax": 1}),
+    "H.264 in Matroska": ("a.mkv", "libx264", "yuvj420p", {"g": 12, "bf": 3, "crf": 1}),
+}
+
+
+@pytest.mark.parametrize(("name", "codec", "pixels", "options"), FORMATS.values(), ids=FORMATS)
+def test_any_frame_is_found_in_any_order(
+    moving: Callable, write_video: Callable, name: str, codec: str, pixels: str, options: dict[str, Any]
+) -> None:
+    """Each frame is nearer to the one that was written than its neighbours are."""
+    written = moving()
+    index = index_of(write_video(written, name, codec, pixels, **options))
+    assert len(index.times) == len(written)
+    decoded = DecodedFrames(index, threads=1, capacity_bytes=0)
+    for frame in (39, 0, 17, 18, 5, 38, 23, 11, 12):
+        differences = np.abs(written - decoded[frame].astype(int)).mean(axis=(1, 2))
+        assert differences.argmin() == frame
+        assert differences[frame] < 6
+    decoded.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels", "black", "white"),
+    [
+        ("a.mkv", "ffv1", "gray", 0, 255),
+        ("a.mkv", "ffv1", "yuv420p", 16, 235),
+        ("a.mkv", "ffv1", "yuv420p10le", 64, 940),
+        ("a.avi", "mjpeg", "yuvj420p", 0, 255),
+        ("a.avi", "rawvideo", "yuyv422", 16, 235),
+        ("a.avi", "rawvideo", "bgr24", 0, 255),
+    ],
+)
+def test_range_and_bits_are_those_of_the_file(
+    moving: Callable, write_video: Callable, name: str, codec: str, pixels: str, black: float, white: float
+) -> None:
+    bits = 10 if "10" in pixels else 8
+    frames = moving(3).astype(np.uint16 if bits == 10 else np.uint8) * 2 ** (bits - 8)
+    if pixels in ("yuyv422", "bgr24"):
+        frames = np.stack([frames] * (2 if pixels == "yuyv422" else 3), axis=-1)
+    path = write_video(frames, name, codec, pixels)
+    with opened(path) as source:
+        assert source.info.bit_depth == bits
+        assert (source.response.black_level, source.response.saturation_level) == (black, white)
+        if codec != "mjpeg":
+            grey = frames[..., 0] if frames.ndim == 4 else frames
+            np.testing.assert_array_equal(source.frames(source.info.span), grey)
+    with opened(path, response=ResponseConfig(black_level=2, white_level=200)) as source:
+        assert (source.response.black_level, source.response.saturation_level) == (2, 200)
+
+
+def test_the_rate_of_the_spec_comes_before_that_of_playback(moving: Callable, write_video: Callable) -> None:
+    path = write_video(moving(3), "a.avi", "mjpeg", "yuvj420p")
+    assert opened(path).info.frame_rate_hz == 30
+    assert opened(path, frame_rate_hz=500).info.frame_rate_hz == 500
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_overlapping_groups_are_decoded_about_once(moving: Callable, write_video: Callable, threads: int) -> None:
+    """Groups of 20 frames, each beginning at the middle of the one before, merged side by side."""
+    path = write_video(moving(200), "a.mp4", "libx264", "yuvj420p", g=50)
+    index = index_of(path)
+    decoded = DecodedFrames(index, threads, 60 * index.height * index.width)
+
+    def merge(start: int) -> None:
+        for frame in range(start, start + 20):
+            decoded[frame]
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(merge, range(0, 190, 10)))
+    decoded.close()
+    # A thread that falls behind finds what it needs forgotten; each of two groups decoded by itself would be 380 and more.
+    assert 200 <= decoded.n_decoded <= (200 if threads == 1 else 360)
+
+
+def test_no_more_is_kept_than_allowed(moving: Callable, write_video: Callable) -> None:
+    index = index_of(write_video(moving(), "a.avi", "mjpeg", "yuvj420p"))
+    decoded = DecodedFrames(index, 1, 5 * index.height * index.width)
+    for frame in range(40):
+        decoded[frame]
+    for frame in range(35, 40):
+        decoded[frame]
+    assert decoded.n_decoded == 40
+    decoded[34]
+    assert decoded.n_decoded == 41
+    decoded.close()
+
+
+def test_what_ends_in_the_middle_of_a_frame_is_told_at_the_frame(moving: Callable, write_video: Callable) -> None:
+    """A file whose packets are all there, and damaged."""
+    path = write_video(moving(), "a.mp4", "libx264", "yuvj420p", g=12)
+    content = bytearray(path.read_bytes())
+    index = index_of(path)
+    data = content.find(b"mdat") + 4
+    length = int.from_bytes(content[data - 8 : data - 4], "big")
+    content[data + length // 2 : data + length - 8] = bytes(length - 8 - length // 2)
+    path.write_bytes(content)
+    with opened(path) as source:
+        assert source.info.n_frames == len(index.times)
+        with pytest.raises(InputError, match=rf"^frame \d+ of {path} is damaged or missing; export or copy it again$"):
+            source.counts(source.info.span)
+        assert source.counts(FrameSpan(0, 1)).any()
