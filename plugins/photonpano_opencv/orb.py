@@ -32,7 +32,7 @@ class OrbLocator(KeypointMatcher):
     def describe(self, exposure: VirtualExposure) -> Keypoints:
         """Detect keypoints on the variance-stabilised image, where it was seen."""
         config = self._orb
-        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        blur_px = blur_against_noise(exposure, config.blur_px)
         # A detector for each call: OpenCV does not promise that one may be shared by threads.
         orb = cv2.ORB.create(
             config.max_keypoints, config.pyramid_scale, config.pyramid_levels, fastThreshold=config.fast_threshold

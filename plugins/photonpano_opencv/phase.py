@@ -10,7 +10,7 @@ from scipy import fft
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, normalised, translation
-from photonpano.locating import ImageLimits, blur_against_noise, motion_from_images, view_of
+from photonpano.locating import blur_against_noise, motion_from_images, view_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,8 +38,7 @@ class PhaseCorrelationLocator:
 
     def describe(self, exposure: VirtualExposure) -> View:
         """Return the exposure on the scale on which photon noise is uniform."""
-        blur_px = self._config.blur_px
-        return view_of(exposure, blur_against_noise(exposure) if blur_px == "auto" else blur_px)
+        return view_of(exposure, blur_against_noise(exposure, self._config.blur_px))
 
     def register(self, moving: View, fixed: View, initial: NDArray[np.float64] | None) -> Located | NotLocated:
         """Shift; see `photonpano.Locator`.
@@ -57,8 +56,7 @@ class PhaseCorrelationLocator:
             homography = normalised(homography @ translation(*shift))
             if max(abs(shift)) < config.converged_px:
                 break
-        limits = ImageLimits(config.min_overlap, config.min_agreement, config.max_std_px)
-        return motion_from_images(moving, fixed, homography, limits, free=TRANSLATION)
+        return motion_from_images(moving, fixed, homography, config, free=TRANSLATION)
 
 
 def _shift_of(motion: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano.locating.configs import ImageLimits
     from photonpano.locating.viewing import View
     from photonpano.values import FloatArray, Homography
 
@@ -33,21 +33,6 @@ _UNKNOWN = 1e-3
 _PRIOR_STD = 0.03
 """How much a parameter that a backend leaves alone may be off, in coordinates of unit size: two exposures roll against each
 other by a degree or two at most, and differ as little in scale, shear and perspective."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImageLimits:
-    """What an alignment of two images must fulfil to be believed.
-
-    Attributes:
-        min_overlap: the least share of the image that both exposures must see.
-        min_agreement: the least correlation after alignment, with photon noise taken out.
-        max_std_px: an alignment that leaves the corners of the frame more uncertain than this, on average, is not believed.
-    """
-
-    min_overlap: float = 0.1
-    min_agreement: float = 0.5
-    max_std_px: float = 15.0
 
 
 def motion_from_images(
