@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
-from photonpano.photometry import noise_free_correlation
+from photonpano.photometry import Likeness, autocorrelation, likeness_of
 from photonpano.values import Located, NotLocated
 
 if TYPE_CHECKING:
@@ -78,14 +78,10 @@ def motion_from_images(
             f"less than min_overlap = {limits.min_overlap:.0%}",
             found,
         )
-    found["agreement"] = _agreement(moving, there)
-    if found["agreement"] < limits.min_agreement:
-        return NotLocated(
-            f"after alignment the images agree by {found['agreement']:.2f}, less than min_agreement = {limits.min_agreement:g}"
-            if found["agreement"]
-            else "where the images overlap after alignment, nothing stands out from photon noise",
-            found,
-        )
+    alike = _likeness(moving, there)
+    found |= alike.evidence
+    if reason := alike.objection(limits.min_agreement):
+        return NotLocated(reason, found)
     weight = np.asarray(1 / (1 / moving.weight[both] + 1 / there.weight[both]), np.float32)
     squares = weight * np.square(moving.image[both] - there.image[both])
     found["noise_ratio"] = float(squares.mean(dtype=np.float64)) / moving.noise_left
@@ -108,22 +104,28 @@ def motion_from_images(
     return Located(homography, to_step.T @ information @ to_step, std_px, found)
 
 
-def _agreement(moving: View, there: View) -> float:
-    """Return the correlation that two images on one grid would have without photon noise, in large px."""
+def _likeness(moving: View, there: View) -> Likeness:
+    """Return how alike two images on one grid are, in large px."""
     while moving.pixel < _JUDGED_PIXEL and min(moving.shape) >= 2 * _SMALLEST_SIDE:
         moving, there = moving.halved(), there.halved()
     both = moving.seen & there.seen
-    pixels = np.count_nonzero(both)
+    pixels = int(np.count_nonzero(both))
     if not pixels:
-        return 0.0
+        return Likeness(0.0, 0.0, 0.0)
     # Shadows and slopes that fill the image look alike wherever one looks.
     mask = both.astype(np.float32)
     norm = np.maximum(_surroundings(mask), np.float32(1e-6))
-    here, beyond = (
-        np.asarray((view.image - _surroundings(view.image * mask) / norm)[both], np.float32) for view in (moving, there)
+    details = [
+        np.asarray((view.image - _surroundings(view.image * mask) / norm) * mask, np.float32) for view in (moving, there)
+    ]
+    noise = [view.noise_left * float(np.mean(1 / view.weight[both])) for view in (moving, there)]
+    return likeness_of(
+        np.cov(details[0][both], details[1][both]),
+        (noise[0], noise[1]),
+        pixels,
+        pixels * min(1.0, moving.noise_left),
+        (autocorrelation(details[0]), autocorrelation(details[1])),
     )
-    here_noise, there_noise = (view.noise_left * float(np.mean(1 / view.weight[both])) for view in (moving, there))
-    return noise_free_correlation(here, beyond, (here_noise, there_noise), pixels * min(1.0, moving.noise_left))
 
 
 def _surroundings(image: NDArray[np.float32]) -> NDArray[np.float32]:

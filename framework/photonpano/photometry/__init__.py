@@ -1,14 +1,16 @@
 """The detection model, flux estimation, tone curves and packed-bit sums."""
 
 from photonpano.photometry.contrast import signal_to_noise
-from photonpano.photometry.likeness import correlation_without_noise, noise_free_correlation
+from photonpano.photometry.likeness import Likeness, autocorrelation, likeness_of, noise_free_correlation
 from photonpano.photometry.packed import packed_counts
 from photonpano.photometry.responses import BinaryResponse
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
-    "correlation_without_noise",
+    "Likeness",
+    "autocorrelation",
+    "likeness_of",
     "linear_to_srgb",
     "noise_free_correlation",
     "packed_counts",
