@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, implausibility, normalised
-from photonpano.locating import MIN_NOISE_PX, least_agreeing, motion_from_points
+from photonpano.locating import least_agreeing, motion_from_points
 from photonpano_opencv.matching import match_everywhere, match_nearby
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class KeypointMatcher:
         seed: int,
         as_unit_vectors: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
         ratio: float,
-        noise_px: float = MIN_NOISE_PX,
+        rounding_px: float = 0.0,
     ) -> None:
         """Prepare to match.
 
@@ -98,13 +98,13 @@ class KeypointMatcher:
             seed: of the consensus.
             as_unit_vectors: makes of descriptors what is compared by scalar products.
             ratio: of the distances of those vectors to the best and to the second best match.
-            noise_px: standard deviation to which a match is known at best.
+            rounding_px: standard deviation of what all matches may err alike.
         """
         self._config = config
         self._seed = seed
         self._as_unit_vectors = as_unit_vectors
         self._ratio = ratio
-        self._noise_px = noise_px
+        self._rounding_px = rounding_px
 
     def register(self, moving: Keypoints, fixed: Keypoints, initial: NDArray[np.float64] | None) -> Located | NotLocated:
         """Match and fit; see `photonpano.Locator`.
@@ -158,7 +158,7 @@ class KeypointMatcher:
                 sizes=sizes,
                 evidence=evidence,
                 rounds=1,
-                min_noise_px=self._noise_px,
+                rounding_px=self._rounding_px,
             )
             if isinstance(motion, NotLocated):
                 break

@@ -42,6 +42,7 @@ def motion_from_images(
     limits: ImageLimits,
     *,
     free: Sequence[int] = ALL,
+    efficiency: float = 1.0,
     evidence: Mapping[str, float] | None = None,
 ) -> Located | NotLocated:
     """Judge the homography with which a backend aligned two images, and say how well it is known. Raises nothing.
@@ -59,6 +60,7 @@ def motion_from_images(
         homography: (3, 3) what the backend found.
         limits: what it takes to be believed.
         free: which of p1..p8 the backend estimated; the others are as likely to be off as cameras make them.
+        efficiency: which share of the information of the photons the backend uses; least squares uses all of it.
         evidence: what the backend counted, for the record.
 
     Returns:
@@ -88,7 +90,7 @@ def motion_from_images(
     curvature = _common_curvature(_derivatives(moving, both), _derivatives(there, both), weight)
     if curvature is None:
         return NotLocated("where the images overlap after alignment, there is no texture", found)
-    known, used = curvature / max(1.0, found["noise_ratio"]), list(free)
+    known, used = curvature * efficiency / max(1.0, found["noise_ratio"]), list(free)
     # A backend that leaves parameters alone finds the others wrong by what these do to the image.
     rows = known[used]
     information = rows.T @ np.linalg.solve(known[np.ix_(used, used)], rows)
