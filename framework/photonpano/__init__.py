@@ -5,8 +5,9 @@ The names here are public: plugins and notebooks import them from `photonpano` a
 Each is imported when it is first used, so that the help of the command line needs no numpy.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from photonpano.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from photonpano.api import RunResult, evaluate, open_source, run
@@ -109,15 +110,7 @@ __all__ = [
     "run",
 ]
 
-_MODULES = ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "spec")
-"""Where the public names are defined."""
-
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
-
-    def __getattr__(name: str) -> object:
-        if name in __all__:
-            for home in _MODULES:
-                module = import_module(f"photonpano.{home}")
-                if hasattr(module, name):
-                    return getattr(module, name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    __getattr__ = imported_on_use(
+        __name__, __all__, ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "spec")
+    )

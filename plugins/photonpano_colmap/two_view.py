@@ -10,7 +10,7 @@ import pycolmap
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import normalised
-from photonpano.locating import PointLimits, blur_against_noise, motion_from_points, stabilised_8_bit
+from photonpano.locating import blur_against_noise, motion_from_points, stabilised_8_bit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,7 +62,7 @@ class TwoViewLocator:
     def describe(self, exposure: VirtualExposure) -> Features:
         """Detect keypoints on the variance-stabilised image, and keep the largest where it was seen."""
         config = self._config
-        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        blur_px = blur_against_noise(exposure, config.blur_px)
         image, mask = stabilised_8_bit(exposure, blur_px)
         options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = config.max_keypoints
@@ -132,19 +132,18 @@ class TwoViewLocator:
     def _motion(self, moving: Features, fixed: Features, pairs: NDArray[np.intp]) -> Located | NotLocated:
         """Find the homography that most pairs agree on, and fit it to these."""
         config = self._config
-        limits = PointLimits(config.min_inliers, config.threshold_px, config.max_std_px)
         counts = {"keypoints_moving": len(moving.points), "keypoints_fixed": len(fixed.points), "matches": len(pairs)}
         evidence = {name: float(count) for name, count in counts.items()}
-        if len(pairs) < limits.min_inliers:
+        if len(pairs) < config.min_inliers:
             return NotLocated(
-                f"{len(pairs)} matches, fewer than min_inliers = {limits.min_inliers} "
+                f"{len(pairs)} matches, fewer than min_inliers = {config.min_inliers} "
                 f"({len(moving.points)} and {len(fixed.points)} keypoints)",
                 evidence,
             )
         here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
-        options = pycolmap.RANSACOptions(max_error=limits.threshold_px, max_num_trials=MAX_TRIALS, random_seed=self._seed)
+        options = pycolmap.RANSACOptions(max_error=config.threshold_px, max_num_trials=MAX_TRIALS, random_seed=self._seed)
         consensus = pycolmap.estimate_homography_matrix(here, there, options)
         if consensus is None or not consensus["H"][2, 2]:
             return NotLocated(f"no motion explains any of {len(pairs)} matches", evidence)
         start, sizes = normalised(consensus["H"]), moving.sizes[pairs[:, 0]]
-        return motion_from_points(here, there, start, moving.shape, limits, sizes=sizes, evidence=evidence)
+        return motion_from_points(here, there, start, moving.shape, config, sizes=sizes, evidence=evidence)

@@ -11,7 +11,7 @@ from kornia.geometry import RANSAC
 
 from photonpano import NotLocated
 from photonpano.geometry import apply, normalised
-from photonpano.locating import PointLimits, least_agreeing, motion_from_points
+from photonpano.locating import least_agreeing, motion_from_points
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano import Located
-    from photonpano_kornia.configs import MatchConfig
+    from photonpano.locating import MatchingConfig
 
 _CONFIDENCE = 0.999
 """RANSAC stops when it has found the best motion with this probability."""
@@ -43,7 +43,7 @@ class Matches:
 
 
 def motion_of(
-    tries: Iterable[Matches], shape: tuple[int, int], config: MatchConfig, seed: int, evidence: Mapping[str, float]
+    tries: Iterable[Matches], shape: tuple[int, int], config: MatchingConfig, seed: int, evidence: Mapping[str, float]
 ) -> Located | NotLocated:
     """Return the motion of the first matches that agree on one beyond chance; if none do, why the last ones do not.
 
@@ -66,8 +66,7 @@ def motion_of(
         if homography is None or agreeing <= least:
             reason = f"{agreeing} of {count} matches agree on a motion, which may be chance (more than {least:.0f} must)"
             continue
-        limits = PointLimits(config.min_inliers, config.threshold_px, config.max_std_px)
-        return motion_from_points(matches.moving, matches.fixed, homography, shape, limits, sizes=matches.sizes, evidence=found)
+        return motion_from_points(matches.moving, matches.fixed, homography, shape, config, sizes=matches.sizes, evidence=found)
     return NotLocated(reason, found)
 
 

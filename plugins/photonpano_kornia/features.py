@@ -63,7 +63,7 @@ class FeatureLocator:
     def describe(self, exposure: VirtualExposure) -> SiftFeatures:
         """Detect keypoints on the variance-stabilised image, where it was seen."""
         config = self._config
-        image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px)
+        image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure, config.blur_px))
         if not mask.any():
             return SiftFeatures(np.zeros((0, 2, 3), np.float32), np.zeros((0, 128), np.float16), mask.shape)
         with one_thread(), torch.inference_mode():

@@ -54,8 +54,7 @@ class LoftrLocator:
 
     def describe(self, exposure: VirtualExposure) -> Picture:
         """Return the exposure on the scale on which photon noise is uniform, in 8 bits."""
-        blur_px = self._config.blur_px
-        image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure) if blur_px == "auto" else blur_px)
+        image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure, self._config.blur_px))
         seen = mask > 0
         if seen.any():
             image[~seen] = np.uint8(image[seen].mean())

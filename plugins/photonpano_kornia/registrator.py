@@ -26,7 +26,7 @@ from photonpano.geometry import (
     rescaled,
     translation,
 )
-from photonpano.locating import ImageLimits, blur_against_noise, motion_from_images, view_of
+from photonpano.locating import blur_against_noise, motion_from_images, view_pyramid
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 
 if TYPE_CHECKING:
@@ -71,11 +71,8 @@ class RegistratorLocator:
 
     def describe(self, exposure: VirtualExposure) -> tuple[View, ...]:
         """Return the pyramid of the exposure on the scale on which photon noise is uniform, finest first."""
-        blur_px = self._config.blur_px
-        views = [view_of(exposure, blur_against_noise(exposure) if blur_px == "auto" else blur_px)]
-        while len(views) < self._config.pyramid_levels and min(views[-1].shape) >= 2 * _SMALLEST_SIDE:
-            views.append(views[-1].halved())
-        return tuple(views)
+        blur_px = blur_against_noise(exposure, self._config.blur_px)
+        return view_pyramid(exposure, blur_px, self._config.pyramid_levels, _SMALLEST_SIDE)
 
     def register(
         self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: NDArray[np.float64] | None
@@ -103,9 +100,7 @@ class RegistratorLocator:
                 homography, lost = rescaled(found, pixel), ""
         if lost:
             return NotLocated(lost)
-        config = self._config
-        limits = ImageLimits(config.min_overlap, config.min_agreement, config.max_std_px)
-        return motion_from_images(moving[0], fixed[0], homography, limits, evidence={"evaluations": float(evaluations)})
+        return motion_from_images(moving[0], fixed[0], homography, self._config, evidence={"evaluations": float(evaluations)})
 
 
 class _Descent:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano import VirtualExposure
+    from photonpano.photometry import Likeness
     from photonpano_opencv.configs import DirectConfig
     from photonpano_opencv.pyramid import Layer, Pyramid
     from photonpano_opencv.template import Quality
@@ -82,24 +83,20 @@ class DirectLocator:
         return self._judged(homography, quality, scale, alike, contrast)
 
     def _judged(
-        self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: float, contrast: float
+        self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: Likeness, contrast: float
     ) -> Located | NotLocated:
         """Say what is to be said of an alignment, whose quality and contrast are those of a layer of this scale."""
         config, std_px = self._config, quality.std_px / scale
         max_noise_ratio = max(config.max_noise_ratio, _BLURRED_APART * contrast)
         evidence = {
-            "agreement": alike,
+            **alike.evidence,
             "noise_ratio": quality.noise_ratio,
             "overlap": quality.overlap,
             "pixel": 1 / scale,
         }
-        if alike < config.min_agreement:
-            reason = (
-                f"after alignment the images agree by {alike:.2f}, less than min_agreement = {config.min_agreement:g}"
-                if alike
-                else "where the images overlap after alignment, nothing stands out from photon noise"
-            )
-        elif quality.noise_ratio > max_noise_ratio:
+        if reason := alike.objection(config.min_agreement):
+            return NotLocated(reason, evidence)
+        if quality.noise_ratio > max_noise_ratio:
             reason = f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, " + (
                 f"more than max_noise_ratio = {config.max_noise_ratio:g}"
                 if max_noise_ratio == config.max_noise_ratio

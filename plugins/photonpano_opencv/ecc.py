@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import implausibility, normalised, rescaled, translation
-from photonpano.locating import ImageLimits, blur_against_noise, motion_from_images, view_of
+from photonpano.locating import blur_against_noise, motion_from_images, view_pyramid
 from photonpano_opencv.phase import NOTHING_TO_HOLD, shift_between
 
 if TYPE_CHECKING:
@@ -34,11 +34,8 @@ class EccLocator:
 
     def describe(self, exposure: VirtualExposure) -> tuple[View, ...]:
         """Return the pyramid of the exposure on the scale on which photon noise is uniform, finest first."""
-        blur_px = self._config.blur_px
-        views = [view_of(exposure, blur_against_noise(exposure) if blur_px == "auto" else blur_px)]
-        while len(views) < self._config.pyramid_levels and min(views[-1].shape) >= 2 * _SMALLEST_SIDE:
-            views.append(views[-1].halved())
-        return tuple(views)
+        blur_px = blur_against_noise(exposure, self._config.blur_px)
+        return view_pyramid(exposure, blur_px, self._config.pyramid_levels, _SMALLEST_SIDE)
 
     def register(
         self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: NDArray[np.float64] | None
@@ -66,8 +63,7 @@ class EccLocator:
             homography, aligned = rescaled(found, here.pixel), aligned + 1
         if not aligned:
             return NotLocated(lost)
-        limits = ImageLimits(config.min_overlap, config.min_agreement, config.max_std_px)
-        return motion_from_images(moving[0], fixed[0], homography, limits, evidence={"aligned_levels": float(aligned)})
+        return motion_from_images(moving[0], fixed[0], homography, config, evidence={"aligned_levels": float(aligned)})
 
     def _climbed(self, moving: View, fixed: View, start: NDArray[np.float64]) -> NDArray[np.float64] | str:
         """Return the homography under which two images correlate most, from a start nearby, or why there is none."""

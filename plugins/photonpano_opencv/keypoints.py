@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, implausibility, normalised
-from photonpano.locating import MIN_NOISE_PX, PointLimits, least_agreeing, motion_from_points
+from photonpano.locating import least_agreeing, motion_from_points
 from photonpano_opencv.matching import match_everywhere, match_nearby
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from photonpano_opencv.configs import KeypointConfig
+    from photonpano.locating import KeypointConfig
 
 GUIDED_RADII = (1.5, 1.0)
 """Once a motion is fitted, more matches are looked for near where it puts them; radii in units of `threshold_px`."""
@@ -89,7 +89,7 @@ class KeypointMatcher:
         seed: int,
         as_unit_vectors: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
         ratio: float,
-        noise_px: float = MIN_NOISE_PX,
+        rounding_px: float = 0.0,
     ) -> None:
         """Prepare to match.
 
@@ -98,13 +98,13 @@ class KeypointMatcher:
             seed: of the consensus.
             as_unit_vectors: makes of descriptors what is compared by scalar products.
             ratio: of the distances of those vectors to the best and to the second best match.
-            noise_px: standard deviation to which a match is known at best.
+            rounding_px: standard deviation of what all matches may err alike.
         """
         self._config = config
         self._seed = seed
         self._as_unit_vectors = as_unit_vectors
         self._ratio = ratio
-        self._noise_px = noise_px
+        self._rounding_px = rounding_px
 
     def register(self, moving: Keypoints, fixed: Keypoints, initial: NDArray[np.float64] | None) -> Located | NotLocated:
         """Match and fit; see `photonpano.Locator`.
@@ -144,12 +144,22 @@ class KeypointMatcher:
             return NotLocated(f"{reason}, from {len(pairs)} matches", evidence)
         motion: Located | NotLocated
         for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
-            limits = PointLimits(config.min_inliers, radius * config.threshold_px, max_std_px, self._noise_px)
+            limits = config.model_copy(update={"threshold_px": radius * config.threshold_px, "max_std_px": max_std_px})
             predicted = apply(homography, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, GUIDED_RATIO)
             here, there, sizes = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]]
             # Matches that were looked for within the threshold are inliers, all of them.
-            motion = motion_from_points(here, there, homography, moving.shape, limits, sizes=sizes, evidence=evidence, rounds=1)
+            motion = motion_from_points(
+                here,
+                there,
+                homography,
+                moving.shape,
+                limits,
+                sizes=sizes,
+                evidence=evidence,
+                rounds=1,
+                rounding_px=self._rounding_px,
+            )
             if isinstance(motion, NotLocated):
                 break
             homography = motion.homography

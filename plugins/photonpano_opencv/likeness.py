@@ -9,11 +9,12 @@ import numpy as np
 
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, sample, seen_part
-from photonpano.photometry import correlation_without_noise
+from photonpano.photometry import Likeness, autocorrelation, likeness_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano.values import FloatArray
     from photonpano_opencv.pyramid import Layer
 
 _SURROUNDINGS_PX = 13
@@ -27,11 +28,13 @@ class Details(NamedTuple):
         image: (H, W) float32, the layer minus the mean of the surroundings; 0 where nothing was seen.
         weight: (H, W) float32, that of the layer.
         gain: what the blur leaves of the variance of white noise.
+        autocorrelation: that of the image.
     """
 
     image: NDArray[np.float32]
     weight: NDArray[np.float32]
     gain: float
+    autocorrelation: FloatArray
 
     @property
     def contrast(self) -> float:
@@ -45,13 +48,11 @@ def details_of(layer: Layer) -> Details:
     mask = (layer.weight > 0).astype(np.float32)
     norm = np.maximum(_surroundings(mask), np.float32(1e-6))
     image = np.asarray((layer.image - _surroundings(layer.image * mask) / norm) * mask, dtype=np.float32)
-    return Details(image, layer.weight, 1 / (4 * np.pi * layer.blur_px**2))
+    return Details(image, layer.weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image))
 
 
-def agreement(moving: Details, fixed: Details, homography: NDArray[np.float64]) -> float:
-    """Return the correlation that two images would have without photon noise: 1 where they show the same.
-
-    Around 0 for different places, and 0 where the scene does not stand out from the noise, so that any two places look alike.
+def agreement(moving: Details, fixed: Details, homography: NDArray[np.float64]) -> Likeness:
+    """Return how alike two images are under a motion.
 
     Args:
         moving: one image.
@@ -62,11 +63,12 @@ def agreement(moving: Details, fixed: Details, homography: NDArray[np.float64]) 
     _sum_up(moving, fixed, homography, sums)
     pixels, first, second, squares, products, others, weight, other_weight = sums
     if not pixels:
-        return 0.0
+        return Likeness(0.0, 0.0, 0.0)
     covariance = np.array([[squares, products], [products, others]]) - np.outer([first, second], [first, second]) / pixels
     # Interpolation leaves 4/9 of the variance of white noise, on average over where between pixels it looks.
     noise = moving.gain * pixels / weight, 4 / 9 * fixed.gain * pixels / other_weight
-    return correlation_without_noise(covariance / max(1.0, pixels - 1), noise, pixels * min(1.0, moving.gain))
+    autocorrelations = moving.autocorrelation, fixed.autocorrelation
+    return likeness_of(covariance / max(1.0, pixels - 1), noise, pixels, pixels * min(1.0, moving.gain), autocorrelations)
 
 
 @compiled

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from photonpano import VirtualExposure
     from photonpano_opencv.configs import OpencvOrbConfig
 
-_NOISE_PX = math.sqrt(2 / 12)
-"""Corners are found to whole pixels: the difference of two is not known better, even where all of them round alike."""
+_ROUNDING_PX = math.sqrt(1 / 12)
+"""Corners are found to whole pixels, and where a camera shifts, all of them are rounded alike: that is an error of up to half a
+pixel, which no number of matches lowers."""
 
 
 class OrbLocator(KeypointMatcher):
@@ -26,13 +27,13 @@ class OrbLocator(KeypointMatcher):
 
     def __init__(self, config: OpencvOrbConfig, seed: int) -> None:
         # Hamming's distance is the square of that of vectors.
-        super().__init__(config, seed, unit_bits, math.sqrt(config.ratio), _NOISE_PX)
+        super().__init__(config, seed, unit_bits, math.sqrt(config.ratio), _ROUNDING_PX)
         self._orb = config
 
     def describe(self, exposure: VirtualExposure) -> Keypoints:
         """Detect keypoints on the variance-stabilised image, where it was seen."""
         config = self._orb
-        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        blur_px = blur_against_noise(exposure, config.blur_px)
         # A detector for each call: OpenCV does not promise that one may be shared by threads.
         orb = cv2.ORB.create(
             config.max_keypoints, config.pyramid_scale, config.pyramid_levels, fastThreshold=config.fast_threshold

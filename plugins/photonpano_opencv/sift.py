@@ -25,7 +25,7 @@ class SiftLocator(KeypointMatcher):
     def describe(self, exposure: VirtualExposure) -> Keypoints:
         """Detect keypoints on the variance-stabilised image, where it was seen."""
         config = self._sift
-        blur_px = blur_against_noise(exposure) if config.blur_px == "auto" else config.blur_px
+        blur_px = blur_against_noise(exposure, config.blur_px)
         threshold = config.contrast_threshold / max(1.0, blur_px)
         # A detector for each call: OpenCV does not promise that one may be shared by threads.
         sift = cv2.SIFT.create(config.max_keypoints, 3, threshold, enable_precise_upscale=True)

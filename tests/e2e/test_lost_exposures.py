@@ -120,9 +120,8 @@ def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
     ]
 
 
-@pytest.mark.xfail(reason="agreement counts pixels, not structures: smears that cross each other look alike", strict=True)
 def test_a_smear_is_not_taken_for_a_place(simulated: Callable) -> None:
-    """Groups blurred by 500 px on frames of 160 px. What is located wrongly has an expected error of 8 px, and is told."""
+    """Groups blurred by 500 px on frames of 160 px: the few stripes of two of them can be laid onto each other."""
     fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 1})
     with pytest.raises(LocationError):
         run(fast, "resample.with.group_size=100")

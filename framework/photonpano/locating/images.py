@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
-from photonpano.photometry import noise_free_correlation
+from photonpano.photometry import Likeness, autocorrelation, likeness_of
 from photonpano.values import Located, NotLocated
 
 if TYPE_CHECKING:
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano.locating.configs import ImageLimits
     from photonpano.locating.viewing import View
     from photonpano.values import FloatArray, Homography
 
@@ -35,21 +35,6 @@ _PRIOR_STD = 0.03
 other by a degree or two at most, and differ as little in scale, shear and perspective."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImageLimits:
-    """What an alignment of two images must fulfil to be believed.
-
-    Attributes:
-        min_overlap: the least share of the image that both exposures must see.
-        min_agreement: the least correlation after alignment, with photon noise taken out.
-        max_std_px: an alignment that leaves the corners of the frame more uncertain than this, on average, is not believed.
-    """
-
-    min_overlap: float = 0.1
-    min_agreement: float = 0.5
-    max_std_px: float = 15.0
-
-
 def motion_from_images(
     moving: View,
     fixed: View,
@@ -57,6 +42,7 @@ def motion_from_images(
     limits: ImageLimits,
     *,
     free: Sequence[int] = ALL,
+    efficiency: float = 1.0,
     evidence: Mapping[str, float] | None = None,
 ) -> Located | NotLocated:
     """Judge the homography with which a backend aligned two images, and say how well it is known. Raises nothing.
@@ -74,6 +60,7 @@ def motion_from_images(
         homography: (3, 3) what the backend found.
         limits: what it takes to be believed.
         free: which of p1..p8 the backend estimated; the others are as likely to be off as cameras make them.
+        efficiency: which share of the information of the photons the backend uses; least squares uses all of it.
         evidence: what the backend counted, for the record.
 
     Returns:
@@ -93,21 +80,17 @@ def motion_from_images(
             f"less than min_overlap = {limits.min_overlap:.0%}",
             found,
         )
-    found["agreement"] = _agreement(moving, there)
-    if found["agreement"] < limits.min_agreement:
-        return NotLocated(
-            f"after alignment the images agree by {found['agreement']:.2f}, less than min_agreement = {limits.min_agreement:g}"
-            if found["agreement"]
-            else "where the images overlap after alignment, nothing stands out from photon noise",
-            found,
-        )
+    alike = _likeness(moving, there)
+    found |= alike.evidence
+    if reason := alike.objection(limits.min_agreement):
+        return NotLocated(reason, found)
     weight = np.asarray(1 / (1 / moving.weight[both] + 1 / there.weight[both]), np.float32)
     squares = weight * np.square(moving.image[both] - there.image[both])
     found["noise_ratio"] = float(squares.mean(dtype=np.float64)) / moving.noise_left
     curvature = _common_curvature(_derivatives(moving, both), _derivatives(there, both), weight)
     if curvature is None:
         return NotLocated("where the images overlap after alignment, there is no texture", found)
-    known, used = curvature / max(1.0, found["noise_ratio"]), list(free)
+    known, used = curvature * efficiency / max(1.0, found["noise_ratio"]), list(free)
     # A backend that leaves parameters alone finds the others wrong by what these do to the image.
     rows = known[used]
     information = rows.T @ np.linalg.solve(known[np.ix_(used, used)], rows)
@@ -123,22 +106,28 @@ def motion_from_images(
     return Located(homography, to_step.T @ information @ to_step, std_px, found)
 
 
-def _agreement(moving: View, there: View) -> float:
-    """Return the correlation that two images on one grid would have without photon noise, in large px."""
+def _likeness(moving: View, there: View) -> Likeness:
+    """Return how alike two images on one grid are, in large px."""
     while moving.pixel < _JUDGED_PIXEL and min(moving.shape) >= 2 * _SMALLEST_SIDE:
         moving, there = moving.halved(), there.halved()
     both = moving.seen & there.seen
-    pixels = np.count_nonzero(both)
+    pixels = int(np.count_nonzero(both))
     if not pixels:
-        return 0.0
+        return Likeness(0.0, 0.0, 0.0)
     # Shadows and slopes that fill the image look alike wherever one looks.
     mask = both.astype(np.float32)
     norm = np.maximum(_surroundings(mask), np.float32(1e-6))
-    here, beyond = (
-        np.asarray((view.image - _surroundings(view.image * mask) / norm)[both], np.float32) for view in (moving, there)
+    details = [
+        np.asarray((view.image - _surroundings(view.image * mask) / norm) * mask, np.float32) for view in (moving, there)
+    ]
+    noise = [view.noise_left * float(np.mean(1 / view.weight[both])) for view in (moving, there)]
+    return likeness_of(
+        np.cov(details[0][both], details[1][both]),
+        (noise[0], noise[1]),
+        pixels,
+        pixels * min(1.0, moving.noise_left),
+        (autocorrelation(details[0]), autocorrelation(details[1])),
     )
-    here_noise, there_noise = (view.noise_left * float(np.mean(1 / view.weight[both])) for view in (moving, there))
-    return noise_free_correlation(here, beyond, (here_noise, there_noise), pixels * min(1.0, moving.noise_left))
 
 
 def _surroundings(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano.geometry import apply, implausibility
-from photonpano.locating.fitting import MIN_NOISE_PX, fit_homography
+from photonpano.locating.fitting import fit_homography
 from photonpano.values import Located, NotLocated
 
 if TYPE_CHECKING:
@@ -16,25 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano.locating.configs import PointLimits
     from photonpano.values import Homography
-
-
-@dataclass(frozen=True, slots=True)
-class PointLimits:
-    """What matched points must fulfil to be believed.
-
-    Attributes:
-        min_inliers: a pair with fewer inliers is not located; at least 5.
-        threshold_px: a match is an inlier where the motion puts it this near to its partner.
-        max_std_px: a motion that leaves a corner of the frame more uncertain than this is not believed.
-        min_noise_px: matches err by at least this much a coordinate, however well they agree: detectors that know whole pixels
-            only round alike.
-    """
-
-    min_inliers: int = 12
-    threshold_px: float = 2.0
-    max_std_px: float = 10.0
-    min_noise_px: float = MIN_NOISE_PX
 
 
 def least_agreeing(matches: int, guided: bool) -> float:
@@ -57,6 +39,7 @@ def motion_from_points(
     sizes: NDArray[np.floating] | None = None,
     evidence: Mapping[str, float] | None = None,
     rounds: int = 2,
+    rounding_px: float = 0.0,
 ) -> Located | NotLocated:
     """Fit a motion to the matches that agree with it, by least squares, and judge it. Raises nothing.
 
@@ -72,6 +55,7 @@ def motion_from_points(
         sizes: (N,) diameters of the keypoints, where they differ; where a keypoint lies is known in proportion.
         evidence: what the backend counted, for the record.
         rounds: how often inliers are chosen and fitted.
+        rounding_px: standard deviation of what all matches may err alike, as they do where points are known to whole pixels.
 
     Returns:
         `Located` with the information that the residuals give, `evidence`, and the numbers of `matches` and `inliers`; or
@@ -93,7 +77,7 @@ def motion_from_points(
                 f"fewer than min_inliers = {limits.min_inliers}",
                 found,
             )
-        fit = fit_homography(moving[inliers], fixed[inliers], sizes[inliers], homography, limits.min_noise_px)
+        fit = fit_homography(moving[inliers], fixed[inliers], sizes[inliers], homography, rounding_px)
         homography = fit.homography
     std_px = fit.corner_std_px(shape)
     if not std_px <= limits.max_std_px:

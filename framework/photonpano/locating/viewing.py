@@ -15,6 +15,7 @@ from photonpano.photometry import signal_to_noise
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano.locating.configs import BlurPx
     from photonpano.values import Homography, VirtualExposure
 
 _CLIPPED = 0.001
@@ -98,8 +99,8 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
         blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
     """
     known = exposure.weight > 0
-    variance = np.zeros(known.shape, np.float32)
-    variance[known] = exposure.response.stabilised_std(exposure.weight[known]) ** 2
+    std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
+    variance = np.where(known, std * std, np.float32(0))
     image, noise, near = _blurred(_stabilised(exposure), variance, known.astype(np.float32), blur_px=blur_px)
     bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     border = math.ceil(_BORDER * blur_px)
@@ -109,12 +110,30 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
     return View(image, np.divide(near, noise, out=np.zeros_like(near), where=seen), blur_px)
 
 
-def blur_against_noise(exposure: VirtualExposure) -> float:
-    """Choose the standard deviation of the Gaussian, in px: 1 in the light, up to 2.5 where noise exceeds the scene.
+def view_pyramid(exposure: VirtualExposure, blur_px: float, levels: int, smallest_side: int) -> tuple[View, ...]:
+    """Return an exposure as an aligner of brightness sees it, and its halves, finest first.
 
-    In the light more blur costs accuracy (1.5 px instead of 1 px took a trajectory at flux 0.5 from
-    0.07 to 0.17 px), in the dark less blur does (at flux 0.02 most keypoints are noise then).
+    Args:
+        exposure: flux and weight.
+        blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
+        levels: how many views at most.
+        smallest_side: the pyramid ends before a side gets shorter than this, in px of a view.
     """
+    views = [view_of(exposure, blur_px)]
+    while len(views) < levels and min(views[-1].shape) >= 2 * smallest_side:
+        views.append(views[-1].halved())
+    return tuple(views)
+
+
+def blur_against_noise(exposure: VirtualExposure, asked_px: BlurPx = "auto") -> float:
+    """Return the standard deviation of the Gaussian, in px: what is asked for, or for `auto` as much as noise needs.
+
+    That is 1 in the light, and up to 2.5 where noise exceeds the scene. In the light more blur costs accuracy (1.5 px instead
+    of 1 px took a trajectory at flux 0.5 from 0.07 to 0.17 px), in the dark less blur does (at flux 0.02 most keypoints are
+    noise then).
+    """
+    if asked_px != "auto":
+        return asked_px
     return float(np.clip(2 / max(signal_to_noise(exposure), 1e-6), 1.0, 2.5))
 
 

@@ -1,7 +1,7 @@
 """The detection model, flux estimation, tone curves and packed-bit sums."""
 
 from photonpano.photometry.contrast import signal_to_noise
-from photonpano.photometry.likeness import correlation_without_noise, noise_free_correlation
+from photonpano.photometry.likeness import Likeness, autocorrelation, likeness_of, noise_free_correlation
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
 from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, IntensityResponse
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
@@ -11,7 +11,9 @@ __all__ = [
     "BinarySumResponse",
     "BitOrder",
     "IntensityResponse",
-    "correlation_without_noise",
+    "Likeness",
+    "autocorrelation",
+    "likeness_of",
     "linear_to_srgb",
     "noise_free_correlation",
     "packed_along_width",

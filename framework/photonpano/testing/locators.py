@@ -72,7 +72,7 @@ class LocatorConformance(StageConformance):
     free: tuple[int, ...] = tuple(range(8))
     shape: tuple[int, int] = SHAPE
     needs_start: bool = False
-    information_factor: float = 4.0
+    information_factor: float = 3.0
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
         """Check what the locator is made for."""

@@ -1,4 +1,4 @@
-"""What the locators promise that need no weights."""
+"""What the kit does not ask of the locators that need no weights: starts further off, the dark, what torch shares, memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import Located, NotLocated, StageContext, StreamInfo
-from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.geometry import corner_displacements, from_parameters, translation
 from photonpano.photometry import BinaryResponse
 from photonpano_kornia.hooks import photonpano_locators
 
@@ -34,13 +34,8 @@ BACKENDS = {
     "adalam": ("kornia-features", {"max_keypoints": 400, "matcher": "adalam"}, 0.3),
 }
 """Locators, what they are told, and their tolerance in px at 0.5 photons per pixel and frame."""
-MOTIONS = {
-    "sub-pixel": translation(0.3, -0.2),
-    "shift": translation(20.25, 7.5),
-    "backwards": translation(-31, 4),
-    "rotation": from_parameters([np.cos(0.05) - 1, np.sin(0.05), -np.sin(0.05), np.cos(0.05) - 1, 6.0, -3.0, 0, 0]),
-    "homography": from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5]),
-}
+SHIFT = translation(20.25, 7.5)
+HOMOGRAPHY = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
 
 
 @pytest.fixture(params=["registrator", "smnn"])
@@ -54,9 +49,9 @@ def built(backend: str) -> Locator:
 
 
 def register(
-    backend: str, moving: VirtualExposure, fixed: VirtualExposure, initial: np.ndarray | None = None, **config: object
-):
-    locator = built(backend, **config)
+    backend: str, moving: VirtualExposure, fixed: VirtualExposure, initial: np.ndarray | None = None
+) -> Located | NotLocated:
+    locator = built(backend)
     return locator.register(locator.describe(moving), locator.describe(fixed), initial)
 
 
@@ -69,27 +64,10 @@ def error_px(motion: Located | NotLocated, true: np.ndarray) -> float:
     return float(corner_displacements(located(motion).homography, true, SHAPE).mean())
 
 
-CASES = [(backend, kind) for backend in ("registrator", "smnn") for kind in MOTIONS]
-
-
-# AdaLAM differs only in how it matches.
-@pytest.mark.parametrize(("backend", "kind"), [*CASES, ("adalam", "homography")])
-def test_known_motions_are_found_and_not_their_inverse(backend: str, kind: str, shot: Callable) -> None:
-    true = MOTIONS[kind]
-    motion = located(register(backend, shot(true, 1), shot(STILL, 2)))
-    assert error_px(motion, true) < BACKENDS[backend][2]
-    if kind != "sub-pixel":
-        assert error_px(motion, inverse(true)) > 10
-    assert motion.homography[2, 2] == 1
-    assert motion.residual_px > 0
-    np.linalg.cholesky(motion.information)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_motion_known_so_far_is_corrected(backend: str, shot: Callable) -> None:
-    true = MOTIONS["homography"]
-    motion = register(backend, shot(true, 1), shot(STILL, 2), true @ translation(3, -2))
-    assert error_px(motion, true) < BACKENDS[backend][2]
+    motion = register(backend, shot(HOMOGRAPHY, 1), shot(STILL, 2), HOMOGRAPHY @ translation(3, -2))
+    assert error_px(motion, HOMOGRAPHY) < BACKENDS[backend][2]
 
 
 def test_what_is_known_so_far_tells_what_looks_alike(backend: str, photograph: Callable) -> None:
@@ -103,21 +81,7 @@ def test_what_is_known_so_far_tells_what_looks_alike(backend: str, photograph: C
 
 def test_in_the_dark_too(backend: str, shot: Callable) -> None:
     """At 0.02 photons per pixel and frame."""
-    true = MOTIONS["shift"]
-    assert error_px(register(backend, shot(true, 1, 0.04), shot(STILL, 2, 0.04)), true) < 0.8
-
-
-def test_the_information_is_that_of_the_scatter(backend: str, shot: Callable) -> None:
-    # Whole pixels: between them, the fixture samples its street bluntly, and the images differ by more than noise.
-    true, frame, locator = translation(10, -3), corners(SHAPE), built(backend)
-    errors, predicted = [], []
-    for seed in range(5):
-        pair = (locator.describe(shot(each, 2 * seed + i, 0.2)) for i, each in enumerate((true, STILL)))
-        motion = located(locator.register(*pair, true))
-        to_corners = jacobian(motion.homography, frame).reshape(8, 8)
-        predicted.append(np.trace(to_corners @ np.linalg.inv(motion.information) @ to_corners.T))
-        errors.append(np.sum((apply(motion.homography, frame) - apply(true, frame)) ** 2))
-    assert 1 / 3 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 3
+    assert error_px(register(backend, shot(SHIFT, 1, 0.04), shot(STILL, 2, 0.04)), SHIFT) < 0.8
 
 
 @pytest.fixture
@@ -153,57 +117,13 @@ def test_an_exposure_lies_where_it_lies(backend: str, shot: Callable) -> None:
     assert error_px(register(backend, exposure, exposure), STILL) < 1e-3
 
 
-def test_exposures_are_left_as_they_are(backend: str, shot: Callable) -> None:
-    moving, fixed, initial = shot(MOTIONS["shift"], 1), shot(STILL, 2), MOTIONS["shift"].copy()
-    for array in (moving.flux, moving.weight, fixed.flux, fixed.weight, initial):
-        array.flags.writeable = False
-    located(register(backend, moving, fixed, initial))
-
-
-def masked(exposure: VirtualExposure, unseen: np.ndarray) -> VirtualExposure:
-    return replace(
-        exposure,
-        flux=np.where(unseen, np.float32(np.nan), exposure.flux),
-        weight=np.where(unseen, np.float32(0), exposure.weight),
-    )
-
-
 def test_what_was_not_seen_does_not_pull(backend: str, shot: Callable) -> None:
-    """A third of one exposure is missing; at the same places, one pixel in fifty of both, as on a sensor."""
-    true = MOTIONS["shift"]
-    left = np.arange(SHAPE[1]) < 50 + np.zeros((SHAPE[0], 1))
-    hot = np.random.default_rng(7).random(SHAPE) < 0.02
-    for unseen in ((left, np.zeros(SHAPE, bool)), (hot, hot)):
-        pair = (masked(shot(each, seed), mask) for seed, (each, mask) in enumerate(zip((true, STILL), unseen, strict=True)))
-        assert error_px(register(backend, *pair), true) < 2 * BACKENDS[backend][2]
-
-
-@pytest.mark.parametrize("initial", [None, STILL, translation(170, 0)], ids=["unknown", "still", "apart"])
-def test_without_texture_nothing_is_located(
-    backend: str, initial: np.ndarray | None, photograph: Callable, shot: Callable
-) -> None:
-    """A wall, the dark, what was not seen, all of it lit: each with its like, and with the street."""
-    locator = built(backend)
-    walls = [photograph(np.full(SHAPE, flux), seed) for seed, flux in enumerate((0.5, 0.0, 0.0, 50.0))]
-    walls[2] = masked(walls[2], np.ones(SHAPE, bool))
-    street, other, *described = map(locator.describe, (shot(STILL), photograph(np.full(SHAPE, 0.5), 9), *walls))
-    for index, wall in enumerate(described):
-        for pair in ((wall, wall if index else other), (wall, street), (street, wall)):
-            motion = locator.register(*pair, initial)
-            assert isinstance(motion, NotLocated), (index, motion)
-            assert motion.reason
-
-
-@pytest.mark.parametrize("initial", [None, STILL], ids=["unknown", "still"])
-def test_another_place_is_not_located(backend: str, initial: np.ndarray | None, shot: Callable) -> None:
-    motion = register(backend, shot(translation(0, 250), 1), shot(STILL, 2), initial)
-    assert isinstance(motion, NotLocated), motion
-
-
-@pytest.mark.parametrize("shape", [(24, 40), (9, 17), (1, 8)])
-def test_images_may_be_tiny(backend: str, shape: tuple[int, int], photograph: Callable) -> None:
-    tiny = photograph(np.random.default_rng(0).random(shape))
-    register(backend, tiny, tiny)
+    """A third of one exposure is missing."""
+    moving, unseen = shot(SHIFT, 1), np.arange(SHAPE[1]) < 50 + np.zeros((SHAPE[0], 1))
+    moving = replace(
+        moving, flux=np.where(unseen, np.float32(np.nan), moving.flux), weight=np.where(unseen, np.float32(0), moving.weight)
+    )
+    assert error_px(register(backend, moving, shot(STILL, 2)), SHIFT) < 2 * BACKENDS[backend][2]
 
 
 def test_what_is_kept_of_an_exposure_is_small(backend: str, shot: Callable) -> None:

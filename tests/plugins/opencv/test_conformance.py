@@ -33,5 +33,3 @@ class TestPhaseCorrelation(LocatorConformance):
     tolerance_px = 0.1
     motions = ("sub-pixel shift", "shift")
     free = (4, 5)
-    # Frequencies count alike, also those that hold little but noise: a fifth as exact as the photons would allow.
-    information_factor = 8.0

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,21 +76,6 @@ def test_it_says_how_well_it_knows(seen_from: Callable) -> None:
         errors.append(apply(motion.homography, frame) - apply(true, frame))
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(predicted))
     assert 1 / 3 < ratio < 3
-
-
-def test_the_same_input_gives_the_same_bytes_from_any_thread(seen_from: Callable) -> None:
-    sift = locator()
-    exposures = [seen_from(translation(9 * index, 0), index) for index in range(4)]
-
-    def all_pairs(threads: int) -> list[bytes]:
-        with ThreadPoolExecutor(threads) as pool:
-            features = list(pool.map(sift.describe, exposures))
-            motions = list(pool.map(sift.register, features[1:] * 2, features[:-1] * 2, [None] * 6))
-        return [located(motion).homography.tobytes() for motion in motions]
-
-    alone = all_pairs(1)
-    assert alone[:3] == alone[3:]
-    assert all_pairs(4) == alone
 
 
 @pytest.mark.parametrize("off_px", [0, 8, 15, 30])

@@ -34,7 +34,19 @@ def test_the_information_is_that_of_the_scatter() -> None:
         fit = fit_homography(*matches(seed, 0.3), SIZES, TRUE)
         error = parameters(fit.homography) - parameters(TRUE)
         chi_squared.append(error @ fit.information @ error)
-    assert np.mean(chi_squared) == pytest.approx(8, rel=0.35)
+    assert np.mean(chi_squared) == pytest.approx(8, rel=0.2)
+
+
+def test_what_all_matches_err_alike_is_not_averaged_out() -> None:
+    """Over 100 fits to matches that are all off by about 0.3 px, and hardly scatter."""
+    chi_squared = []
+    for seed in range(100):
+        here, there = matches(seed, 0.05)
+        there += np.random.default_rng(seed).normal(0, 0.3, 2)
+        fit = fit_homography(here, there, SIZES, TRUE, rounding_px=0.3)
+        error = parameters(fit.homography) - parameters(TRUE)
+        chi_squared.append(error @ fit.information @ error)
+    assert np.mean(chi_squared) == pytest.approx(8, rel=0.2)
 
 
 def test_a_quarter_of_wrong_matches_does_little_harm() -> None:
@@ -43,7 +55,8 @@ def test_a_quarter_of_wrong_matches_does_little_harm() -> None:
     there[:30] += np.random.default_rng(1).uniform(-4, 4, (30, 2)).astype(np.float32)
     wrong = fit_homography(here, there, SIZES, TRUE)
     assert error_px(wrong.homography) < 2.5 * error_px(clean.homography) + 0.05
-    assert wrong.residual_px < 2 * clean.residual_px
+    # It cannot know which of them are wrong, and says that it is less certain.
+    assert 2 * clean.residual_px < wrong.residual_px < 1.5
 
 
 def test_large_keypoints_count_less() -> None:

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
-from photonpano.photometry import noise_free_correlation
+from photonpano.photometry import Likeness, autocorrelation, likeness_of, noise_free_correlation
 
 N = 20_000
 
@@ -46,3 +47,50 @@ def test_few_pixels_count_as_nothing_alike(scenes):
     few = scenes[0, :200].astype(np.float32)
     assert noise_free_correlation(few, few, (0, 0), 49) == 0
     assert noise_free_correlation(few, few, (0, 0), 50) == pytest.approx(1)
+
+
+def smeared(seed, down_px, across_px):
+    """White noise under a Gaussian: 64 x 96 pixels, of mean 0."""
+    noise = np.random.default_rng(seed).normal(size=(64, 96))
+    image = gaussian_filter(noise, (down_px, across_px), mode="wrap").astype(np.float32)
+    return image - image.mean()
+
+
+def compared(first, second):
+    covariance = np.cov(first.ravel(), second.ravel())
+    return likeness_of(covariance, (0, 0), first.size, first.size, (autocorrelation(first), autocorrelation(second)))
+
+
+def test_the_autocorrelation_of_a_blur_is_a_wider_one():
+    found = np.mean([autocorrelation(smeared(seed, 1, 2)) for seed in range(20)], axis=0)
+    assert found.shape == (2 * 16 + 1, 24 + 1)
+    down, across = np.mgrid[-16:17, :25]
+    np.testing.assert_allclose(found, np.exp(-(down**2) / 4 - across**2 / 16), atol=0.05)
+    assert not autocorrelation(np.zeros((8, 8), np.float32)).any()
+
+
+@pytest.mark.parametrize(("down_px", "across_px"), [(1, 1), (3, 1), (1, 3)])
+def test_a_blur_leaves_as_many_structures_as_its_area_allows(down_px, across_px):
+    """The squares of its autocorrelation sum up to 2 pi times its standard deviations."""
+    images = [smeared(seed, down_px, across_px) for seed in range(20)]
+    found = np.mean([compared(first, second).structures for first, second in zip(images[1:], images[:-1], strict=True)])
+    assert found == pytest.approx(64 * 96 / (2 * np.pi * down_px * across_px), rel=0.15)
+
+
+@pytest.mark.parametrize("second", [(1, 6), (6, 1)], ids=["alike", "crossed"])
+def test_the_score_of_different_scenes_is_that_of_chance(second):
+    """Two hundred pairs of smears: with pixels in place of structures it would be 3 to 5 times as large."""
+    scores = [compared(smeared(seed, 1, 6), smeared(1000 + seed, *second)).score for seed in range(200)]
+    assert np.std(scores) == pytest.approx(1, abs=0.2)
+
+
+def test_it_says_what_is_wrong():
+    image, few, others = smeared(0, 1, 1), smeared(0, 10, 10), smeared(1, 10, 10)
+    assert compared(image, image).objection(0.5) is None
+    assert compared(image, smeared(1, 1, 1)).objection(0.5).endswith("less than min_agreement = 0.5")
+    nearly = compared(few, few + 0.6 * others)
+    assert nearly.correlation > 0.7
+    assert nearly.objection(0.5).endswith("independent structures, and so few may agree by chance")
+    assert Likeness(0.0, 0.0, 0.0).objection(0.5) == (
+        "where the images overlap after alignment, nothing stands out from photon noise"
+    )

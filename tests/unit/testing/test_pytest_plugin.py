@@ -58,7 +58,8 @@ def test_pytest_starts_without_the_kit():
         "print(*sorted(set(sys.modules) - before))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["photonpano", "photonpano.testing", "photonpano.testing.pytest_plugin"]
+    package = ["photonpano", "photonpano.lazy", "photonpano.testing", "photonpano.testing.pytest_plugin"]
+    assert done.stdout.split() == package
 
 
 def test_the_package_does_not_import_pytest():
