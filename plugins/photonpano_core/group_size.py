@@ -22,7 +22,7 @@ _KNOWN_FROM = 3
 _DARK_BLUR = 2.0
 """In the dark, so many times the blur is allowed."""
 _SHARP = 0.04
-"""Where light is plentiful, groups are so short that they are blurred by this share only: more of them take their time, and tell no more."""
+"""Where light is plentiful, groups are so short that they are blurred by this share only; shorter ones tell no more."""
 _PLENTY = 1000.0
 """So many photons a pixel are plenty."""
 _GROUPS = 8

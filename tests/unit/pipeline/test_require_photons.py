@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from photonpano import InputError, StreamInfo
 from photonpano.photometry import IntensityResponse
 from photonpano.pipeline.run import require_photons
-from photonpano.testing import MemorySource
 
 DARK = (
     "no pixel is lit in any of {} frames looked at all over the capture; "
@@ -50,7 +51,7 @@ def test_grey_levels_are_judged_by_black_and_white(memory_source: type, level: i
     require_photons(grey(memory_source, 100))
 
 
-def grey(memory_source: type, level: int) -> MemorySource:
+def grey(memory_source: type, level: int) -> Any:
     """Return a capture of one level, whose black is 16 and whose white is 235."""
     source = memory_source(np.full((40, 4, 8), level))
     source.info, source.response = StreamInfo(40, 4, 8, None, "intensity", 8), IntensityResponse(40.0, 16.0, 235.0, 20.0)
