@@ -21,8 +21,8 @@ _KNOWN_FROM = 3
 """From this level on even a trembling hand is known, whose period would forbid long groups before."""
 _DARK_BLUR = 2.0
 """In the dark, so many times the blur is allowed."""
-_SHARP = 0.02
-"""Where light is plentiful, groups are so short that they are blurred by this share only: 8 times as many take their time."""
+_SHARP = 0.04
+"""Where light is plentiful, groups are so short that they are blurred by this share only; shorter ones tell no more."""
 _PLENTY = 1000.0
 """So many photons a pixel are plenty."""
 _GROUPS = 8
@@ -75,7 +75,7 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
     """Return the group size for a capture, in frames, and a clause that gives the reason.
 
     The blur of a group of m frames at v px a frame is m v px. It may be 0.15 of the shorter side of a frame, and up to twice
-    that as long as a pixel gets fewer than 3 photons; it is kept to 0.02 where a pixel gets 1000 all the same. There are at
+    that as long as a pixel gets fewer than 3 photons; it is kept to 0.04 where a pixel gets 1000 all the same. There are at
     least `shortest` frames in a group, and at least 8 groups.
     """
     if capture.speed_px is None:

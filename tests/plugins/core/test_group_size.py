@@ -69,9 +69,9 @@ def test_grey_frames_may_stand_alone() -> None:
 
 def test_plenty_of_light_makes_groups_sharp() -> None:
     size, reason = choice(2000, 0.5, shortest=1)
-    assert size == 10  # 0.02 of 254 px
-    assert reason.endswith("they hold 2e+04 photons a pixel, so that less blur is worth more than more light")
-    assert choice(50, 0.5, shortest=1)[0] == 20  # 1000 photons
+    assert size == 20  # 0.04 of 254 px
+    assert reason.endswith("they hold 4e+04 photons a pixel, so that less blur is worth more than more light")
+    assert choice(25, 0.5, shortest=1)[0] == 40  # 1000 photons
     assert choice(0.5, 0.05)[0] == 762  # which are too few
 
 

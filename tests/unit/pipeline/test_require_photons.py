@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -44,10 +46,13 @@ def test_masked_pixels_do_not_count(memory_source: type, value: int) -> None:
 
 @pytest.mark.parametrize(("level", "text"), [(16, "no pixel is brighter than black"), (235, "every pixel is saturated")])
 def test_grey_levels_are_judged_by_black_and_white(memory_source: type, level: int, text: str) -> None:
-    source = memory_source(np.full((40, 4, 8), level, np.uint8))
-    source.info, source.response = StreamInfo(40, 4, 8, None, "intensity", 8), IntensityResponse(40.0, 16.0, 235.0, 20.0)
     with pytest.raises(InputError, match=f"^{text} in"):
-        require_photons(source)
-    source = memory_source(np.full((40, 4, 8), 100, np.uint8))
+        require_photons(grey(memory_source, level))
+    require_photons(grey(memory_source, 100))
+
+
+def grey(memory_source: type, level: int) -> Any:
+    """Return a capture of one level, whose black is 16 and whose white is 235."""
+    source = memory_source(np.full((40, 4, 8), level))
     source.info, source.response = StreamInfo(40, 4, 8, None, "intensity", 8), IntensityResponse(40.0, 16.0, 235.0, 20.0)
-    require_photons(source)
+    return source
