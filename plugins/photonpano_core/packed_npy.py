@@ -15,6 +15,7 @@ from photonpano.reading import (
     gzipped_npy_header,
     is_gzip,
     npy_header,
+    objections,
     require_whole,
     unpacked,
     unpacked_start,
@@ -110,11 +111,7 @@ def _layout(config: PackedNpyConfig) -> tuple[NpyHeader, FrameLayout]:
 
 
 def _check(config: PackedNpyConfig) -> Sequence[str]:
-    try:
-        _read(config)
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(_read, config)
 
 
 def _recognise(path: Path) -> Recognised | None:

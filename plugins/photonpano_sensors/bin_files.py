@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from photonpano import Config, InputError, SpecPath
-from photonpano.reading import FrameFile, PackedFileSource, files_in
+from photonpano.reading import FrameFile, PackedFileSource, files_in, objections
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,11 +30,7 @@ def opened(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Pac
 
 def checked(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Sequence[str]:
     """Return what opening a capture would raise."""
-    try:
-        frame_files(config.path, layout, footer_bytes)
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(frame_files, config.path, layout, footer_bytes)
 
 
 def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[FrameFile]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pydantic import BaseModel, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, read_json
+from photonpano.reading import BinarySource, FrameLayout, objections, read_json
 from photonpano_sensors.mat_file import MatFrames
 
 if TYPE_CHECKING:
@@ -119,11 +119,7 @@ def _size(shape: tuple[int, int, int]) -> str:
 
 def _check(config: MatPartsConfig) -> Sequence[str]:
     """Look which parts there are; reading them takes a library."""
-    try:
-        _parts(config.path)
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(_parts, config.path)
 
 
 def _recognise(path: Path) -> Recognised | None:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from photonpano import Config, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, files_in, read_start
+from photonpano.reading import BinarySource, FrameLayout, files_in, objections, read_start
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -122,11 +122,7 @@ def _frame_ends(path: Path) -> NDArray[np.int64]:
 
 
 def _check(config: Spad512SparseConfig) -> Sequence[str]:
-    try:
-        _files(config.path)
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(_files, config.path)
 
 
 def _recognise(path: Path) -> Recognised | None:

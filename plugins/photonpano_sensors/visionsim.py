@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.photometry import packed_along_width
-from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, npy_header, read_json, require_whole
+from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, npy_header, objections, read_json, require_whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -159,11 +159,7 @@ def _layout(transforms: _Transforms, packed_dim: int | None, channel: int | None
 
 
 def _check(config: VisionsimConfig) -> Sequence[str]:
-    try:
-        _read(config)
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(_read, config)
 
 
 def _recognise(path: Path) -> Recognised | None:

@@ -215,7 +215,7 @@ def test_a_full_disk_half_way_leaves_the_earlier_run(simulated: Callable[..., Pa
     done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit_files)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == (
-        f"error: {folder}: the results could not be written (a file was cut short); what was there before is unchanged. "
+        f"error: {folder}: the results could not be written (File too large); what was there before is unchanged. "
         "Make room, or choose another folder with --output"
     )
     assert {file.name: file.read_text() for file in folder.iterdir()} == {

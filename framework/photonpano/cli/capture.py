@@ -62,7 +62,7 @@ def plan_for(
         path: the capture, or a spec.
         source: what specs call the source that reads it.
         keys: its keys, such as `frame_rate_hz=96800`.
-        corrections: items of the spec's list of corrections, in YAML; they go before those of a spec.
+        corrections: items of the spec's list of corrections, in YAML; they take the place of those of a spec.
         overrides: other values of the spec.
 
     Raises:

@@ -59,7 +59,8 @@ def dark(
 
     if output.suffix not in (".npz", ".npy"):
         raise OutputError(f"cannot write {output}: dark counts are an .npz file, and a mask of hot pixels is a .npy file")
-    with open_source(plan_for(path, source, keys, corrections)) as capture:
+    plan = plan_for(path, source, keys, corrections)
+    with open_source(plan) as capture:
         info, valid = capture.info, capture.valid
         if not valid.any():
             raise InputError(f"{path}: no pixel may be used")
@@ -76,7 +77,8 @@ def dark(
     typer.echo(columns(_rows(output, info, measured, hot & valid, limit, valid)))
     uses = {"hot-pixels": "dark", "dark-counts": "dark"} if output.suffix == ".npz" else {"mask": "file"}
     typer.echo("\nIn a spec that lies here:\n")
-    typer.echo(f"corrections: {flow([{name: {key: str(output)}} for name, key in uses.items()])}")
+    listed = [*plan.document["corrections"], *({name: {key: str(output)}} for name, key in uses.items())]
+    typer.echo(f"corrections: {flow(listed)}")
 
 
 def _rows(
@@ -92,5 +94,5 @@ def _rows(
     return [
         [str(output), f"from {capture_words(info)}"],
         ["dark counts a frame", f"median {median:.2g}, 90 % {most:.2g}, 99 % {nearly_all:.2g}, highest {highest:.2g}"],
-        ["hot pixels", f"{n_hot:,} of {n_pixels:,} ({n_hot / n_pixels:.2%}), above {limit:.2g}"],
+        ["hot pixels", f"{n_hot:,} of {n_pixels:,} ({100 * n_hot / n_pixels:.2f} %), above {limit:.2g}"],
     ]

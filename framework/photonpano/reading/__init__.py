@@ -4,6 +4,7 @@ from photonpano.reading.binary_source import BinarySource
 from photonpano.reading.files import OpenFiles, files_in, read_json, read_start
 from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, unpacked_start
 from photonpano.reading.npy import NpyHeader, npy_header, require_whole
+from photonpano.reading.objections import objections
 from photonpano.reading.packed_files import FrameFile, PackedFileSource
 from photonpano.reading.packed_layout import FrameLayout
 
@@ -18,6 +19,7 @@ __all__ = [
     "gzipped_npy_header",
     "is_gzip",
     "npy_header",
+    "objections",
     "read_json",
     "read_start",
     "require_whole",

@@ -80,7 +80,9 @@ def found_source(keys: Value, catalog: Catalog, directory: Path, problems: list[
         if several:
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
-            lines = [*_near_misses(keys, catalog, directory), *answers.failures]
+            # The path is named once; each line has its last part.
+            near = [line.replace(str(path), path.name) for line in _near_misses(keys, catalog, directory)]
+            lines = [*near, *answers.failures]
             message = "\n  ".join([f"no source recognises {path}, {_looks(path)}; name the one that reads it", *lines])
         problems.append(place.problem(message))
         return None
@@ -110,8 +112,7 @@ def _complaints(entry: Entry, keys: Value, directory: Path) -> tuple[str, ...]:
         return ()
     if config is None:
         return ()
-    said = complaints(Choice(entry.contribution, config, entry.plugin, entry.version))
-    return said or ("finds nothing wrong with it",)
+    return complaints(Choice(entry.contribution, config, entry.plugin, entry.version))
 
 
 def _looks(path: Path) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from photonpano import InputError, Requirement, SourceContribution
+from photonpano import Requirement, SourceContribution
+from photonpano.reading import objections
 from photonpano_sensors.intensity.configs import FastcamMrawConfig, ImageFolderConfig, VideoConfig
 from photonpano_sensors.intensity.recognition import (
     is_file,
@@ -28,10 +29,8 @@ def _build_video(config: VideoConfig, context: SourceContext) -> Source:
 
 def _check_video(config: VideoConfig) -> Sequence[str]:
     """Look at the file's name alone: to index its packets takes as long as to read it."""
-    try:
-        refuse_mdat(config.path)
-    except InputError as error:
-        return (str(error),)
+    if found := objections(refuse_mdat, config.path):
+        return found
     return () if is_file(config.path) else (f"there is no file {config.path}; check the path",)
 
 
@@ -45,11 +44,7 @@ def _build_mraw(config: FastcamMrawConfig, context: SourceContext) -> Source:
 def _check_mraw(config: FastcamMrawConfig) -> Sequence[str]:
     from photonpano_sensors.intensity.mraw import open_recording
 
-    try:
-        open_recording(config.path)
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(open_recording, config.path)
 
 
 def _build_pictures(config: ImageFolderConfig, context: SourceContext) -> Source:
@@ -62,11 +57,7 @@ def _build_pictures(config: ImageFolderConfig, context: SourceContext) -> Source
 def _check_pictures(config: ImageFolderConfig) -> Sequence[str]:
     from photonpano_sensors.intensity.pictures import ImageFolderSource
 
-    try:
-        ImageFolderSource(config).close()
-    except InputError as error:
-        return (str(error),)
-    return ()
+    return objections(lambda: ImageFolderSource(config).close())
 
 
 INTENSITY_SOURCES: tuple[SourceContribution[Any], ...] = (

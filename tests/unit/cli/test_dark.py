@@ -38,7 +38,7 @@ def test_dark_counts_and_how_to_use_them(hot: np.ndarray, folder: Path, invoke: 
     lines = done.stdout.splitlines()
     assert lines[0] == "dark.npz             from 1,000 binary frames of 24x32"
     assert lines[1].startswith("dark counts a frame  median 0.002, 90 % 0.0")
-    assert lines[2].startswith(f"hot pixels           {hot.sum()} of 768 ({hot.mean():.2%}), above 0.0")
+    assert lines[2].startswith(f"hot pixels           {hot.sum()} of 768 ({100 * hot.mean():.2f} %), above 0.0")
     line = "corrections: [{hot-pixels: {dark: dark.npz}}, {dark-counts: {dark: dark.npz}}]"
     assert lines[3:] == ["", "In a spec that lies here:", "", line]
     assert len(parse_spec(f"{SPEC}{line}\n", directory=folder).corrections) == 2
