@@ -14,8 +14,9 @@ nothing else does: it needs pytest (`pip install "photonpano[testing]"`). Each n
 pytest starts as fast as without it.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from photonpano.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from photonpano.testing.captures import KnownMotion, MemorySource, photographed, recorded
@@ -44,10 +45,4 @@ _MODULES = ("scenes", "captures", "sources", "resamplers", "mergers", "locators"
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
 
-    def __getattr__(name: str) -> object:
-        if name in __all__:
-            for home in _MODULES:
-                module = import_module(f"photonpano.testing.{home}")
-                if hasattr(module, name):
-                    return getattr(module, name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    __getattr__ = imported_on_use(__name__, __all__, _MODULES)
