@@ -180,7 +180,7 @@ def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder
     printed = invoke("explain", "capture.yaml").stdout
     assert YAML(typ="safe").load(printed) == load_spec("capture.yaml").document
     top, first, second = (part.partition("fallback:\n")[2].splitlines() for part in re.split("# level .:", printed))
-    assert top[:3] == ["    - use: opencv-sift  # photonpano 0.1.0", "      with:", "        max_keypoints: 2000  # default"]
+    assert top[:3] == ["    - use: opencv-sift  # photonpano 0.1.0", "      with:", "        threshold_px: 2  # default"]
     assert first[:2] == ["        - use: opencv-sift  # photonpano 0.1.0", "          with:"]
     assert "            ratio: 0.8  # default" in first
     assert "            ratio: 0.9" in second
