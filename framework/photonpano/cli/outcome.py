@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import typer
 
-from photonpano.errors import PhotonpanoError, SpecError
+from photonpano.errors import PhotonpanoError, PluginError, SpecError
 
 FAILED = 1
 WRONG_SPEC = 2
@@ -39,7 +39,7 @@ def reported(*, debug: bool = False) -> Iterator[None]:
     except PhotonpanoError as error:
         if debug:
             traceback.print_exc()
-        raise typer.Exit(_told(error)) from error
+        raise typer.Exit(_told(error, debug)) from error
     except KeyboardInterrupt as error:
         typer.echo("\ninterrupted; nothing half-written is left under a final name", err=True)
         raise typer.Exit(INTERRUPTED) from error
@@ -62,10 +62,12 @@ class _Warnings(logging.Handler):
         sys.stderr.write(f"warning: {record.getMessage()}\n")
 
 
-def _told(error: PhotonpanoError) -> int:
+def _told(error: PhotonpanoError, debug: bool) -> int:
     """Print an error, every problem of a spec on a line of its own, and return its exit code."""
     if not isinstance(error, SpecError):
         typer.echo(f"error: {error}", err=True)
+        if isinstance(error, PluginError) and error.__cause__ and not debug:
+            typer.echo("for the traceback: photonpano --debug ...", err=True)
         return WRONG_SPEC if isinstance(error, WrongArgumentError) else FAILED
     for problem in error.problems:
         typer.echo(problem, err=True)

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import typer
 
+from photonpano import PluginError
 from photonpano.cli.outcome import reported
 
 if TYPE_CHECKING:
@@ -129,6 +131,18 @@ def test_debug_shows_the_traceback(
     assert result.exit_code == 2
     assert result.stderr.startswith("Traceback (most recent call last):")
     assert result.stderr.endswith("error: the spec has 1 problem\n")
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_what_a_plugin_raises_comes_with_the_way_to_its_traceback(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
+    """Not what it breaks its contract by: no line of it is to blame for that."""
+    for cause in (ValueError("out of luck"), None):
+        with pytest.raises(typer.Exit), reported(debug=debug):
+            raise PluginError("locator 'toy' failed") from cause
+        told = capsys.readouterr().err
+        assert ("Traceback" in told) == debug
+        assert "error: locator 'toy' failed\n" in told
+        assert told.endswith("for the traceback: photonpano --debug ...\n") == (not debug and cause is not None)
 
 
 @pytest.mark.parametrize("debug", [False, True])

@@ -79,6 +79,8 @@ def test_including_a_contribution_for_another_contract_is_an_error():
     [
         ("locator", "opencv-sfit", "there is no locator 'opencv-sfit'; did you mean 'opencv-sift'?"),
         ("locator", "Opencv_Sift", "there is no locator 'Opencv_Sift'; did you mean 'opencv-sift'?"),
+        ("locator", "sift", "there is no locator 'sift'; did you mean 'opencv-sift'?"),
+        ("locator", "shift", "there is no locator 'shift'; did you mean 'opencv-sift'?"),
         ("locator", "loftr", "there is no locator 'loftr'; known: direct and opencv-sift"),
         ("locator", "sum", "there is no locator 'sum'; it is one of the mergers"),
         ("source", "cube", "there is no source 'cube'"),
