@@ -49,8 +49,15 @@ PROGRAM = [sys.executable, "-c", "from photonpano.cli import main; main()"]
 def simulate(folder: Path, n_frames: int) -> Path:
     """Write a capture that moves by 0.02 px a frame, with its truth beside it."""
     cube = folder / f"{n_frames}.npy"
-    path = {"kind": "random-spline", "length_px": PX_A_FRAME * n_frames}
-    simulator = {"scene": {"kind": "street"}, "path": path, "flux": 0.3, "n_frames": n_frames, "frame_shape": SHAPE}
+    length_px = PX_A_FRAME * n_frames
+    width = max(2048, round(length_px))
+    simulator = {
+        "scene": {"kind": "street", "width": width, "height": width * 2 // 3},
+        "path": {"kind": "random-spline", "length_px": length_px},
+        "flux": 0.3,
+        "n_frames": n_frames,
+        "frame_shape": SHAPE,
+    }
     spec = cube.with_suffix(".yaml")
     # JSON is YAML.
     spec.write_text(json.dumps({"version": 1, "source": {"use": "simulator", "with": simulator}}))
