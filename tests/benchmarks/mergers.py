@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from photonpano import FrameSpan, Group
+from photonpano import FrameSpan, Group, SourceContext
 from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
-from photonpano_core.packed_npy import PackedNpyConfig, PackedNpySource
+from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.robust_merge import RobustMerger
 from photonpano_core.splat import SplatMerger
@@ -30,7 +30,7 @@ from photonpano_simulator.config import StreetScene
 from photonpano_simulator.scenes import scene_flux
 
 if TYPE_CHECKING:
-    from photonpano import Merger
+    from photonpano import Merger, Source
 
 SHAPE = (254, 496)
 SPEEDS_PX = (0.02, 0.15, 0.6)
@@ -52,14 +52,14 @@ def panning(speed_px: float, n_frames: int) -> FrameTrajectory:
     return FrameTrajectory(np.array([translation(speed_px * frame, 0.1 * speed_px * frame) for frame in range(n_frames)]))
 
 
-def opened(folder: Path, frames: np.ndarray) -> PackedNpySource:
+def opened(folder: Path, frames: np.ndarray) -> Source:
     """Write frames as a capture, and open it."""
     file = folder / "cube.npy"
     np.save(file, np.packbits(frames, axis=-1))
-    return PackedNpySource(PackedNpyConfig(path=file))
+    return PACKED_NPY.build(PackedNpyConfig(path=file), SourceContext())
 
 
-def seconds(merger: Merger, source: PackedNpySource, motion: FrameTrajectory) -> float:
+def seconds(merger: Merger, source: Source, motion: FrameTrajectory) -> float:
     """Return the CPU time of a frame."""
     group = Group(FrameSpan(0, TIMED_FRAMES), (TIMED_FRAMES - 1) / 2)
     times = []

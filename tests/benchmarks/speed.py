@@ -25,12 +25,12 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
-from photonpano import FrameSpan
+from photonpano import FrameSpan, SourceContext
 from photonpano.evaluation import FrameTrajectory, load_truth
 from photonpano.geometry import inverse
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.midpoint import MidpointResampler
-from photonpano_core.packed_npy import PackedNpyConfig, PackedNpySource
+from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def sums(cube: Path) -> list[str]:
     """Return the rows of the table of sums: GB of packed frames a second."""
     frame_bytes = SHAPE[0] * SHAPE[1] // 8
     rows = ["| Frames in a sum | unpackbits | one thread | two threads |", "| --- | --- | --- | --- |"]
-    with PackedNpySource(PackedNpyConfig(path=cube)) as source:
+    with PACKED_NPY.build(PackedNpyConfig(path=cube), SourceContext()) as source:
         source.counts(FrameSpan(0, 600))
         packed = np.load(cube, mmap_mode="r")
         for length in (8, 16, 32, 64, 250, 500):
@@ -138,7 +138,7 @@ def merging(cube: Path) -> list[str]:
         "| Moves within a chunk | 100,000 frames, two threads | against frame by frame | PSNR lost |",
         "| --- | --- | --- | --- |",
     ]
-    with PackedNpySource(PackedNpyConfig(path=cube)) as source:
+    with PACKED_NPY.build(PackedNpyConfig(path=cube), SourceContext()) as source:
         groups = MidpointResampler(MidpointConfig(group_size=GROUP_SIZE)).groups(source.info.n_frames, 3)
         scene, response = truth.scene, source.response
         assert scene is not None

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 HEAVY = ("cv2", "h5py", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia", "pycolmap")
 COMMANDS = ["--help", "plugins list", "plugins show direct", "schema", "check scan.yaml"]
 HELP_SECONDS = 0.5
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted([*(ROOT / "tests" / "benchmarks").glob("*.py"), *(ROOT / "docs").glob("*.py")])
 
 
 def imported_by(statement: str, folder: Path | None = None) -> set[str]:
@@ -24,6 +24,15 @@ def imported_by(statement: str, folder: Path | None = None) -> set[str]:
         [sys.executable, "-c", f"{tell}\n{statement}"], capture_output=True, text=True, check=True, cwd=folder
     )
     return set(done.stderr.split())
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
+def test_what_the_suite_does_not_run_can_be_imported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Benchmarks and the scripts of the docs take too long to run here, and are not to fall behind."""
+    spec = importlib.util.spec_from_file_location(f"script_{script.stem}", script)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # as dataclasses look it up
+    spec.loader.exec_module(module)
 
 
 def test_the_package_imports_nothing_at_all() -> None:
