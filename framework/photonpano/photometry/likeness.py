@@ -106,11 +106,16 @@ def autocorrelation(image: NDArray[np.float32]) -> FloatArray:
         (2 H // 4 + 1, W // 4 + 1): lags along y from the most negative to the largest, lags along x from 0.
     """
     down, across = (side // _LAGS for side in image.shape)
-    # So wide that what leaves at one side does not come back at the other.
-    shape = image.shape[0] + down, image.shape[1] + across
-    products = np.fft.irfft2(np.square(np.abs(np.fft.rfft2(image, shape))), shape)
+    # So wide that what leaves at one side does not come back at the other, and of factors that are quick to transform.
+    shape = _rounded_up(image.shape[0] + down), _rounded_up(image.shape[1] + across)
+    spectrum = np.fft.rfft2(image, shape)
+    products = np.fft.irfft2(spectrum.real**2 + spectrum.imag**2, shape)
     lags = np.roll(products, down, axis=0)[: 2 * down + 1, : across + 1]
     return np.asarray(lags / lags[down, 0] if lags[down, 0] > 0 else np.zeros_like(lags))
+
+
+def _rounded_up(length: int) -> int:
+    return -(-length // 32) * 32
 
 
 def likeness_of(
