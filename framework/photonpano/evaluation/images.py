@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from photonpano.geometry import apply
 from photonpano.photometry import linear_to_srgb
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from photonpano.geometry import Canvas
     from photonpano.values import BoolArray, FluxImage, Homography
 
@@ -90,7 +92,8 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
     whole = cv2.erode(compared.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)).astype(bool)
     ssim = np.nan
     if whole.any():
-        _, similarity = structural_similarity(  # type: ignore[no-untyped-call]
+        similarity_of: Callable[..., Any] = structural_similarity
+        _, similarity = similarity_of(
             first, second, data_range=1.0, gaussian_weights=True, sigma=_SSIM_SIGMA, use_sample_covariance=False, full=True
         )
         ssim = float(similarity[whole].mean(dtype=np.float64))

@@ -1,8 +1,7 @@
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +9,6 @@ from pydantic import BaseModel
 
 from photonpano import FrameSpan, InputError
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, read_json
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_files_come_in_natural_order(tmp_path: Path) -> None:
@@ -39,11 +35,14 @@ def source(tmp_path: Path) -> PackedFileSource:
     return PackedFileSource(files, FrameLayout((4, 16), (4, 2)))
 
 
+DESCRIPTORS = Path("/proc/self/fd")
+
+
 def open_files() -> int:
-    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    return len(list(DESCRIPTORS.iterdir()))
 
 
-@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="only Linux lists the open files of a process")  # noqa: PTH112
+@pytest.mark.skipif(not DESCRIPTORS.is_dir(), reason="only Linux lists the open files of a process")
 def test_few_of_many_files_are_open_at_a_time(source: PackedFileSource) -> None:
     before = open_files()
 
