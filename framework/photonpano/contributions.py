@@ -173,11 +173,14 @@ class SourceContribution(Contribution[C, SourceContext, Source]):
         check: problems of a config that can be told without reading the capture, such as a missing file.
         recognise: tells whether a path is a capture of this source, for specs that leave the choice to `auto`. It looks at
             names, sizes and first bytes, imports nothing heavy, and raises nothing.
+        suffixes: how the names of its files end, in small letters, such as ".npy": if nobody recognises a path, only sources
+            are heard of whose files it could be. Empty for any.
     """
 
     kind: ClassVar[str] = "source"
     check: Callable[[C], Sequence[str]] = no_problems
     recognise: Callable[[Path], Recognised | None] = _not_ours
+    suffixes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

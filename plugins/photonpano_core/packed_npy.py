@@ -139,4 +139,5 @@ PACKED_NPY = SourceContribution(
     build=lambda config, _: _open(config),
     check=_check,
     recognise=_recognise,
+    suffixes=(".npy", ".gz"),
 )

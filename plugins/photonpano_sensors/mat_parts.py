@@ -133,4 +133,5 @@ MAT_PARTS = SourceContribution(
     build=lambda config, _: MatPartsSource(config),
     check=_check,
     recognise=_recognise,
+    suffixes=(".mat",),
 )

@@ -35,4 +35,5 @@ SPAD512 = SourceContribution(
     build=lambda config, _: opened(config, LAYOUT, FOOTER_BYTES),
     check=lambda config: checked(config, LAYOUT, FOOTER_BYTES),
     recognise=_recognise,
+    suffixes=(".bin",),
 )

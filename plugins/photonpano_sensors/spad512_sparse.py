@@ -143,4 +143,5 @@ SPAD512_SPARSE = SourceContribution(
     build=lambda config, _: Spad512SparseSource(config),
     check=_check,
     recognise=_recognise,
+    suffixes=(".bin",),
 )

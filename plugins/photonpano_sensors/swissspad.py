@@ -97,6 +97,7 @@ SWISSSPAD_HALF = SourceContribution(
     build=lambda config, _: opened(config, HALF),
     check=lambda config: checked(config, HALF),
     recognise=lambda path: _recognise(path, "half"),
+    suffixes=(".bin",),
 )
 SWISSSPAD_FULL = SourceContribution(
     name="swissspad-full",
@@ -105,4 +106,5 @@ SWISSSPAD_FULL = SourceContribution(
     build=lambda config, _: opened(config, FULL),
     check=lambda config: checked(config, FULL),
     recognise=lambda path: _recognise(path, "full"),
+    suffixes=(".bin",),
 )

@@ -60,5 +60,6 @@ UBICEPT_H5 = SourceContribution(
     build=_build,
     check=_check,
     recognise=_recognise,
+    suffixes=(".h5",),
     requires=(Requirement("h5py", "photonpano[hdf5]"),),
 )

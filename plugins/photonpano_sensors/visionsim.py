@@ -191,4 +191,5 @@ VISIONSIM = SourceContribution(
     build=lambda config, _: _open(config),
     check=_check,
     recognise=_recognise,
+    suffixes=(".json",),
 )

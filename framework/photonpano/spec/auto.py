@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from heapq import nsmallest
+from itertools import islice
 from typing import TYPE_CHECKING
 
+from photonpano.contributions import SourceContribution
 from photonpano.registry.auto import AUTO, AutoConfig, ask_sources
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.suggestions import listed
@@ -27,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 _SHOWN = 3
 """So many names of a folder are shown."""
+_LOOKED_AT = 1000
+"""So many files of a folder tell whose they could be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +85,8 @@ def found_source(keys: Value, catalog: Catalog, directory: Path, problems: list[
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
             # The path is named once; each line has its last part.
-            near = [line.replace(str(path), path.name) for line in _near_misses(keys, catalog, directory)]
-            lines = [*near, *answers.failures]
+            near = [line.replace(str(path), path.name) for line in _near_misses(keys, catalog, directory, path)]
+            lines = [*(near or _known_endings(catalog)), *answers.failures]
             message = "\n  ".join([f"no source recognises {path}, {_looks(path)}; name the one that reads it", *lines])
         problems.append(place.problem(message))
         return None
@@ -98,11 +102,21 @@ def found_source(keys: Value, catalog: Catalog, directory: Path, problems: list[
     return Found(entry.name, replace(keys, content=given | others), path, answer.because)
 
 
-def _near_misses(keys: Value, catalog: Catalog, directory: Path) -> Iterator[str]:
-    """Yield what each source that could be told the same keys has against the capture."""
+def _near_misses(keys: Value, catalog: Catalog, directory: Path, path: Path) -> Iterator[str]:
+    """Yield what each source whose files it could be, and that could be told the same keys, has against the capture."""
+    endings = {each.suffix.lower() for each in ([path] if path.is_file() else islice(path.rglob("*"), _LOOKED_AT))}
     for entry in catalog.rows:
-        if entry.kind == AUTO.kind and entry.contribution is not AUTO:
-            yield from (f"{entry.name}: {each}" for each in _complaints(entry, keys, directory))
+        if isinstance(entry.contribution, SourceContribution) and entry.contribution is not AUTO:
+            suffixes = entry.contribution.suffixes
+            if not suffixes or endings & {*suffixes}:
+                yield from (f"{entry.name}: {each}" for each in _complaints(entry, keys, directory))
+
+
+def _known_endings(catalog: Catalog) -> list[str]:
+    """Say what the files of captures are called."""
+    sources = [each.contribution for each in catalog.rows if isinstance(each.contribution, SourceContribution)]
+    endings = sorted({suffix for source in sources for suffix in source.suffixes})
+    return [f"the names of files of captures end in {listed(endings)}"] if endings else []
 
 
 def _complaints(entry: Entry, keys: Value, directory: Path) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from photonpano import Requirement, SourceContribution
 from photonpano.reading import objections
 from photonpano_sensors.intensity.configs import FastcamMrawConfig, ImageFolderConfig, VideoConfig
 from photonpano_sensors.intensity.recognition import (
+    PICTURES,
     is_file,
     recognise_mraw,
     recognise_pictures,
@@ -68,6 +69,7 @@ INTENSITY_SOURCES: tuple[SourceContribution[Any], ...] = (
         build=_build_video,
         check=_check_video,
         recognise=recognise_video,
+        suffixes=(".mp4", ".avi", ".mov", ".mkv"),
         requires=(Requirement("av", "photonpano[video]"),),
     ),
     SourceContribution(
@@ -77,6 +79,7 @@ INTENSITY_SOURCES: tuple[SourceContribution[Any], ...] = (
         build=_build_mraw,
         check=_check_mraw,
         recognise=recognise_mraw,
+        suffixes=(".mraw", ".cih", ".cihx"),
     ),
     SourceContribution(
         name="image-folder",
@@ -85,5 +88,6 @@ INTENSITY_SOURCES: tuple[SourceContribution[Any], ...] = (
         build=_build_pictures,
         check=_check_pictures,
         recognise=recognise_pictures,
+        suffixes=PICTURES,
     ),
 )

@@ -66,11 +66,37 @@ def test_what_was_recognised_is_laid_under_what_is_written(folder, catalog):
     assert set(plan.places) >= {"source.with.path", "source.with.order", "source.with.rows"}
 
 
-def test_nobody_recognises_it(folder, catalog):
-    said = told(folder, catalog.including(HALVES), "source: {use: auto, with: {path: cube.dat}}")
-    assert said == (
-        "scan.yaml:2:34: source.with.path: no source recognises cube.dat, a file of 5 bytes; name the one that reads it"
+def fussy(name, *suffixes):
+    """Offer a source that recognises nothing and has something against everything."""
+    return SourceContribution(
+        name=name,
+        summary="Toy",
+        config=HalvesConfig,
+        build=lambda *_: None,
+        check=lambda config: [f"{config.path} is not mine"],
+        suffixes=suffixes,
     )
+
+
+FUSSY = [fussy("any"), fussy("bins", ".bin"), fussy("dats", ".dat", ".data")]
+
+
+@pytest.mark.parametrize(
+    ("path", "looks", "heard"),
+    [("cube.dat", "a file of 5 bytes", ["any", "dats"]), ("recording", "a folder of left.bin", ["any", "bins"])],
+)
+def test_nobody_recognises_it(folder, catalog, path, looks, heard):
+    """Those speak whose files it could be, or who do not say what theirs are called."""
+    said = told(folder, catalog.including(*FUSSY), f"source: {{use: auto, with: {{path: {path}}}}}")
+    first, *others = said.splitlines()
+    assert first == f"scan.yaml:2:34: source.with.path: no source recognises {path}, {looks}; name the one that reads it"
+    assert others == [f"  {name}: {path} is not mine" for name in heard]
+
+
+def test_nobody_has_files_that_are_called_so(folder, catalog):
+    (folder / "cube.txt").touch()
+    said = told(folder, catalog.including(*FUSSY[1:]), "source: {use: auto, with: {path: cube.txt}}")
+    assert said.splitlines()[1:] == ["  the names of files of captures end in .bin, .dat and .data"]
 
 
 @pytest.mark.parametrize(
