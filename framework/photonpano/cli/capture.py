@@ -84,13 +84,13 @@ def plan_for(
     try:
         return parse_spec({"version": 1, "source": {"use": "auto", "with": {"path": path}}}, overrides=changes)
     except SpecError as error:
-        raise WrongArgumentError("\n".join(map(_told, error.problems))) from error
+        raise WrongArgumentError("\n".join(_told(each, source) for each in error.problems)) from error
 
 
-def _told(problem: Problem) -> str:
-    """Say what is wrong without naming a spec that nobody wrote."""
+def _told(problem: Problem, source: str | None) -> str:
+    """Say what is wrong without naming a spec that nobody wrote, nor a source."""
     where = problem.where
-    if where in ("", "source", "source.with.path"):
+    if where in ("", "source", "source.with.path") or (where == "source.use" and source is None):
         return problem.message
     if where.startswith("corrections"):
         return f"--correct: {problem.message}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,6 +79,15 @@ def test_what_is_wrong_is_told_by_the_name_of_the_option(cube: Path, arguments: 
     with pytest.raises(WrongArgumentError) as caught:
         plan_for(**{"path": Path("cube.npy")} | arguments)
     assert str(caught.value).startswith(message.replace("{folder}", str(cube.parent)))
+
+
+def test_a_source_that_nobody_named_is_not_blamed_on_an_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *args: None if name == "av" else found(name, *args))
+    (folder / "film.mp4").write_bytes(b"....ftypisom")
+    with pytest.raises(WrongArgumentError) as caught:
+        plan_for(Path("film.mp4"))
+    assert str(caught.value).startswith("the source 'video' needs av, which is not installed: pip install ")
 
 
 def test_check_and_explain_say_what_auto_is_and_why(cube: Path, invoke: Callable[..., Any]) -> None:
