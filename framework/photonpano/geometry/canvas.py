@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from photonpano.values import FloatArray, Homography
 
 
+_AT_ONCE = 8192
+"""So many frames are looked at together, which bounds the memory that it takes."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Canvas:
     """The pixel grid of a panorama.
@@ -45,13 +49,15 @@ def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: flo
         ValueError: a frame reaches the horizon of the reference plane, so that no finite canvas holds it.
     """
     frame = corners(frame_shape)
-    depth = homographies[:, 2:, :2] @ frame.T + homographies[:, 2:, 2:]
+    depth = (homographies[:, 2:, :2] @ frame.T + homographies[:, 2:, 2:]).min(axis=(1, 2))
     if depth.min() <= 0:
-        index = int(np.argmin(depth.min(axis=(1, 2))))
+        index = int(np.argmin(depth))
         raise ValueError(f"homography {index} of {len(homographies)} sends part of its frame behind the reference plane")
-    points = apply(homographies, frame).reshape(-1, 2)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for start in range(0, len(homographies), _AT_ONCE):
+        points = apply(homographies[start : start + _AT_ONCE], frame).reshape(-1, 2)
+        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     # Whole reference pixels, so that the canvas of scale 1 samples the reference frame without interpolation.
-    low = np.floor(points.min(axis=0) + 1e-6)
-    high = np.ceil(points.max(axis=0) - 1e-6)
+    low, high = np.floor(low + 1e-6), np.ceil(high - 1e-6)
     width, height = np.ceil((high - low + 1) * scale - 1e-6).astype(int)
     return Canvas(int(height), int(width), rescaling(scale) @ translation(-low[0], -low[1]))

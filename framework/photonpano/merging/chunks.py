@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from photonpano.protocols import Trajectory
-    from photonpano.values import Homography
+    from photonpano.values import FloatArray, Homography
+
+
+_AT_ONCE = 8192
+"""So many frames are looked at together, which bounds the memory that it takes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,16 +45,22 @@ def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, i
         tolerance_px: length of the way of a corner, in pixels of a frame, that one warp may ignore. A chunk is warped at its
             centre instant, so that no photon is misplaced by more than about half of it.
     """
-    frames = np.arange(span.start, span.stop)
-    homographies = trajectory.at(frames)
-    # Seen from frame t, in its own pixels: how far frame t + 1 has moved.
-    steps = inverse(homographies[:-1]) @ homographies[1:]
-    way = np.concatenate([[0.0], np.cumsum(corner_displacements(steps, np.eye(3), frame_shape).max(axis=-1))])
-    starts = np.flatnonzero(np.diff(np.floor(way / tolerance_px), prepend=-1.0))
-    stops = np.append(starts[1:], len(frames))
-    spans = [FrameSpan(int(frames[start]), int(frames[stop - 1]) + 1) for start, stop in zip(starts, stops, strict=True)]
+    parts = range(span.start, span.stop - 1, _AT_ONCE)
+    steps = [_steps_px(trajectory, start, min(start + _AT_ONCE, span.stop - 1), frame_shape) for start in parts]
+    way = np.cumsum(np.concatenate([[0.0], *steps]))
+    starts = span.start + np.flatnonzero(np.diff(np.floor(way / tolerance_px), prepend=-1.0))
+    stops = np.append(starts[1:], span.stop)
+    spans = [FrameSpan(start, stop) for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
     centres = trajectory.at([chunk.centre for chunk in spans])
     return tuple(Chunk(chunk, homography) for chunk, homography in zip(spans, centres, strict=True))
+
+
+def _steps_px(trajectory: Trajectory, start: int, stop: int, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return how far the corners of the frames from start to stop move to the next frame, at most: (stop - start,)."""
+    homographies = trajectory.at(np.arange(start, stop + 1))
+    # Seen from frame t, in its own pixels: how far frame t + 1 has moved.
+    steps = inverse(homographies[:-1]) @ homographies[1:]
+    return np.asarray(corner_displacements(steps, np.eye(3), frame_shape).max(axis=-1))
 
 
 def clipped(chunks: Sequence[Chunk], span: FrameSpan, trajectory: Trajectory) -> tuple[Chunk, ...]:

@@ -181,16 +181,14 @@ class Adjustment:
         d_fixed = -self._generators @ mapped[:, None]
         root = np.sqrt(weights)[:, None, None] * self._whitening
         n_edges = len(weights)
-        edge_rows = np.arange(8 * n_edges).reshape(n_edges, 8, 1)
-        data, row, column = [], [], []
-        for nodes, d in ((self._moving, d_moving), (self._fixed, d_fixed)):
-            block = root @ slopes(mapped, d)
-            data.append(block.ravel())
-            row.append(np.broadcast_to(edge_rows, block.shape).ravel())
-            column.append(np.broadcast_to(8 * nodes[:, None, None] + np.arange(8), block.shape).ravel())
-        entries = (np.concatenate(data), (np.concatenate(row), np.concatenate(column)))
+        # Each residual depends on the eight unknowns of both nodes of its edge, and on no others.
+        entries = np.concatenate([root @ slopes(mapped, d) for d in (d_moving, d_fixed)], axis=2)
+        unknowns = (8 * np.stack([self._moving, self._fixed], axis=1)[..., None] + np.arange(8)).reshape(n_edges, 1, 16)
+        columns = np.broadcast_to(unknowns, entries.shape).astype(np.int32)
+        starts = np.arange(0, entries.size + 1, 16, dtype=np.int32)
         residuals = np.einsum("eij,ej->ei", root, self._residuals(homographies).reshape(-1, 8))
-        return sparse.csr_array(entries, shape=(8 * n_edges, 8 * self._n_nodes)), residuals.ravel()
+        shape = 8 * n_edges, 8 * self._n_nodes
+        return sparse.csr_array((entries.ravel(), columns.ravel(), starts), shape=shape), residuals.ravel()
 
 
 def _solved(normal: sparse.csr_array, right: FloatArray) -> FloatArray:
