@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -23,13 +24,13 @@ class Rearrangement(Correction):
         del source, decide
         return pixels.rearranged(self.moved(numbered(pixels.shape)))
 
+    @abstractmethod
     def moved(self, pixels: Index) -> Index:
         """Return the (H, W) numbers of pixels where they are to lie, -1 for pixels that the sensor does not have.
 
         Raises:
             InputError: the frame is too small.
         """
-        raise NotImplementedError
 
 
 class Crop(Rearrangement):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
@@ -78,7 +79,7 @@ class Pixels:
             raise InputError(f"{what} is of {given} px, and frames are of {here} px at this place of the list")
 
 
-class Correction(Config):
+class Correction(Config, ABC):
     """One correction of a list: its settings, and what it does.
 
     Attributes:
@@ -92,6 +93,7 @@ class Correction(Config):
         """Whether it takes something out of sums of frames, rather than moving or masking pixels."""
         return False
 
+    @abstractmethod
     def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
         """Apply it to what the corrections before it have left.
 
@@ -104,7 +106,6 @@ class Correction(Config):
         Raises:
             InputError: it does not suit the pixels, or a file is not what it should be.
         """
-        raise NotImplementedError
 
 
 def numbered(shape: tuple[int, ...]) -> Index:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import subprocess
@@ -110,7 +109,6 @@ def heed_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise there")
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_conversion_is_continued(cube: Path, invoke: Callable[..., Any], sent: signal.Signals) -> None:
     part, command = cube.parent / "out.npy.part", [sys.executable, "-c", SLOWLY, "convert", "cube.npy", "out.npy"]

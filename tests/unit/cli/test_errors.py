@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import subprocess
 import time
@@ -195,7 +194,6 @@ def heed_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals are sent otherwise there")
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: list[str], sent: signal.Signals) -> None:
     command = [*program, "simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=100000"]
