@@ -138,5 +138,7 @@ def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
     if side not in ("lower", "higher"):
         raise InputError(f"{path}: {_KEYS['effective side'][name]!r} must be Lower or Higher, got {side:.40}")
     white = 2**effective - 1
-    encoding = Encoding(effective, 0.0, white) if side == "lower" else Encoding(bits, 0.0, white << (bits - effective))
+    # However few are effective, levels of more than a byte stay so.
+    low = Encoding(max(effective, min(bits, 9)), 0.0, white)
+    encoding = low if side == "lower" else Encoding(bits, 0.0, white << (bits - effective))
     return Header(count("frames"), height, width, bits, encoding, rate_hz / max(every, 1) or None)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano import InputError
+from photonpano.reading import OpenFiles
 from photonpano_sensors.intensity.cih import read_header
 from photonpano_sensors.intensity.recognition import header_beside, mraw_beside, refuse_mdat
 from photonpano_sensors.intensity.source import IntensitySource
@@ -15,8 +15,6 @@ from photonpano_sensors.intensity.summing import unpack_12_bits
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from photonpano import FrameSpan
     from photonpano_sensors.intensity.cih import Header
@@ -35,31 +33,21 @@ class FastcamMrawSource(IntensitySource):
         self._path, header = open_recording(config.path)
         super().__init__(config, (header.n_frames, header.height, header.width), header.frame_rate_hz, header.encoding)
         self._header = header
-        self._file = self._path.open("rb", buffering=0)
+        self._files = OpenFiles()
 
     def close(self) -> None:
         """Let go of the file."""
-        self._file.close()
+        self._files.close()
 
     def _read(self, span: FrameSpan, levels: Levels) -> None:
-        flat = levels.reshape(-1)
+        frame_bytes = self._header.frame_bytes
+        flat, position = levels.reshape(-1), span.start * frame_bytes
         if self._header.bits != 12:
-            self._fill(flat.view(np.uint8), span)
+            self._files.read(self._path, position, flat.view(np.uint8))
             return
-        packed = np.empty(len(span) * self._header.frame_bytes, np.uint8)
-        self._fill(packed, span)
+        packed = np.empty(len(span) * frame_bytes, np.uint8)
+        self._files.read(self._path, position, packed)
         unpack_12_bits(packed, flat.view(np.uint16))
-
-    def _fill(self, content: NDArray[np.uint8], span: FrameSpan) -> None:
-        target, position = content.data, span.start * self._header.frame_bytes
-        while target:
-            try:
-                done = os.preadv(self._file.fileno(), [target], position)
-            except OSError as error:
-                raise InputError(f"cannot read {span} of {self._path}: {error.strerror}") from error
-            if not done:
-                raise InputError(f"{self._path} has become shorter: {span} are no longer in it; copy or record it again")
-            target, position = target[done:], position + done
 
 
 def open_recording(path: Path) -> tuple[Path, Header]:

@@ -69,11 +69,15 @@ def index_of(path: Path) -> VideoIndex:
         stream = container.streams.video[0]
         context = stream.codec_context
         try:
-            # An empty packet ends the stream; others are of frames that editing has cut away.
-            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
+            # An empty packet ends the stream; others are of frames that editing has cut away. None is kept: they hold the film.
+            told = [
+                (packet.dts if packet.pts is None else packet.pts, packet.is_keyframe)
+                for packet in container.demux(stream)
+                if packet.size and not packet.is_discard
+            ]
         except av.FFmpegError as error:
             raise InputError(f"{path} is damaged: {error.strerror}; export or copy it again") from error
-        times = np.array([packet.dts if packet.pts is None else packet.pts for packet in packets], dtype=np.float64)
+        times = np.array([time for time, _ in told], dtype=np.float64)
         if not len(times):
             raise InputError(f"{path} has no frames; export or copy it again")
         if np.isnan(times).any() or len(np.unique(times)) < len(times):
@@ -83,7 +87,7 @@ def index_of(path: Path) -> VideoIndex:
                 f"{path} is cut short: it promises {stream.frames} frames and holds {len(times)}; export or copy it again"
             )
         order = np.argsort(times)
-        keys = np.flatnonzero(np.array([packet.is_keyframe for packet in packets])[order])
+        keys = np.flatnonzero(np.array([key for _, key in told])[order])
         if not len(keys) or keys[0]:
             raise InputError(f"{path} does not begin with a frame that stands alone; export it again")
         if context.format is None or not context.width * context.height:

@@ -46,6 +46,22 @@ def test_levels_in_the_higher_bits_are_known(tmp_path: Path) -> None:
     assert read_header(tmp_path / "a.cih").encoding == Encoding(16, 0, 0xFFF0)
 
 
+@pytest.mark.parametrize("bits", [12, 16])
+def test_few_levels_in_large_pixels_are_read(tmp_path: Path, bits: int) -> None:
+    levels = np.random.default_rng(0).integers(0, 256, (3, 4, 6), dtype=np.uint16)
+    stored = levels.astype("<u2").tobytes()
+    if bits == 12:
+        first, second = levels.reshape(-1, 2).T
+        stored = np.stack([first >> 4, (first & 15) << 4 | second >> 8, second & 255], axis=1).astype(np.uint8).tobytes()
+    keys = {"Image Width": 6, "Image Height": 4, "Total Frame": 3, "Color Bit": bits, "File Format": "MRaw"}
+    keys |= {"EffectiveBit Depth": 8, "EffectiveBit Side": "Lower"}
+    (tmp_path / "a.cih").write_text("".join(f"{key} : {value}\n" for key, value in keys.items()))
+    (tmp_path / "a.mraw").write_bytes(stored)
+    with FastcamMrawSource(FastcamMrawConfig(path=tmp_path / "a.mraw")) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), levels)
+        assert source.response.saturation_level == 255
+
+
 def test_entities_are_not_expanded(tmp_path: Path) -> None:
     """A document type is cut off, or makes the header a damaged one."""
     entities = b'<!DOCTYPE a [<!ENTITY a "999"><!ENTITY b "&a;&a;"><!ENTITY c "&b;&b;">]>'

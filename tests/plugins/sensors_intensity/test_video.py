@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,13 @@ from photonpano_sensors.intensity.configs import ResponseConfig, VideoConfig
 
 pytest.importorskip("av")
 
+from photonpano_sensors.intensity import video_index
 from photonpano_sensors.intensity.decoding import DecodedFrames
 from photonpano_sensors.intensity.video import VideoSource
-from photonpano_sensors.intensity.video_index import index_of
+from photonpano_sensors.intensity.video_index import index_of, open_video
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 
@@ -53,6 +55,34 @@ def test_any_frame_is_found_in_any_order(
         assert differences.argmin() == frame
         assert differences[frame] < 6
     decoded.close()
+
+
+def test_the_index_keeps_no_packets(moving: Callable, write_video: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are the film itself, which may be larger than the memory."""
+    alive: weakref.WeakSet[Any] = weakref.WeakSet()
+    most = 0
+
+    class Packet:
+        def __init__(self, packet: Any) -> None:
+            self.pts, self.dts, self.size = packet.pts, packet.dts, packet.size
+            self.is_keyframe, self.is_discard = packet.is_keyframe, packet.is_discard
+
+    class Container:
+        def __init__(self, path: Path) -> None:
+            self._container = open_video(path)
+            self.streams, self.close = self._container.streams, self._container.close
+
+        def demux(self, stream: Any) -> Iterator[Packet]:
+            nonlocal most
+            for packet in map(Packet, self._container.demux(stream)):
+                alive.add(packet)
+                most = max(most, len(alive))
+                yield packet
+
+    monkeypatch.setattr(video_index, "open_video", Container)
+    index = index_of(write_video(moving(), "a.mp4", "libx264", "yuvj420p"))
+    assert len(index.times) == 40
+    assert most <= 2
 
 
 @pytest.mark.parametrize(
