@@ -118,7 +118,7 @@ def _size(shape: tuple[int, int, int]) -> str:
 
 
 def _check(config: MatPartsConfig) -> Sequence[str]:
-    """Look which parts there are; reading them takes a library."""
+    """Look which parts there are; to read one takes seconds."""
     return objections(_parts, config.path)
 
 

@@ -11,7 +11,6 @@ from pydantic import Field
 from photonpano.contributions import SpecPath
 from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
-from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
     from photonpano.corrections.dark import DarkFrames
@@ -90,11 +89,7 @@ def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tup
 
 def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[BoolArray, int]:
     """Return which pixels of a capture are brighter or darker than their neighbours, and how many frames tell it."""
-    n_frames = source.info.n_frames
-    spans = [source.info.span]
-    if n_frames > _SPANS * _SPAN_FRAMES:
-        starts = np.linspace(0, n_frames - _SPAN_FRAMES, _SPANS).astype(int)
-        spans = [FrameSpan(int(start), int(start) + _SPAN_FRAMES) for start in starts]
+    spans = source.info.spread(_SPANS, _SPAN_FRAMES)
     seen = sum(map(len, spans))
     counts = np.sum([source.counts(span) for span in spans], axis=0)
     response, frames = source.response, float(seen)

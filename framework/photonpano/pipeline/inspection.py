@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.errors import InputError
-from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
     from photonpano.protocols import Source
-    from photonpano.values import StreamInfo
 
 _PLACES, _FRAMES = 16, 16
 """At so many places, so many frames are looked at."""
@@ -23,7 +21,7 @@ def require_photons(source: Source) -> None:
     Raises:
         InputError: no pixel, or every pixel, is lit in all of them; of grey levels, all are black, or saturated.
     """
-    valid, spans = source.valid, _spread(source.info)
+    valid, spans = source.valid, source.info.spread(_PLACES, _FRAMES)
     seen = sum(map(len, spans))
     mean_count = sum(source.counts(span)[valid] for span in spans) / np.float32(seen)
     none, most = source.response.mean_count(np.array([0, np.inf], np.float32)).tolist()
@@ -46,14 +44,6 @@ def saturated_share(source: Source) -> float:
     Their flux is unknown.
     """
     highest = source.response.mean_count(np.array([np.inf], np.float32)).item()
-    spans = _spread(source.info)
+    spans = source.info.spread(_PLACES, _FRAMES)
     full = np.logical_and.reduce([source.counts(span) >= highest * len(span) for span in spans])
     return float(full[source.valid].mean())
-
-
-def _spread(info: StreamInfo) -> list[FrameSpan]:
-    """Return some spans all over a capture; all of it where it is short."""
-    if info.n_frames <= _PLACES * _FRAMES:
-        return [info.span]
-    starts = np.linspace(0, info.n_frames - _FRAMES, _PLACES).astype(int).tolist()
-    return [FrameSpan(start, start + _FRAMES) for start in starts]

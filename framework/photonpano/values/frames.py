@@ -93,6 +93,13 @@ class StreamInfo:
         """All frames."""
         return FrameSpan(0, self.n_frames)
 
+    def spread(self, places: int, frames: int) -> list[FrameSpan]:
+        """Return spans of so many frames at so many places all over the capture; all of it at once where it is no longer."""
+        if self.n_frames <= places * frames:
+            return [self.span]
+        starts = np.linspace(0, self.n_frames - frames, places).astype(int).tolist()
+        return [FrameSpan(start, start + frames) for start in starts]
+
     def require(self, span: FrameSpan) -> None:
         """Refuse a span that the capture does not hold.
 

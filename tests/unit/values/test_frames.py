@@ -44,6 +44,12 @@ def test_a_stream_refuses_frames_it_does_not_hold() -> None:
     assert str(caught.value) == "frames 90 to 100 were asked for, but the capture has 100 frames (0 to 99)"
 
 
+def test_places_are_spread_over_all_of_a_capture() -> None:
+    stream = StreamInfo(1000, 4, 6, None)
+    assert stream.spread(3, 10) == [FrameSpan(0, 10), FrameSpan(495, 505), FrameSpan(990, 1000)]
+    assert stream.spread(100, 10) == [stream.span]
+
+
 @pytest.mark.parametrize("value", [FrameSpan(0, 1), Group(FrameSpan(0, 1), 0), StreamInfo(1, 1, 1, None)])
 def test_values_are_frozen(value: FrameSpan | Group | StreamInfo) -> None:
     field = dataclasses.fields(value)[0].name
