@@ -51,6 +51,7 @@ class Problem:
         file: the spec file, None for a spec that was built in Python.
         line: line in the file, from 1; None if unknown.
         column: column in the line, from 1; None if unknown.
+        override: what has put the value there from outside of the file, such as `locate.with.ratio=0.7`.
     """
 
     where: str
@@ -58,11 +59,13 @@ class Problem:
     file: Path | None = None
     line: int | None = None
     column: int | None = None
+    override: str | None = None
 
     def __str__(self) -> str:
         position = [str(part) for part in (self.file, self.line, self.column) if part is not None]
         head = ":".join(position)
-        return ": ".join(part for part in (head, self.where, self.message) if part)
+        message = f"{self.message} (in the override {self.override})" if self.override else self.message
+        return ": ".join(part for part in (head, self.where, message) if part)
 
 
 class SpecError(PhotonpanoError):

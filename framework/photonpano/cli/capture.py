@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from photonpano.errors import Problem
+    from photonpano.protocols import Source
     from photonpano.spec import Plan
 
 CapturePath = Annotated[
@@ -70,9 +72,11 @@ def plan_for(
         WrongArgumentError: nothing recognises the capture, or an option is wrong.
     """
     from photonpano.cli.outcome import WrongArgumentError
-    from photonpano.errors import SpecError
     from photonpano.spec import load_spec, parse_spec
 
+    for key in keys or ():
+        if "=" not in key:
+            raise WrongArgumentError(f"--with {key}: expected KEY=VALUE, such as frame_rate_hz=96800")
     changes = [f"source.with.{key}" for key in keys or ()]
     if source is not None:
         changes.append(f"source.use={source}")
@@ -81,14 +85,46 @@ def plan_for(
     changes += overrides
     if is_spec(path):
         return load_spec(path, changes)
-    try:
+    with _blaming_options(source):
         return parse_spec({"version": 1, "source": {"use": "auto", "with": {"path": path}}}, overrides=changes)
+
+
+@contextmanager
+def opened(
+    path: Path,
+    source: str | None = None,
+    keys: Sequence[str] | None = None,
+    corrections: Sequence[str] | None = None,
+    overrides: Sequence[str] = (),
+) -> Iterator[tuple[Plan, Source]]:
+    """Open a capture that is given by its path, or by a spec: see `plan_for`.
+
+    What does not suit it may show as late as in the block, and is told by the name of the option as well.
+
+    Raises:
+        InputError: the capture cannot be read.
+    """
+    from photonpano.pipeline.components import build_source
+
+    plan = plan_for(path, source, keys, corrections, overrides)
+    with nullcontext() if is_spec(path) else _blaming_options(source), build_source(plan) as capture:
+        yield plan, capture
+
+
+@contextmanager
+def _blaming_options(source: str | None) -> Iterator[None]:
+    """Say what is wrong without naming a spec that nobody wrote."""
+    from photonpano.cli.outcome import WrongArgumentError
+    from photonpano.errors import SpecError
+
+    try:
+        yield
     except SpecError as error:
         raise WrongArgumentError("\n".join(_told(each, source) for each in error.problems)) from error
 
 
 def _told(problem: Problem, source: str | None) -> str:
-    """Say what is wrong without naming a spec that nobody wrote, nor a source."""
+    """Say what is wrong by the name of the option, if one has brought it in."""
     where = problem.where
     if where in ("", "source", "source.with.path") or (where == "source.use" and source is None):
         return problem.message

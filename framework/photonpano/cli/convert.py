@@ -24,21 +24,19 @@ def convert(
     Example: photonpano convert recording/ cube.npy --with frame_rate_hz=96800
     """
     from photonpano.atomic import part_path
-    from photonpano.cli.capture import plan_for
+    from photonpano.cli.capture import opened
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.written import tell_written
     from photonpano.pipeline.capture import write_packed
-    from photonpano.pipeline.components import build_source
     from photonpano.pipeline.threads import thread_count
 
-    plan = plan_for(path, source, keys, corrections)
     part = part_path(output)
 
     def resumed(there: int) -> None:
         found = f"holds {there:,} of its frames, and is continued" if there else "is of another capture, and is written anew"
         typer.echo(f"{part} {found}", err=True)
 
-    with build_source(plan) as capture:
+    with opened(path, source, keys, corrections) as (plan, capture):
         info, unused = capture.info, int((~capture.valid).sum())
         try:
             with progress_for_stderr().stage(f"writing {output.name}", info.n_frames, "frames") as advance:

@@ -46,9 +46,8 @@ def dark(
     """
     import numpy as np
 
-    from photonpano.api import open_source
     from photonpano.atomic import atomic_path
-    from photonpano.cli.capture import plan_for
+    from photonpano.cli.capture import opened
     from photonpano.cli.outcome import warn
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.wording import columns
@@ -59,8 +58,7 @@ def dark(
 
     if output.suffix not in (".npz", ".npy"):
         raise OutputError(f"cannot write {output}: dark counts are an .npz file, and a mask of hot pixels is a .npy file")
-    plan = plan_for(path, source, keys, corrections)
-    with open_source(plan) as capture:
+    with opened(path, source, keys, corrections) as (plan, capture):
         info, valid = capture.info, capture.valid
         if not valid.any():
             raise InputError(f"{path}: no pixel may be used")

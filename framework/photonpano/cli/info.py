@@ -33,16 +33,16 @@ def info(
     """
     import json
 
-    from photonpano.cli.capture import plan_for
+    from photonpano.cli.capture import opened
     from photonpano.cli.outcome import warn
     from photonpano.cli.wording import columns
-    from photonpano.pipeline.components import build_source, origin_of
+    from photonpano.pipeline.components import origin_of
     from photonpano.pipeline.named import NamedSource
 
     # Whatever a spec says of groups, what the capture asks for is told.
-    plan = plan_for(path, source, keys, corrections, ["resample={use: midpoint}", "levels=1"])
-    with build_source(plan) as opened:
-        facts = _facts(plan, NamedSource(opened, origin_of(plan.source)))
+    overrides = ["resample={use: midpoint}", "levels=1"]
+    with opened(path, source, keys, corrections, overrides) as (plan, capture):
+        facts = _facts(plan, NamedSource(capture, origin_of(plan.source)))
     if as_json:
         typer.echo(json.dumps(facts, indent=2))
         return

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
 from photonpano.corrections import CorrectedSource
-from photonpano.errors import CaptureUnreadError, PhotonpanoError, PluginError, SpecError
+from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
 from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.threads import thread_count
 from photonpano.spec.tree import Place
@@ -86,7 +86,14 @@ def build_source(plan: Plan) -> Source:
         PluginError: a library is missing, or the plugin failed in its own way.
         SpecError: a correction does not suit the capture, or its file is not what it should be.
     """
-    source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+    try:
+        source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+    except InputError as error:
+        found = next((decision for decision in plan.decisions if decision.what == "source"), None)
+        if found is None:
+            raise
+        # Nobody named this source, so it is said why it was asked.
+        raise InputError(f"{error} (source {found.value}: {found.reason})") from error
     if not plan.corrections:
         return source
 

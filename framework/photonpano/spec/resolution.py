@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from photonpano.errors import Problem
     from photonpano.registry import Catalog, Entry, Kind
-    from photonpano.values import Decision
+    from photonpano.spec.auto import Found
 
 VERSION = 1
 LEVELS = 3
@@ -96,7 +96,7 @@ class _Resolver:
         self.catalog = catalog
         self.problems = problems
         self.places = root.places()
-        self.decisions: list[Decision] = []
+        self.recognised: Found | None = None
 
     def plan(self) -> Plan | None:
         """Resolve everything; None if there are problems."""
@@ -108,7 +108,8 @@ class _Resolver:
         sections = {name: written.get(name) or Value(None, replace(self.root.head, where=name)) for name in SECTIONS}
         source = self.select("source", sections["source"]).choice
         if source is not None:
-            self.problems += map(sections["source"].head.problem, complaints(source))
+            complained = list(map(sections["source"].head.problem, complaints(source)))
+            self.problems += self.recognised.blamed(complained) if self.recognised else complained
         corrections = resolved_corrections(sections["corrections"], self.directory, self.problems)
         stages = {name: self.select(name, sections[name]) for name in STAGES}
         levels = [self.level(each, stages) for each in self.levels(sections["levels"])]
@@ -126,7 +127,7 @@ class _Resolver:
             places=self.places,
             file=self.root.head.file,
             observers=self.catalog.observers,
-            decisions=tuple(self.decisions),
+            decisions=(self.recognised.decision,) if self.recognised else (),
         )
         return replace(plan, document=self.document(plan, stages))
 
@@ -180,7 +181,7 @@ class _Resolver:
         found = found_source(keys, self.catalog, self.directory, self.problems)
         if found is None:
             return _Selection(None, keys, None)
-        self.decisions.append(found.decision)
+        self.recognised = found
         self.places = found.keys.places() | self.places
         before = len(self.problems)
         entry = self.entry(kind, value, replace(use, content=found.name))

@@ -34,9 +34,7 @@ class Place:
     def problem(self, message: str, key: str | int | None = None) -> Problem:
         """Make a problem of what stands here, or of one of its keys."""
         where = self.where if key is None else joined(self.where, key)
-        if self.override is not None:
-            message = f"{message} (in the override {self.override})"
-        return Problem(where, message, self.file, self.line, self.column)
+        return Problem(where, message, self.file, self.line, self.column, self.override)
 
 
 @dataclass(slots=True)

@@ -48,7 +48,9 @@ def recognise_pictures(path: Path) -> Recognised | None:
     if _TIFF.match(_start_of(path)):
         return Recognised({"path": path}, "by its first bytes it is a TIFF file")
     found = pictures_in(path)
-    return Recognised({"path": path}, f"it holds {len(found)} {found[0].suffix} files") if found else None
+    if not found:
+        return None
+    return Recognised({"path": path}, f"it holds {len(found)} {found[0].suffix} file{'s' if len(found) > 1 else ''}")
 
 
 def refuse_mdat(path: Path) -> None:

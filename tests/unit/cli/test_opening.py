@@ -64,21 +64,53 @@ def test_a_capture_that_nobody_recognises(cube: Path, invoke: Callable[..., Any]
         ({"source": "nobody"}, "--source: there is no source 'nobody'; known: "),
         (
             {"source": "packed-npy", "keys": ["widht=4"]},
-            "--with widht: unknown key; did you mean 'width'? (in the override source.with.widht=4)",
+            "--with widht: unknown key; did you mean 'width'?",
         ),
         (
             {"keys": ["width=wide"]},
-            "--with width: expected an integer of at least 1 or null, got 'wide' (in the override source.with.width=wide) "
+            "--with width: expected an integer of at least 1 or null, got 'wide' "
             "(cube.npy is taken for packed-npy: uint8 of shape (20, 8, 2) in a .npy file)",
         ),
-        ({"keys": ["width"]}, "expected KEY=VALUE, such as run.seed=1 (in the override source.with.width)"),
+        ({"keys": ["width"]}, "--with width: expected KEY=VALUE, such as frame_rate_hz=96800"),
         ({"corrections": ["rot9"]}, "--correct: there is no correction 'rot9'; did you mean "),
     ],
 )
 def test_what_is_wrong_is_told_by_the_name_of_the_option(cube: Path, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(WrongArgumentError) as caught:
         plan_for(**{"path": Path("cube.npy")} | arguments)
-    assert str(caught.value).startswith(message.replace("{folder}", str(cube.parent)))
+    told = str(caught.value)
+    assert told.startswith(message.replace("{folder}", str(cube.parent)))
+    assert "override" not in told
+
+
+@pytest.mark.parametrize("command", [["info"], ["convert", "out.npy"], ["preview", "-o", "out"], ["dark", "-o", "out.npz"]])
+def test_what_shows_when_the_capture_is_open_is_told_so_as_well(
+    cube: Path, invoke: Callable[..., Any], command: list[str]
+) -> None:
+    name, *others = command
+    result = invoke(name, "cube.npy", *others, "--correct", "{crop: {rows: [9, null]}}")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "error: --correct: the rows [9, null] are no part of a frame, which has 8 rows at this place of the list\n"
+    )
+
+
+def test_a_capture_that_cannot_be_opened_says_what_it_was_taken_for(folder: Path, invoke: Callable[..., Any]) -> None:
+    pytest.importorskip("av")
+    (folder / "film.mp4").write_bytes(b"....ftypisom")
+    result = invoke("info", "film.mp4")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.endswith(
+        "export or copy it again (source video: film.mp4 is taken for it: by its first bytes it is an MP4 or MOV file)\n"
+    )
+
+
+def test_a_check_that_refuses_what_was_recognised_says_what_it_was_taken_for(folder: Path, invoke: Callable[..., Any]) -> None:
+    (folder / "pictures").mkdir()
+    (folder / "pictures" / "a.png").write_bytes(b"no picture")
+    result = invoke("info", "pictures")
+    assert result.exit_code == 2
+    assert result.stderr.endswith("(pictures is taken for image-folder: it holds 1 .png file)\n")
 
 
 def test_a_source_that_nobody_named_is_not_blamed_on_an_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
