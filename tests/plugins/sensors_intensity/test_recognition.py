@@ -51,7 +51,7 @@ def test_videos_are_recognised_by_their_first_bytes(
 def test_pictures_are_recognised(tmp_path: Path) -> None:
     assert recognised(tmp_path) == {}
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
-    assert recognised(tmp_path) == {"image-folder": "it holds 1 .png files"}
+    assert recognised(tmp_path) == {"image-folder": "it holds 1 .png file"}
     tifffile.imwrite(tmp_path / "b.tif", np.zeros((2, 4, 4), np.uint8))
     assert recognised(tmp_path / "b.tif") == {"image-folder": "by its first bytes it is a TIFF file"}
 
