@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from photonpano import FrameSpan, Group, StageContext, StreamInfo, discover, evaluate, load_spec, open_source, parse_spec, run
+from photonpano.captures.writing import truth_path, write_packed
 from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import (
     corner_displacements,
@@ -33,7 +34,6 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.photometry import BinaryResponse, tone_mapped
-from photonpano.pipeline.capture import truth_path, write_packed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,8 +21,8 @@ from photonpano.cli.app import app
 from photonpano.corrections import CORRECTIONS
 from photonpano.registry import KINDS
 from photonpano.registry.description import config_rows
-from photonpano.spec.resolution import SETTINGS
-from photonpano.spec.settings import LevelSettings
+from photonpano.specs.resolution import SETTINGS
+from photonpano.specs.settings import LevelSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -78,9 +78,9 @@ def seen_from(street: np.ndarray, photograph: Callable) -> Callable[..., Virtual
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Write a small capture and its truth: 300 frames of 128x160 px of a street, on a pan of 60 px with a trembling hand."""
-    from photonpano.pipeline.capture import write_packed
+    from photonpano.captures.writing import write_packed
     from photonpano.pipeline.components import build_source
-    from photonpano.spec import parse_spec
+    from photonpano.specs import parse_spec
 
     def simulated(**changes: Any) -> Path:
         shake = {"rms_px": 3, "frequencies_hz": [300, 400, 600]}
@@ -118,7 +118,7 @@ def small_spec(small_capture: Path) -> dict[str, Any]:
 def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A whole run of the small capture. Tests read its folder and leave it as it is."""
     from photonpano import api
-    from photonpano.spec import parse_spec
+    from photonpano.specs import parse_spec
 
     return api.run(parse_spec(small_spec, output=tmp_path_factory.mktemp("runs") / "small"))
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from photonpano.hookspecs import hookimpl
     from photonpano.protocols import (
         Interpolator,
+        KnowsTruth,
         LinearlyCorrectedSource,
         Locator,
         Merger,
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
         Trajectory,
     )
     from photonpano.registry import Catalog, discover
-    from photonpano.spec import Plan, load_spec, parse_spec
+    from photonpano.specs import Plan, load_spec, parse_spec
     from photonpano.values import (
         CaptureSummary,
         FrameSpan,
@@ -72,6 +73,7 @@ __all__ = [
     "InputError",
     "Interpolator",
     "InterpolatorContribution",
+    "KnowsTruth",
     "LinearlyCorrectedSource",
     "Located",
     "LocationError",
@@ -112,5 +114,5 @@ __all__ = [
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
     __getattr__ = imported_on_use(
-        __name__, __all__, ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "spec")
+        __name__, __all__, ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "specs")
     )

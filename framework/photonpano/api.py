@@ -13,14 +13,14 @@ from photonpano.errors import InputError, SpecError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from photonpano.context import Progress
     from photonpano.evaluation import Evaluation
     from photonpano.geometry import Canvas
     from photonpano.pipeline.observers import Observers
-    from photonpano.pipeline.progress import Progress
     from photonpano.protocols import Source, Trajectory
     from photonpano.registry import Catalog
     from photonpano.report import RunRecord
-    from photonpano.spec import Plan
+    from photonpano.specs import Plan
     from photonpano.values import Panorama
 
 
@@ -46,7 +46,7 @@ def open_source(plan: Plan) -> Iterator[Source]:
         SpecError: a stage does not suit it.
     """
     from photonpano.pipeline.components import build_source
-    from photonpano.spec import check_stream
+    from photonpano.specs import check_stream
 
     with build_source(plan) as source:
         if problems := check_stream(plan, source.info):
@@ -64,8 +64,8 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
     Raises:
         PhotonpanoError: the run failed; the message says why, and what was in the run folder before is still there.
     """
+    from photonpano.context import Quiet
     from photonpano.pipeline.observers import Observers
-    from photonpano.pipeline.progress import Quiet
 
     observers = Observers(plan.observers, plan.output.directory)
     with observers.run(plan.document):
@@ -119,10 +119,10 @@ def evaluate(
     Raises:
         InputError: a file is missing or damaged, or run and truth are not of the same capture.
     """
+    from photonpano.context import Context, Quiet
     from photonpano.evaluation import evaluate as evaluate_folder
-    from photonpano.pipeline.panorama import render
-    from photonpano.pipeline.progress import Quiet
-    from photonpano.pipeline.threads import thread_count
+    from photonpano.merging.panorama import render
+    from photonpano.threads import thread_count
 
     if not oracle:
         return evaluate_folder(run_folder, truth)
@@ -130,8 +130,8 @@ def evaluate(
     with open_source(plan) as source:
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
-            threads = thread_count(plan.run)
-            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, threads, progress or Quiet())
+            context = Context(thread_count(plan.run.threads), progress or Quiet())
+            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context)
 
         return evaluate_folder(run_folder, truth, along_truth)
 
@@ -140,7 +140,7 @@ def _recorded_plan(run_folder: Path, catalog: Catalog | None) -> Plan:
     """Return the plan that a run folder was made with."""
     import json
 
-    from photonpano.spec import parse_spec
+    from photonpano.specs import parse_spec
 
     file = run_folder / "run.json"
     if not file.is_file():

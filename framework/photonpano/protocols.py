@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from types import TracebackType
 
     import numpy as np
@@ -92,6 +93,26 @@ class LinearlyCorrectedSource(Source, Protocol):
 
         Returns:
             (H, W) float32.
+        """
+        ...
+
+
+@runtime_checkable
+class KnowsTruth(Protocol):
+    """A source that knows what it shows, as simulators do: a `Source` with one method more.
+
+    `photonpano simulate` stores the truth as an .npz archive, for `photonpano evaluate`.
+    """
+
+    def truth(self) -> Mapping[str, NDArray[np.generic]]:
+        """Return named arrays; others than these may be among them.
+
+        Convention:
+            Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres.
+
+        Returns:
+            `homographies` (T, 3, 3) float64, one for each frame, h33 = 1; `scene` (Hs, Ws) float32, the flux that is detected,
+            in photons per pixel per frame period, without dark counts; `frame_shape` (2,), height and width of a frame.
         """
         ...
 

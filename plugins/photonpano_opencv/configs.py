@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from photonpano.locating import AlignmentConfig, ImageLimits, KeypointConfig, PyramidConfig
+from photonpano.locating import AlignmentConfig, KeypointConfig, PyramidConfig
 
 
 class OpencvSiftConfig(KeypointConfig):
@@ -50,17 +50,3 @@ class PhaseCorrelationConfig(AlignmentConfig):
         5, ge=1, le=20, description="how often the images are shifted by what was found, and correlated again"
     )
     converged_px: float = Field(0.05, gt=0, le=1, description="the shift is found when a round changes it by less")
-
-
-class DirectConfig(PyramidConfig, ImageLimits):
-    """Inverse-compositional alignment, coarse to fine."""
-
-    blur_px: float = Field(0.8, gt=0, le=16, description="standard deviation of the Gaussian that quiets photon noise, in px")
-    max_iterations: int = Field(30, ge=1, le=1000, description="steps at each level of the pyramid")
-    converged_px: float = Field(0.01, gt=0, le=1, description="the alignment is done when a step moves no corner further")
-    max_noise_ratio: float = Field(
-        100.0,
-        gt=1,
-        description="a pair that differs by more than this many times its photon noise is not located, "
-        "unless there is so much light that blur explains it",
-    )

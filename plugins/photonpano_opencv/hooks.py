@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from photonpano import LocatorContribution, hookimpl
-from photonpano_opencv.configs import DirectConfig, OpencvEccConfig, OpencvOrbConfig, OpencvSiftConfig, PhaseCorrelationConfig
+from photonpano_opencv.configs import OpencvEccConfig, OpencvOrbConfig, OpencvSiftConfig, PhaseCorrelationConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,12 +27,6 @@ def photonpano_locators() -> Iterator[LocatorContribution[Any]]:
         summary="ORB keypoints, ratio test on bits, MAGSAC, and a least-squares fit of the inliers",
         config=OpencvOrbConfig,
         build=_build_orb,
-    )
-    yield LocatorContribution(
-        name="direct",
-        summary="Inverse-compositional alignment of brightness, coarse to fine, weighted by photon statistics",
-        config=DirectConfig,
-        build=_build_direct,
     )
     yield LocatorContribution(
         name="opencv-ecc",
@@ -58,13 +52,6 @@ def _build_orb(config: OpencvOrbConfig, context: StageContext) -> Locator:
     from photonpano_opencv.orb import OrbLocator
 
     return OrbLocator(config, context.seed)
-
-
-def _build_direct(config: DirectConfig, context: StageContext) -> Locator:
-    from photonpano_opencv.direct import DirectLocator
-
-    del context
-    return DirectLocator(config)
 
 
 def _build_ecc(config: OpencvEccConfig, context: StageContext) -> Locator:

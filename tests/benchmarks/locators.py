@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from photonpano import FrameSpan, Group, Located, PhotonpanoError, StageContext, discover, open_source, parse_spec
 from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import apply, corner_displacements, corners, inverse, normalised
-from photonpano.pipeline.capture import KnowsTruth
+from photonpano.protocols import KnowsTruth
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 

@@ -22,9 +22,9 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from photonpano import discover, hookspecs, parse_spec
+from photonpano.captures.writing import truth_path
 from photonpano.cli.app import app
 from photonpano.corrections import CORRECTIONS
-from photonpano.pipeline.capture import truth_path
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

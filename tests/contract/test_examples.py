@@ -14,8 +14,8 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from photonpano import open_source, parse_spec
+from photonpano.captures.writing import truth_path
 from photonpano.cli.app import app
-from photonpano.pipeline.capture import truth_path
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
 SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}

@@ -14,7 +14,7 @@ import pytest
 from photonpano import FrameSpan, Group, PluginError, api, hookspecs, registry
 from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 from photonpano.testing import ResamplerConformance
 
 HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}

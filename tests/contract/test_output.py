@@ -13,7 +13,7 @@ import tifffile
 
 from photonpano.geometry import apply, corners
 from photonpano.photometry import tone_mapped
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from pathlib import Path

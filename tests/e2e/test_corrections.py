@@ -10,13 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from photonpano import FrameSpan, SpecError, api
+from photonpano.captures.writing import truth_path, write_packed
 from photonpano.cli.app import app
-from photonpano.pipeline.capture import truth_path, write_packed
+from photonpano.context import Context
+from photonpano.merging.panorama import plan_canvas, render
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import forecast
-from photonpano.pipeline.panorama import plan_canvas, render
-from photonpano.pipeline.progress import Quiet
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def test_a_masked_pixel_is_filled_by_the_motion_and_not_by_its_neighbours(small_
     for name, corrections in {"all": [], "masked": [{"mask": {"file": str(tmp_path / "blind.npy")}}]}.items():
         with build_source(parse_spec(spec_of(small_capture, *corrections))) as source:
             canvas = plan_canvas(motion, source.info.span, SHAPE, 1.0, 2**30)
-            seen[name] = render(source, motion, source.info.span, canvas, 0.125, 1, Quiet())
+            seen[name] = render(source, motion, source.info.span, canvas, 0.125, Context())
             first = source.counts(FrameSpan(0, 1))
     assert first[:, 80:86].any()
     everywhere, masked = seen["all"], seen["masked"]

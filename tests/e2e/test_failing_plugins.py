@@ -24,7 +24,7 @@ from photonpano import (
 )
 from photonpano.registry import Catalog, discover
 from photonpano.registry.catalog import make_entry
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,11 +10,11 @@ import pytest
 from pydantic import Field
 
 from photonpano import Config, LocatorContribution, NotLocated, api
-from photonpano.pipeline.progress import Quiet
+from photonpano.context import Quiet
 from photonpano.pipeline.run import execute
 from photonpano.registry import Catalog, discover
 from photonpano.registry.catalog import make_entry
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from photonpano import Homography, Located, StageContext, VirtualExposure

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from photonpano import api
 from photonpano.cli.app import app
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from photonpano import LocationError, api
-from photonpano.pipeline.progress import Quiet
+from photonpano.context import Quiet
 from photonpano.pipeline.run import execute
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable

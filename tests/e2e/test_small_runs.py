@@ -11,14 +11,14 @@ import pytest
 import tifffile
 
 from photonpano import api
+from photonpano.captures.writing import truth_path
+from photonpano.context import Quiet
 from photonpano.evaluation import corner_errors
 from photonpano.geometry import rescaling, translation
-from photonpano.pipeline.capture import truth_path
-from photonpano.pipeline.panorama import BYTES_PER_PIXEL
-from photonpano.pipeline.progress import Quiet
+from photonpano.merging.panorama import BYTES_PER_PIXEL
 from photonpano.pipeline.run import execute
 from photonpano.pipeline.run_folder import run_folder
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from photonpano.api import RunResult
     from photonpano.evaluation import Evaluation
     from photonpano.pipeline.run import RunOutcome
-    from photonpano.spec import Plan
+    from photonpano.specs import Plan
 
 SHAPE = (128, 160)
 INSIDE = slice(25, 275)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from photonpano.errors import Problem
     from photonpano.protocols import Source
-    from photonpano.spec import Plan
+    from photonpano.specs import Plan
 
 CapturePath = Annotated[
     Path, typer.Argument(metavar="PATH", help="A capture, which is a file or a folder; or a spec (.yaml).", show_default=False)
@@ -72,7 +72,7 @@ def plan_for(
         WrongArgumentError: nothing recognises the capture, or an option is wrong.
     """
     from photonpano.cli.outcome import WrongArgumentError
-    from photonpano.spec import load_spec, parse_spec
+    from photonpano.specs import load_spec, parse_spec
 
     for key in keys or ():
         if "=" not in key:

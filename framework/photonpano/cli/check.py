@@ -16,7 +16,7 @@ def check(spec: Spec, overrides: Overrides = None) -> None:
     from photonpano.api import open_source
     from photonpano.cli.wording import capture_words
     from photonpano.pipeline.components import foreseen_groups
-    from photonpano.spec import load_spec
+    from photonpano.specs import load_spec
 
     plan = load_spec(spec, overrides or ())
     with open_source(plan) as source:

@@ -24,11 +24,11 @@ def convert(
     Example: photonpano convert recording/ cube.npy --with frame_rate_hz=96800
     """
     from photonpano.atomic import part_path
+    from photonpano.captures.writing import write_packed
     from photonpano.cli.capture import opened
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.written import tell_written
-    from photonpano.pipeline.capture import write_packed
-    from photonpano.pipeline.threads import thread_count
+    from photonpano.threads import thread_count
 
     part = part_path(output)
 
@@ -40,7 +40,7 @@ def convert(
         info, unused = capture.info, int((~capture.valid).sum())
         try:
             with progress_for_stderr().stage(f"writing {output.name}", info.n_frames, "frames") as advance:
-                files = write_packed(capture, output, advance, thread_count(plan.run), resumed)
+                files = write_packed(capture, output, advance, thread_count(plan.run.threads), resumed)
         finally:
             if part.exists():
                 typer.echo(f"what is written so far is in {part}; the same command goes on from there", err=True)

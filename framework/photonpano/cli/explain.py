@@ -11,7 +11,7 @@ from photonpano.cli.arguments import Overrides, Spec
 if TYPE_CHECKING:
     from photonpano.protocols import Source
     from photonpano.registry import Catalog
-    from photonpano.spec import Plan
+    from photonpano.specs import Plan
 
 FORETOLD = 3
 """How many levels are described of a plan whose number of levels is open."""
@@ -33,10 +33,10 @@ def explain(
     """
     from photonpano.api import open_source
     from photonpano.cli.wording import capture_words
+    from photonpano.motion.pairs import pairs_of
     from photonpano.pipeline.components import foreseen_groups, scale_of
-    from photonpano.pipeline.pairs import pairs_of
     from photonpano.registry import discover
-    from photonpano.spec import load_spec
+    from photonpano.specs import load_spec
 
     catalog = discover()
     plan = load_spec(spec, overrides or (), catalog=catalog)
@@ -105,7 +105,7 @@ class _Writer:
 
     def _mapping(self, mapping: Mapping[str, Any], where: str, indent: str) -> Iterator[str]:
         from photonpano.registry.description import flow
-        from photonpano.spec.tree import joined
+        from photonpano.specs.tree import joined
 
         for key, value in mapping.items():
             path = joined(where, key)

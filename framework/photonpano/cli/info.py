@@ -9,7 +9,7 @@ from photonpano.cli.capture import CapturePath, Corrections, Keys, SourceName
 
 if TYPE_CHECKING:
     from photonpano.protocols import Source
-    from photonpano.spec import Plan
+    from photonpano.specs import Plan
     from photonpano.values import CaptureSummary
 
 HOT_SHARE = 0.001
@@ -36,13 +36,13 @@ def info(
     from photonpano.cli.capture import opened
     from photonpano.cli.outcome import warn
     from photonpano.cli.wording import columns
+    from photonpano.motion.attribution import AttributedSource
     from photonpano.pipeline.components import origin_of
-    from photonpano.pipeline.named import NamedSource
 
     # Whatever a spec says of groups, what the capture asks for is told.
     overrides = ["resample={use: midpoint}", "levels=1"]
     with opened(path, source, keys, corrections, overrides) as (plan, capture):
-        facts = _facts(plan, NamedSource(capture, origin_of(plan.source)))
+        facts = _facts(plan, AttributedSource(capture, origin_of(plan.source)))
     if as_json:
         typer.echo(json.dumps(facts, indent=2))
         return
@@ -54,13 +54,12 @@ def info(
 
 def _facts(plan: "Plan", source: "Source") -> dict[str, Any]:
     """Look at a capture, and say everything as plain data."""
-    from photonpano.pipeline.inspection import saturated_share
-    from photonpano.pipeline.probing import summarise
-    from photonpano.pipeline.threads import one_thread_inside, thread_count
+    from photonpano.captures.summary import saturated_share, summarise
+    from photonpano.threads import one_thread_inside, thread_count
 
     stream = source.info
     with one_thread_inside():
-        capture = summarise(source, thread_count(plan.run))
+        capture = summarise(source, thread_count(plan.run.threads))
     facts: dict[str, Any] = {
         "source": plan.source.contribution.name,
         "reason": next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
@@ -106,8 +105,8 @@ def _group_size(plan: "Plan", source: "Source", capture: "CaptureSummary") -> di
 
 
 def _warnings(source: "Source", facts: Mapping[str, Any]) -> Iterator[str]:
+    from photonpano.captures.summary import require_photons
     from photonpano.errors import InputError
-    from photonpano.pipeline.inspection import require_photons
 
     try:
         require_photons(source)

@@ -9,7 +9,7 @@ import typer
 from photonpano.cli.capture import CapturePath, Corrections, Keys, SourceName
 
 if TYPE_CHECKING:
-    from photonpano.pipeline.picture_files import Picture
+    from photonpano.captures.picture_files import Picture
 
 
 def preview(
@@ -53,17 +53,17 @@ def preview(
 
     Example: photonpano preview cube.npy --output look.mp4 --group-size 500
     """
+    from photonpano.captures.picture_files import require_writable, write_pictures
+    from photonpano.captures.preview import Look, pictures, preview_spans, white_flux
     from photonpano.cli.capture import opened
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.wording import capture_words
+    from photonpano.motion.attribution import AttributedSource
     from photonpano.pipeline.components import origin_of
-    from photonpano.pipeline.named import NamedSource
-    from photonpano.pipeline.picture_files import require_writable, write_pictures
-    from photonpano.pipeline.preview import Look, pictures, preview_spans, white_flux
-    from photonpano.pipeline.threads import one_thread_inside, thread_count
+    from photonpano.threads import one_thread_inside, thread_count
 
     with opened(path, source, keys, corrections) as (plan, read), one_thread_inside():
-        threads, capture = thread_count(plan.run), NamedSource(read, origin_of(plan.source))
+        threads, capture = thread_count(plan.run.threads), AttributedSource(read, origin_of(plan.source))
         spans = preview_spans(capture.info, group_size, step or group_size)
         require_writable(output, len(spans))
         look = Look(white_flux(capture, spans, quantile, threads) if white is None else white, srgb, label)

@@ -6,7 +6,7 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from photonpano.pipeline.progress import Progress, Quiet
+from photonpano.context import Progress, Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -26,7 +26,7 @@ def run(
     from photonpano.api import run as run_plan
     from photonpano.cli.outcome import warn
     from photonpano.cli.progress import progress_for_stderr
-    from photonpano.spec import load_spec
+    from photonpano.specs import load_spec
 
     result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())
     for warning in result.record["warnings"]:

@@ -23,7 +23,7 @@ def schema(
 
     from photonpano.atomic import atomic_path
     from photonpano.registry import discover
-    from photonpano.spec import json_schema
+    from photonpano.specs import json_schema
 
     text = json.dumps(json_schema(discover()), indent=2, ensure_ascii=False)
     if output is None:

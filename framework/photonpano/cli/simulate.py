@@ -24,17 +24,17 @@ def simulate(
 
     Example: photonpano simulate capture.yaml --output cube.npy
     """
+    from photonpano.captures.writing import write_packed
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.written import tell_written
-    from photonpano.pipeline.capture import write_packed
     from photonpano.pipeline.components import build_source
-    from photonpano.pipeline.threads import thread_count
-    from photonpano.spec import load_spec
+    from photonpano.specs import load_spec
+    from photonpano.threads import thread_count
 
     plan = load_spec(spec, overrides or ())
     with build_source(plan) as source:
         info = source.info
         with progress_for_stderr().stage(f"writing {output.name}", info.n_frames, "frames") as advance:
-            files = write_packed(source, output, advance, thread_count(plan.run))
+            files = write_packed(source, output, advance, thread_count(plan.run.threads))
         unused = int((~source.valid).sum())
     tell_written(files, info, unused)

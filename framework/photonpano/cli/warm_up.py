@@ -7,7 +7,7 @@ import typer
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from photonpano.spec import Plan
+    from photonpano.specs import Plan
 
 _FRAMES, _GROUP = 240, 40
 
@@ -25,7 +25,7 @@ def warm_up() -> None:
     from pathlib import Path
 
     from photonpano.api import run
-    from photonpano.spec import parse_spec
+    from photonpano.specs import parse_spec
 
     start = time.perf_counter()
     source = {
@@ -47,7 +47,7 @@ def warm_up() -> None:
 
 
 def _write(plan: "Plan", capture: "Path") -> None:
-    from photonpano.pipeline.capture import write_packed
+    from photonpano.captures.writing import write_packed
     from photonpano.pipeline.components import build_source
 
     with build_source(plan) as source:

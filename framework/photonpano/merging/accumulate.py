@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from photonpano.geometry import translation
-from photonpano.merging.landing import landings
+from photonpano.merging.footprints import landings
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
 from photonpano.protocols import LinearlyCorrectedSource
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from photonpano.merging.chunks import Chunk
-    from photonpano.merging.landing import Landing
+    from photonpano.merging.footprints import Landing
     from photonpano.protocols import Source
     from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 

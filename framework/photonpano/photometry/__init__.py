@@ -1,9 +1,9 @@
 """The detection model, flux estimation, tone curves and packed-bit sums."""
 
 from photonpano.photometry.contrast import signal_to_noise
-from photonpano.photometry.likeness import Likeness, autocorrelation, likeness_of, noise_free_correlation
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
 from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, IntensityResponse
+from photonpano.photometry.similarity import Likeness, autocorrelation, likeness_of, noise_free_correlation
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import importlib.util
 from collections import Counter
-from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from photonpano.contributions import SourceContext, StageContext
 from photonpano.corrections import CorrectedSource
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
-from photonpano.pipeline.named import NamedSource
-from photonpano.pipeline.threads import thread_count
-from photonpano.spec.tree import Place
+from photonpano.motion.attribution import AttributedSource, attributing
+from photonpano.motion.level import Level, NamedLocator
+from photonpano.specs.tree import Place
+from photonpano.threads import thread_count
 from photonpano.values import Decision
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-    from contextlib import AbstractContextManager
+    from collections.abc import Callable, Iterable, Iterator
 
     from photonpano.contributions import Contribution
-    from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
-    from photonpano.spec.plan import Choice, Plan
+    from photonpano.protocols import Resampler, Source
+    from photonpano.specs.plan import Choice, Plan
     from photonpano.values import CaptureSummary, DecisionValue, Group
 
 HALVED_LEVELS = 2
@@ -32,50 +30,6 @@ LARGE_FRAME_PX = 192
 """Smaller sides than this are not halved: a pyramid needs pixels."""
 ContextT = TypeVar("ContextT")
 ComponentT = TypeVar("ComponentT")
-
-
-@dataclass(frozen=True, slots=True)
-class NamedLocator:
-    """A locator of a level.
-
-    Attributes:
-        name: as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2".
-        component: the locator.
-        origin: who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0".
-    """
-
-    name: str
-    component: Locator
-    origin: str
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """The components of one level, built.
-
-    Attributes:
-        number: from 1.
-        scale: pixels of the level's exposures per pixel of a frame.
-        locators: at least one; a pair that one of them loses is offered to the next.
-        origins: who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0".
-    """
-
-    number: int
-    scale: float
-    resampler: Resampler
-    merger: Merger
-    locators: tuple[NamedLocator, ...]
-    interpolator: Interpolator
-    origins: Mapping[str, str]
-
-    def blaming(self, component: str | NamedLocator) -> AbstractContextManager[None]:
-        """Name a component, given as its kind (such as "merger") or as a locator, in what it raises by mistake.
-
-        Raises:
-            PluginError: the block raised something that was not made for users.
-        """
-        origin = self.origins[component] if isinstance(component, str) else component.origin
-        return _blaming(origin, self.number)
 
 
 def build_source(plan: Plan) -> Source:
@@ -87,7 +41,7 @@ def build_source(plan: Plan) -> Source:
         SpecError: a correction does not suit the capture, or its file is not what it should be.
     """
     try:
-        source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run)))
+        source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
@@ -102,7 +56,7 @@ def build_source(plan: Plan) -> Source:
         return SpecError([plan.places.get(where, Place(where)).problem(message)])
 
     try:
-        return CorrectedSource(NamedSource(source, origin_of(plan.source)), plan.corrections, blame)
+        return CorrectedSource(AttributedSource(source, origin_of(plan.source)), plan.corrections, blame)
     except BaseException:
         source.close()
         raise
@@ -116,9 +70,9 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
         source: the capture.
         decisions: what the components choose because of what the capture shows is added here, once they are at work.
     """
-    from photonpano.pipeline.probing import summarise  # imports OpenCV, which checking a spec does not need
+    from photonpano.captures.summary import summarise  # imports OpenCV, which checking a spec does not need
 
-    threads = thread_count(plan.run)
+    threads = thread_count(plan.run.threads)
     capture = cache(lambda: summarise(source, threads))
     context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
     made: list[tuple[Choice[Any], Any]] = []
@@ -173,7 +127,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     for number, level in enumerate(plan.levels, start=1):
         resampler: Resampler = _built(level.resample, context)
         try:
-            with _blaming(origin_of(level.resample), number):
+            with attributing(origin_of(level.resample), number):
                 foreseen.append(resampler.groups(source.info.n_frames, number))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
@@ -188,10 +142,10 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     """
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
-    threads = thread_count(plan.run)
+    threads = thread_count(plan.run.threads)
     context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
     resampler: Resampler = _built(choice, context)
-    with _blaming(origin_of(choice), 1):
+    with attributing(origin_of(choice), 1):
         resampler.groups(source.info.n_frames, 1)
     return decisions
 
@@ -212,16 +166,6 @@ def _named(choices: Iterable[Choice[Any]]) -> Iterator[tuple[str, Choice[Any]]]:
         name = choice.contribution.name
         seen[name] += 1
         yield (name if seen[name] == 1 else f"{name} {seen[name]}"), choice
-
-
-@contextmanager
-def _blaming(origin: str, level: int) -> Iterator[None]:
-    try:
-        yield
-    except PhotonpanoError:
-        raise
-    except Exception as error:
-        raise PluginError(f"{origin} failed at level {level}: {type(error).__name__}: {error}") from error
 
 
 def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: ContextT) -> ComponentT:

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from photonpano.context import Context
+from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
+from photonpano.motion.loop import estimate_motion, resample
 from photonpano.pipeline.components import build_levels
-from photonpano.pipeline.loop import estimate_motion, resample
-from photonpano.pipeline.panorama import BYTES_PER_PIXEL, plan_canvas, render
-from photonpano.pipeline.progress import Quiet
 from photonpano.pipeline.record import peak_memory_bytes
-from photonpano.pipeline.stopwatch import Stopwatch
-from photonpano.pipeline.threads import one_thread_inside, thread_count
 from photonpano.protocols import LinearlyCorrectedSource, PackedSource
+from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
@@ -24,9 +23,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from photonpano.pipeline.loop import LevelResult
+    from photonpano.motion.loop import LevelResult
     from photonpano.protocols import Source
-    from photonpano.spec.plan import Plan
+    from photonpano.specs.plan import Plan
     from photonpano.values import BoolArray, Counts, FluxImage, Frames, Response, StreamInfo
 
 TRIAL_GROUPS = 12
@@ -100,7 +99,7 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     Raises:
         PhotonpanoError: the run would fail there.
     """
-    threads, n_frames = thread_count(plan.run), source.info.n_frames
+    threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
     groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch(threads))
     length = float(np.median([len(group.span) for group in groups]))
     _tried(plan, PartOfSource(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), threads)
@@ -111,7 +110,7 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     start = time.perf_counter()
     canvas = plan_canvas(results[-1].trajectory, part.info.span, part.info.frame_shape, plan.render.scale, int(plan.run.memory))
     with one_thread_inside():
-        render(part, results[-1].trajectory, part.info.span, canvas, plan.render.tolerance_px, threads, Quiet())
+        render(part, results[-1].trajectory, part.info.span, canvas, plan.render.tolerance_px, Context(threads))
     seconds["panorama"] = (time.perf_counter() - start) * more
     sides = [
         round(side * plan.render.scale + (whole - side * plan.render.scale) * more)
@@ -125,7 +124,7 @@ def forecast(plan: Plan, source: Source) -> Forecast:
 def _tried(plan: Plan, part: PartOfSource, threads: int) -> list[LevelResult]:
     levels = build_levels(plan, part, [])
     with one_thread_inside():
-        return estimate_motion(part, levels, plan.graph, part.info.n_frames // 2, threads, Quiet(), plan.until_converged)
+        return estimate_motion(part, levels, plan.graph, part.info.n_frames // 2, Context(threads), plan.until_converged)
 
 
 def _middle(n_frames: int, length: int) -> FrameSpan:

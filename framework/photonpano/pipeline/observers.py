@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from photonpano.geometry import Canvas
-    from photonpano.pipeline.loop import LevelResult
+    from photonpano.motion.loop import LevelResult
     from photonpano.registry import Observer
 
 logger = logging.getLogger(__name__)

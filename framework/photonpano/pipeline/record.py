@@ -16,8 +16,8 @@ from photonpano.values import Decision, Located, NotLocated, true_spans
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from photonpano.pipeline.loop import LevelResult
-    from photonpano.spec.plan import Choice, Plan
+    from photonpano.motion.loop import LevelResult
+    from photonpano.specs.plan import Choice, Plan
     from photonpano.values import FloatArray, Group, StreamInfo
 
 UNCERTAIN_PX = 0.5

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from photonpano.captures.summary import require_photons
 from photonpano.compiling import told_once
+from photonpano.context import Context
 from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
+from photonpano.merging.panorama import Overview, plan_canvas, render_tiles, tiles_of
+from photonpano.motion.attribution import AttributedSource
+from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_levels, origin_of
-from photonpano.pipeline.inspection import require_photons
-from photonpano.pipeline.loop import estimate_motion
-from photonpano.pipeline.named import NamedSource
 from photonpano.pipeline.observers import NOBODY
-from photonpano.pipeline.overview import Overview
-from photonpano.pipeline.panorama import plan_canvas, render_tiles, tiles_of
 from photonpano.pipeline.record import (
     level_record,
     levels_decision,
@@ -32,21 +32,21 @@ from photonpano.pipeline.record import (
     uncertain_frames,
     warnings_of,
 )
-from photonpano.pipeline.threads import one_thread_inside, thread_count
-from photonpano.spec.tree import Place
+from photonpano.specs.tree import Place
+from photonpano.threads import one_thread_inside, thread_count
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
+    from photonpano.context import Progress
     from photonpano.geometry import Canvas
+    from photonpano.merging.panorama import Tile
     from photonpano.pipeline.observers import Observers
-    from photonpano.pipeline.panorama import Tile
-    from photonpano.pipeline.progress import Progress
     from photonpano.pipeline.run_folder import RunFolder
     from photonpano.protocols import Source
-    from photonpano.spec.plan import Plan
+    from photonpano.specs.plan import Plan
     from photonpano.values import BoolArray, FloatArray, Panorama
 
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
@@ -110,8 +110,8 @@ def execute(
     """
     start = time.perf_counter()
     corrected = source if isinstance(source, CorrectedSource) else None
-    source = NamedSource(source, origin_of(plan.source))
-    threads = thread_count(plan.run)
+    source = AttributedSource(source, origin_of(plan.source))
+    context = Context(thread_count(plan.run.threads), progress, observers.level_finished)
     stream = source.info
     reference = _reference_frame(plan, stream.n_frames)
     try:
@@ -122,7 +122,7 @@ def execute(
     decisions = [*plan.decisions, *(corrected.decisions if corrected else ())]
     levels = build_levels(plan, source, decisions)
     with one_thread_inside(), told_once(partial(progress.note, COMPILING)):
-        results = estimate_motion(source, levels, plan.graph, reference, threads, progress, plan.until_converged, observers)
+        results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged)
     if plan.until_converged:
         decisions.append(levels_decision(results))
     trajectory = results[-1].trajectory
@@ -132,7 +132,7 @@ def execute(
     tiles, reduction = tiles_of(canvas, int(plan.run.memory))
     shown = Overview(canvas, reduction)
     with one_thread_inside():
-        rendered = render_tiles(source, trajectory, covered, tiles, plan.render.tolerance_px, threads, progress)
+        rendered = render_tiles(source, trajectory, covered, tiles, plan.render.tolerance_px, context)
         for tile, part in zip(tiles, rendered, strict=True):
             keep(tile, part, canvas)
             shown.add(tile, part)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.geometry import Canvas
-    from photonpano.pipeline.panorama import Tile
+    from photonpano.merging.panorama import Tile
     from photonpano.values import BoolArray, FloatArray, FluxImage, Homography, Panorama
 
 

@@ -11,7 +11,7 @@ from photonpano.errors import PluginError
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.observers import Observer
 from photonpano.registry.plugins import contributions_of, observation_of, require_same_contract
-from photonpano.registry.suggestions import listed, suggestion
+from photonpano.text import listed, suggestion
 
 if TYPE_CHECKING:
     from photonpano.contributions import AnyContribution, Requirement

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from photonpano.registry.kinds import KINDS
-from photonpano.registry.suggestions import listed
-from photonpano.registry.wording import (
+from photonpano.registry.schema_text import (
     alternative,
     alternatives,
     bounds_words,
@@ -19,6 +18,7 @@ from photonpano.registry.wording import (
     type_words,
     word,
 )
+from photonpano.text import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from photonpano.contributions import AnyContribution
-    from photonpano.registry.wording import Schema
+    from photonpano.registry.schema_text import Schema
 
 PLAIN_TEXT = re.compile(r"[A-Za-z/][\w./-]*")
 COMPUTED = "computed"

@@ -11,9 +11,9 @@ from photonpano.hookspecs import PROJECT
 from photonpano.registry.auto import AUTO
 from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, make_entry, ordered
 from photonpano.registry.chain import CHAIN
+from photonpano.registry.disabling import DISABLE, Switch
 from photonpano.registry.observers import Observer
 from photonpano.registry.plugins import contributions_of, observation_of
-from photonpano.registry.switch import DISABLE, Switch
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from photonpano import hookspecs
 from photonpano.contributions import API_VERSION, Contribution
 from photonpano.errors import PluginError
 from photonpano.registry.kinds import KINDS, Kind
-from photonpano.registry.suggestions import listed
+from photonpano.text import listed
 
 if TYPE_CHECKING:
     from photonpano.contributions import AnyContribution

@@ -19,7 +19,7 @@ for _name in ("conformance", "stages", "sources", "resamplers", "mergers", "loca
 @pytest.fixture(scope="class")
 def photonpano_one_thread_inside() -> Iterator[None]:
     """Keep OpenCV and BLAS from starting threads of their own, as a run does."""
-    from photonpano.pipeline.threads import one_thread_inside
+    from photonpano.threads import one_thread_inside
 
     with one_thread_inside():
         yield

@@ -13,11 +13,6 @@ class TestOpencvSift(LocatorConformance):
     tolerance_px = 0.3
 
 
-class TestDirect(LocatorConformance):
-    contribution = CATALOG.find("locator", "direct").contribution
-    tolerance_px = 0.1
-
-
 class TestOpencvEcc(LocatorConformance):
     contribution = CATALOG.find("locator", "opencv-ecc").contribution
     tolerance_px = 0.1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.pipeline.capture import write_packed
+from photonpano.captures.writing import write_packed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -14,7 +14,7 @@ from photonpano import Config, LocatorContribution, Requirement, hookimpl
 from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.plugins import observation_of
-from photonpano.spec import load_spec, parse_spec
+from photonpano.specs import load_spec, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable

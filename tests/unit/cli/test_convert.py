@@ -82,7 +82,7 @@ class Grey:
 def test_intensities_are_refused(cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     grey = SourceContribution(name="grey", summary="Toy", config=GreyConfig, build=lambda *_: Grey())
     catalog = discover().including(grey)
-    monkeypatch.setattr("photonpano.spec.loading.discover", lambda: catalog)
+    monkeypatch.setattr("photonpano.specs.loading.discover", lambda: catalog)
     result = invoke("convert", "cube.npy", "out.npy", "--source", "grey")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == (
@@ -93,7 +93,7 @@ def test_intensities_are_refused(cube: Path, invoke: Callable[..., Any], monkeyp
 SLOWLY = """
 import time
 from photonpano.cli.app import main
-from photonpano.pipeline import packed_frames
+from photonpano.captures import packed_frames
 packed_frames._BLOCK_BYTES = 20 * 96 * 20
 of = packed_frames.PackedFrames.of
 def slowly(self, span):

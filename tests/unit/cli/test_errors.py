@@ -177,7 +177,7 @@ def test_a_name_of_a_disabled_plugin_says_what_disables_it(
     result = invoke("check", "capture.yaml", "--set", "locate.use=opencv-sift")
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == (
-        "locate.use: there is no locator 'opencv-sift'; known: chain-of-backends, kornia-features, kornia-loftr, "
+        "locate.use: there is no locator 'opencv-sift'; known: chain-of-backends, direct, kornia-features, kornia-loftr, "
         "kornia-registrator and pycolmap-two-view. Disabled plugins may have offered it: photonpano 0.1.0 "
         "(opencv = photonpano_opencv.hooks), by PHOTONPANO_DISABLE_PLUGINS=opencv (in the override locate.use=opencv-sift)\n"
         "error: the spec has 1 problem\n"

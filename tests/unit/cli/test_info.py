@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano.cli.info import _percent
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable

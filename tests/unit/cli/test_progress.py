@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from photonpano.cli.progress import Bars, progress_for_stderr
-from photonpano.pipeline.progress import Quiet
+from photonpano.context import Quiet
 
 
 class Terminal(io.StringIO):

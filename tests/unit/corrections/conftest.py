@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from photonpano.photometry import packed_counts
-from photonpano.spec.corrections import resolved_corrections
-from photonpano.spec.tree import Place, from_data
+from photonpano.specs.corrections import resolved_corrections
+from photonpano.specs.tree import Place, from_data
 from photonpano.testing import MemorySource
 
 if TYPE_CHECKING:

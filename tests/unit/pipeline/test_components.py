@@ -25,7 +25,7 @@ from photonpano import (
 from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.registry import Catalog
 from photonpano.registry.catalog import make_entry
-from photonpano.spec import Plan, parse_spec
+from photonpano.specs import Plan, parse_spec
 from photonpano.values import Decision
 
 

@@ -8,7 +8,7 @@ import pytest
 from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import TRIAL_GROUPS, PartOfSource, forecast
-from photonpano.spec import parse_spec
+from photonpano.specs import parse_spec
 
 if TYPE_CHECKING:
     from photonpano.testing import MemorySource

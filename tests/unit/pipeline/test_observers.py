@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from photonpano import LocationError, hookimpl
+from photonpano.context import Context
 from photonpano.geometry import Canvas
-from photonpano.pipeline.loop import estimate_motion
+from photonpano.motion.loop import estimate_motion
 from photonpano.pipeline.observers import Observers, frozen
-from photonpano.pipeline.progress import Quiet
 from photonpano.registry import Catalog
-from photonpano.spec.settings import GraphSettings
+from photonpano.specs.settings import GraphSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,7 +83,7 @@ def test_the_stages_of_each_level(
 ) -> None:
     source = memory_source(np.zeros((120, 40, 60)))
     levels = [make_level(pan(0.3)), make_level(pan(0.3), number=2)]
-    results = estimate_motion(source, levels, GraphSettings(), 60, 2, Quiet(), observers=watching(log))
+    results = estimate_motion(source, levels, GraphSettings(), 60, Context(2, on_level=watching(log).level_finished))
     assert [(level, stage) for level, stage, _, _ in told] == [
         (level, stage) for level in (1, 2) for stage in ("resample", "merge", "locate", "interpolate")
     ]

@@ -12,7 +12,7 @@ import tifffile
 
 from photonpano import OutputError, Panorama
 from photonpano.geometry import Canvas, translation
-from photonpano.pipeline.panorama import Tile
+from photonpano.merging.panorama import Tile
 from photonpano.pipeline.run_folder import run_folder
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, SpecPath
 from photonpano.registry import ConfigRow, describe
-from photonpano.registry.wording import bounds_words, config_schema, expectation, type_words
+from photonpano.registry.schema_text import bounds_words, config_schema, expectation, type_words
 
 
 class Inner(Config):

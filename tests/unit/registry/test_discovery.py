@@ -5,7 +5,7 @@ import pytest
 import photonpano
 from photonpano import PluginError
 from photonpano.registry import BrokenPlugin, DisabledPlugin, discover
-from photonpano.registry.suggestions import listed
+from photonpano.text import listed
 
 GOOD = """
 @hookimpl
@@ -180,7 +180,7 @@ def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     catalog = discover()
     assert {row.plugin for row in catalog.rows if row.entry_point != "built in"} == {"alpha"}
     disabled = [row.entry_point.partition(" = ")[0] for row in catalog.disabled]
-    assert disabled == ["colmap", "core", "kornia", "opencv", "sensors", "simulator"]
+    assert disabled == ["colmap", "core", "direct", "framework", "kornia", "opencv", "sensors", "simulator"]
 
 
 def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
@@ -214,7 +214,7 @@ def test_unknown_names_of_disabled_plugins_are_told(words, message, install, mon
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     discover()
-    known = "alpha, colmap, core, kornia, opencv, photonpano, sensors and simulator"
+    known = "alpha, colmap, core, direct, framework, kornia, opencv, photonpano, sensors and simulator"
     assert caplog.messages == [f"PHOTONPANO_DISABLE_PLUGINS {message.format(known=known)}"]
 
 

@@ -1,0 +1,1 @@
+"""What looks at a capture: its summary, copies of it, pictures of it."""

@@ -1,0 +1,84 @@
+"""Virtual exposures of a capture as pictures, before any motion is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from photonpano.merging import Chunk, accumulate
+from photonpano.photometry import tone_mapped
+from photonpano.threads import in_order
+from photonpano.values import FrameSpan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from photonpano.protocols import Source
+    from photonpano.values import FluxImage, StreamInfo
+
+_PROBES = 16
+"""White is chosen from so many exposures all over the capture."""
+_FONT, _FONT_SCALE, _LINE_PX, _MARGIN_PX = cv2.FONT_HERSHEY_PLAIN, 0.8, 14, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How exposures become pictures.
+
+    Attributes:
+        white_flux: the flux that is white, the same in all pictures.
+        srgb: whether levels follow the sRGB curve, or are in proportion to the flux.
+        label: whether frames and time are written below each picture.
+    """
+
+    white_flux: float
+    srgb: bool = True
+    label: bool = True
+
+
+def preview_spans(info: StreamInfo, group_size: int, step: int) -> list[FrameSpan]:
+    """Return the frames of each exposure: as many as fit; all frames of a capture that is shorter than one."""
+    if info.n_frames < group_size:
+        return [info.span]
+    return [FrameSpan(start, start + group_size) for start in range(0, info.n_frames - group_size + 1, step)]
+
+
+def white_flux(source: Source, spans: Sequence[FrameSpan], quantile: float, threads: int = 1) -> float:
+    """Return the flux below which this share of the pixels lies, in some of the exposures; 1 where all is dark."""
+    chosen = sorted({round(place) for place in np.linspace(0, len(spans) - 1, _PROBES)})
+    exposures = in_order(lambda place: _exposure(source, spans[place]), chosen, threads)
+    return float(np.nanquantile(np.stack(list(exposures)), quantile)) or 1.0
+
+
+def pictures(source: Source, spans: Sequence[FrameSpan], look: Look, threads: int = 1) -> Iterator[NDArray[np.uint8]]:
+    """Yield the picture of each exposure, in order: (H, W) uint8, with a strip below it if it has a label."""
+
+    def picture(span: FrameSpan) -> NDArray[np.uint8]:
+        image = tone_mapped(_exposure(source, span), look.white_flux, srgb=look.srgb)
+        return np.vstack([image, _label(span, source.info)]) if look.label else image
+
+    return in_order(picture, spans, threads)
+
+
+def _exposure(source: Source, span: FrameSpan) -> FluxImage:
+    """Return the flux of frames that are summed as they lie: (H, W), NaN where a pixel must not be used."""
+    still = Chunk(span, np.eye(3))
+    flux, _ = accumulate(source, [still], np.eye(3), source.info.frame_shape).estimate(source.response)
+    return flux
+
+
+def _label(span: FrameSpan, info: StreamInfo) -> NDArray[np.uint8]:
+    """Return a strip as wide as a frame with the frames of an exposure, and the time of its middle."""
+    rate = info.frame_rate_hz
+    text = str(span) if rate is None else f"{span}  {1000 * span.centre / rate:.3f} ms"
+    (width, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
+    strip = np.zeros((_LINE_PX, max(width + 2 * _MARGIN_PX, info.width)), np.uint8)
+    cv2.putText(strip, text, (_MARGIN_PX, _LINE_PX - _MARGIN_PX), _FONT, _FONT_SCALE, 255, 1, cv2.LINE_AA)
+    if strip.shape[1] == info.width:
+        return strip
+    return np.asarray(cv2.resize(strip, (info.width, _LINE_PX), interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -1,0 +1,51 @@
+"""What a long computation needs of its caller: how many threads it may use, where progress goes, whom to call back."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
+
+
+class Progress(Protocol):
+    """Is told of stages as they start, advance and end. One stage at a time; calls come from any thread."""
+
+    def stage(self, title: str, total: int, unit: str) -> AbstractContextManager[Callable[[int], None]]:
+        """Enter a stage of `total` units, such as "level 2: locate" of 81 exposures; call the value with units done."""
+        ...
+
+    def note(self, message: str) -> None:
+        """Say one line that the user should see, such as the result of a level or a warning."""
+        ...
+
+
+class Quiet:
+    """Progress that says nothing."""
+
+    @contextmanager
+    def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+        """Ignore a stage."""
+        del title, total, unit
+        yield lambda _: None
+
+    def note(self, message: str) -> None:
+        """Ignore a line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """How a computation runs; its result does not depend on it.
+
+    Attributes:
+        threads: how many threads work at once.
+        progress: receives stages and messages.
+        on_level: called with the `LevelResult` of each level of the loop when it is done.
+    """
+
+    threads: int = 1
+    progress: Progress = Quiet()  # noqa: RUF009 - it has no state
+    on_level: Callable[[Any], object] = lambda _: None

@@ -1,0 +1,166 @@
+"""The motion graph: exposures are nodes, pairwise motions are edges; one homography a node makes them agree best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from photonpano.geometry import inverse, normalised
+from photonpano.motion.adjustment import Adjustment
+from photonpano.values import Located
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from photonpano.values import BoolArray, Edge, FloatArray
+
+
+class GraphOptions(Protocol):
+    """Which pairs of exposures are registered, and what happens when too few are located."""
+
+    @property
+    def skips(self) -> tuple[float, ...]:
+        """Each exposure is registered with those at these distances before and after it, in group lengths."""
+        ...
+
+    @property
+    def closure_overlap(self) -> float | None:
+        """The least share of the field of view that the exposures of a loop closure share; None registers no closures."""
+        ...
+
+    @property
+    def disconnected(self) -> Literal["error", "largest"]:
+        """Whether to stop when the graph falls apart, or to go on with its largest part."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class GraphSolution:
+    """Where the exposures lie.
+
+    Convention:
+        Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity.
+
+    Attributes:
+        homographies: (N, 3, 3), NaN for nodes that are not tied to the anchor.
+        located: (N,) True for nodes that are tied to the anchor.
+        contradictions: positions, in the list that was solved, of edges that were dropped because the others outvote them.
+        residual_px: root mean square disagreement of the other edges at the corners, 0 for a tree.
+        assess: makes `information` and `std_px`, which takes about as long as to solve the graph.
+    """
+
+    homographies: FloatArray
+    located: BoolArray
+    contradictions: tuple[int, ...]
+    residual_px: float
+    assess: Callable[[], tuple[FloatArray, FloatArray]]
+
+    @property
+    def information(self) -> FloatArray:
+        """Inverse covariances of p1..p8 of each node while all others are held, (N, 8, 8), NaN where not located."""
+        return self._assessed[0]
+
+    @property
+    def std_px(self) -> FloatArray:
+        """How far a corner of the frame is expected to be from where it should, after the best alignment of the two planes.
+
+        (N,), NaN where not located.
+        """
+        return self._assessed[1]
+
+    @cached_property
+    def _assessed(self) -> tuple[FloatArray, FloatArray]:
+        information, std_px = np.full((len(self.located), 8, 8), np.nan), np.full(len(self.located), np.nan)
+        if self.located.sum() > 1:
+            information[self.located], std_px[self.located] = self.assess()
+        return information, std_px
+
+
+def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
+    """Number the sets of nodes that located edges tie together, the largest first: (N,)."""
+    _, labels = connected_components(_adjacency(n_nodes, _pairs(edges)), directed=False)
+    by_size = np.argsort(-np.bincount(labels), kind="stable")
+    return np.asarray(np.argsort(by_size)[labels])
+
+
+def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> GraphSolution:
+    """Find the homographies that agree best with all located edges.
+
+    Robust least squares on where each edge sends the corners of its frame, weighted by the edge's information where it has
+    one; Gauss-Newton with Cauchy weights, from a spanning tree of edges to the nearest exposures. Edges that contradict the
+    solution are dropped, unless the graph would fall apart, and it is solved again.
+
+    Args:
+        n_nodes: number of exposures.
+        edges: what the locator said; failures are skipped.
+        anchor: the node whose homography is the identity.
+        frame_shape: (height, width) of a frame.
+    """
+    located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
+    pairs = _pairs(edges)
+    order, parents = breadth_first_order(_adjacency(n_nodes, pairs), anchor, directed=False)
+    located = np.zeros(n_nodes, dtype=bool)
+    located[order] = True
+    tied = [index for index, (moving, _) in enumerate(pairs) if located[moving]]
+    positions = np.array([located_edges[index][0] for index in tied], dtype=int)
+    motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
+    homographies = np.full((n_nodes, 3, 3), np.nan)
+    homographies[anchor] = np.eye(3)
+    if not tied:
+        return GraphSolution(homographies, located, (), 0.0, lambda: (np.empty((0, 8, 8)), np.empty(0)))
+    pairs = pairs[tied]
+    observed = np.array([motion.homography for motion in motions])
+    _compose_tree(homographies, order[1:], parents, pairs, observed)
+
+    compact = np.cumsum(located) - 1
+    adjustment = Adjustment(compact[pairs], int(compact[anchor]), observed, motions, frame_shape)
+    kept = np.ones(len(tied), dtype=bool)
+    found, norms = adjustment.minimise(homographies[located], kept)
+    agreeing = adjustment.agreeing(norms)
+    if not agreeing.all() and _connected(len(order), compact[pairs][agreeing]):
+        kept = agreeing
+        found, norms = adjustment.minimise(found, kept)
+    homographies[located] = found
+    residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[kept] ** 2)))
+    contradictions = tuple(int(position) for position in positions[~kept])
+    return GraphSolution(
+        homographies, located, contradictions, residual_px, partial(adjustment.uncertainty, found, norms, kept)
+    )
+
+
+def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
+    """Return the (moving, fixed) of the located edges: (E, 2)."""
+    located = [(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]
+    return np.array(located, dtype=int).reshape(-1, 2)
+
+
+def _connected(n_nodes: int, pairs: NDArray[np.integer]) -> bool:
+    return bool(connected_components(_adjacency(n_nodes, pairs), directed=False)[0] == 1)
+
+
+def _adjacency(n_nodes: int, pairs: NDArray[np.integer]) -> sparse.csr_array:
+    ones = np.ones(len(pairs))
+    return sparse.csr_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(n_nodes, n_nodes))
+
+
+def _compose_tree(
+    homographies: FloatArray,
+    order: NDArray[np.integer],
+    parents: NDArray[np.integer],
+    pairs: NDArray[np.integer],
+    observed: FloatArray,
+) -> None:
+    """Fill in the homographies of the nodes of `order`, each from its parent along one edge."""
+    edge_of = {(int(moving), int(fixed)): index for index, (moving, fixed) in enumerate(pairs)}
+    for node in map(int, order):
+        parent = int(parents[node])
+        forward = edge_of.get((node, parent))
+        step = observed[forward] if forward is not None else inverse(observed[edge_of[parent, node]])
+        homographies[node] = normalised(homographies[parent] @ step)

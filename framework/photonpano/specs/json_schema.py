@@ -1,0 +1,121 @@
+"""The JSON Schema of specs, for editors: names are completed, keys explained, values checked while they are typed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from pydantic.json_schema import models_json_schema
+
+from photonpano.corrections import CORRECTIONS
+from photonpano.registry.auto import AutoConfig
+from photonpano.registry.chain import CHAIN, ChainConfig
+from photonpano.registry.kinds import KINDS
+from photonpano.registry.schema_text import TolerantJsonSchema
+from photonpano.specs.corrections import corrections_schema
+from photonpano.specs.resolution import DEFAULT_FALLBACK, DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
+from photonpano.specs.settings import LevelSettings, OutputSettings
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from photonpano.registry import Catalog, Entry, Kind
+
+Schema: TypeAlias = dict[str, Any]
+SECTION = ["object", "null"]
+"""A section may be left empty."""
+FALLBACK = "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}"
+"""What editors say of the fallback of a locator."""
+
+
+def json_schema(catalog: Catalog) -> Schema:
+    """Return the JSON Schema (draft 2020-12) of the specs that choose from this catalog.
+
+    A name that two plugins offer is left out, since using it is an error.
+    """
+    offered = Counter((entry.kind, entry.name) for entry in catalog.rows)
+    entries = [entry for entry in catalog.rows if offered[entry.kind, entry.name] == 1]
+    models: list[type[BaseModel]] = [*(entry.contribution.config for entry in entries), LevelSettings, *SETTINGS.values()]
+    models += CORRECTIONS.values()
+    schemas, definitions = _schemas(models)
+    definitions[OutputSettings.__name__].pop("required")  # the run folder has a default that depends on the spec's name
+    level = definitions[LevelSettings.__name__]
+    sections, overrides = {}, {}
+    for kind in KINDS.values():
+        own = [entry for entry in entries if entry.kind == kind.name]
+        sections[kind.section] = _component(kind, own, schemas, DEFAULTS.get(kind.section))
+        overrides[kind.section] = _component(kind, own, schemas, None)
+    single = [entry for entry in entries if entry.kind == "locator" and entry.contribution is not CHAIN]
+    locator = _component(KINDS["locator"], single, schemas, None) | {"type": "object", "required": ["use"]}
+    one = {"anyOf": [locator["properties"]["use"], locator]}
+    definitions["fallback"] = {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}
+    if ChainConfig in schemas:
+        definitions[_definition(schemas[ChainConfig])]["properties"]["backends"]["items"] = one
+    if AutoConfig in schemas:  # what it hands on is known once a source has recognised the path
+        definitions[_definition(schemas[AutoConfig])]["additionalProperties"] = True
+    for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
+        described = f"{FALLBACK}; by default {default}, but none where `use` is given"
+        section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
+    level["properties"] |= {name: schema for name, schema in overrides.items() if name in DEFAULTS}
+    sections["source"]["required"] = ["use"]
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "photonpano pipeline spec",
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["version", "source"],
+        "properties": {
+            "version": {"const": VERSION, "description": "the version of the format"},
+            "source": sections.pop("source"),
+            "corrections": corrections_schema(schemas),
+            **sections,
+            "levels": {
+                "description": "how many levels, as many as it takes, or an entry for each level that overrides stages for it",
+                "default": LEVELS,
+                "anyOf": [
+                    {"type": "integer", "minimum": 1, "maximum": MAX_LEVELS},
+                    {"const": UNTIL_CONVERGED},
+                    {"type": "array", "minItems": 1, "maxItems": MAX_LEVELS, "items": schemas[LevelSettings]},
+                ],
+            },
+            **{name: schemas[model] for name, model in SETTINGS.items()},
+        },
+        "$defs": definitions,
+    }
+
+
+def _schemas(models: list[type[BaseModel]]) -> tuple[dict[type[BaseModel], Schema], dict[str, Schema]]:
+    """Return a reference for each model, and the definitions that they point to."""
+    unique = dict.fromkeys(models)
+    references, schema = models_json_schema([(model, "validation") for model in unique], schema_generator=TolerantJsonSchema)
+    definitions: dict[str, Schema] = schema["$defs"]
+    schemas = {model: references[model, "validation"] for model in unique}
+    for reference in schemas.values():
+        definitions[_definition(reference)]["type"] = SECTION
+    return schemas, definitions
+
+
+def _definition(reference: Schema) -> str:
+    """Return the name of the definition that a reference points to."""
+    return str(reference["$ref"]).rpartition("/")[2]
+
+
+def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema], default: str | None) -> Schema:
+    """Return the schema of a section that chooses a component; `with` follows what `use` says, or its default."""
+    summaries = "\n".join(f"{entry.name}: {entry.contribution.summary}" for entry in entries)
+    bindings = []
+    for entry in entries:
+        config = entry.contribution.config
+        chosen: Schema = {"properties": {"use": {"const": entry.name}}}
+        if entry.name != default:
+            chosen["required"] = ["use"]
+        bound: Schema = {"properties": {"with": schemas[config]}}
+        if any(field.is_required() for field in config.model_fields.values()):
+            bound["required"] = ["with"]
+        bindings.append({"if": chosen, "then": bound})
+    use: Schema = {"enum": [entry.name for entry in entries], "description": f"the {kind.name}:\n{summaries}"}
+    if default is not None:
+        use["default"] = default
+    keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
+    section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
+    return section | {"allOf": bindings} if bindings else section

@@ -1,0 +1,93 @@
+"""A spec that has been resolved against a catalog: what the pipeline runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from photonpano.contributions import (
+        Config,
+        InterpolatorContribution,
+        LocatorContribution,
+        MergerContribution,
+        ResamplerContribution,
+        SourceContribution,
+    )
+    from photonpano.corrections import Correction
+    from photonpano.registry import Observer
+    from photonpano.specs.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
+    from photonpano.specs.tree import Place
+    from photonpano.values import Decision
+
+ContributionT = TypeVar("ContributionT", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice(Generic[ContributionT]):
+    """A component chosen by name, with its validated config.
+
+    Attributes:
+        contribution: what the plugin offers under that name.
+        config: an instance of `contribution.config`.
+        plugin: the distribution it came from, such as "photonpano".
+        version: the version of that distribution.
+    """
+
+    contribution: ContributionT
+    config: Config
+    plugin: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class LevelPlan:
+    """The components of one level, and the scale of its exposures (pixels per pixel of a frame, or auto).
+
+    Pairs that `locate` loses are offered to the `fallbacks`, in order.
+    """
+
+    resample: Choice[ResamplerContribution[Any]]
+    merge: Choice[MergerContribution[Any]]
+    locate: Choice[LocatorContribution[Any]]
+    fallbacks: tuple[Choice[LocatorContribution[Any]], ...]
+    interpolate: Choice[InterpolatorContribution[Any]]
+    scale: float | Literal["auto"]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything a run needs.
+
+    Attributes:
+        source: the capture.
+        corrections: what is done to its frames before anything else, in order.
+        levels: one plan for each level, in order.
+        until_converged: the loop ends once the motion has settled, at the latest after the last of `levels`, all of them alike.
+        graph: which pairs are registered, and what happens when the graph falls apart.
+        render: the panorama.
+        output: the run folder.
+        run: seed, threads, memory.
+        document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
+        places: where each value of the spec was written, by its path, for messages that come up later.
+        file: the spec file, None for a spec that was built in Python.
+        observers: the plugins that watch the run.
+        decisions: what the spec leaves open, and reading it has decided: which source recognises the capture.
+    """
+
+    source: Choice[SourceContribution[Any]]
+    corrections: tuple[Correction, ...]
+    levels: tuple[LevelPlan, ...]
+    until_converged: bool
+    graph: GraphSettings
+    render: RenderSettings
+    output: OutputSettings
+    run: RunSettings
+    document: Mapping[str, Any]
+    places: Mapping[str, Place] = field(default_factory=dict)
+    file: Path | None = None
+    observers: tuple[Observer, ...] = ()
+    decisions: tuple[Decision, ...] = ()

@@ -1,0 +1,1 @@
+"""The plugin with photonpano's own locator: direct alignment of photon counts."""

@@ -1,0 +1,203 @@
+"""Sums over the pixels of two images, from which a step of their alignment is made: one look at each pixel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from photonpano.compiling import compiled
+from photonpano.geometry.sampling import run_from, sample, seen_part
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano_direct.pyramid import Layer
+
+
+class Buffers(NamedTuple):
+    """Images that a thread writes to again and again: new memory costs more than what is done to it.
+
+    Attributes:
+        residual: (H, W) float32.
+        weight: (H, W) float32.
+        gradients: (2, H, W) float32.
+    """
+
+    residual: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    gradients: NDArray[np.float32]
+
+
+@compiled
+def look(
+    moving: Layer,
+    fixed: Layer,
+    homography: NDArray[np.float64],
+    buffers: Buffers,
+    along_x: NDArray[np.float64],
+    along_y: NDArray[np.float64],
+) -> tuple[int, float, float]:
+    """Compare a template with the image that it is aligned to.
+
+    Coordinates x and y of the sums run from -1 to 1 along the longer side, with 0 in the middle.
+
+    Args:
+        moving: the template.
+        fixed: the other image, of the same shape.
+        homography: (3, 3), pixels of the template to pixels of the fixed image.
+        buffers: their residual becomes the fixed image seen from the template, minus the template, and their weight the inverse
+            variance of that, 0 where one of them saw nothing.
+        along_x: (3, 3), becomes the sums of residual times weight times derivative along x times x^i y^j.
+        along_y: (3, 3), the same for the derivative along y.
+
+    Returns:
+        The number of pixels that both see, the weighted sum of the squares of their residuals, and the sum of the weights.
+    """
+    height, width = moving.image.shape
+    half = max(height, width) / 2
+    along_x[:] = 0
+    along_y[:] = 0
+    seen, squares, weights = 0.0, 0.0, 0.0
+    across, zero, one = _across(width, half), np.float32(0), np.float32(1)
+    for y in range(height):
+        _compare(moving, fixed, homography, y, buffers)
+        different, weighted = buffers.residual[y], buffers.weight[y]
+        gx, gy = moving.gradients[0][y], moving.gradients[1][y]
+        x0, x1, x2, y0, y1, square, count, total = zero, zero, zero, zero, zero, zero, zero, zero
+        for t in range(width):
+            x, r, w = across[t], different[t], weighted[t]
+            wr = w * r
+            by_x, by_y = wr * gx[t], wr * gy[t]
+            x0 += by_x
+            x1 += by_x * x
+            x2 += by_x * x * x
+            y0 += by_y
+            y1 += by_y * x
+            square += wr * r
+            count += one if w > zero else zero
+            total += w
+        squares += float(square)
+        seen += float(count)
+        weights += float(total)
+        y_unit = (y - (height - 1) / 2) / half
+        power = 1.0
+        for j in range(3):
+            if j < 2:
+                along_x[0, j] += x0 * power
+                along_x[1, j] += x1 * power
+                along_x[2, j] += x2 * power
+            along_y[0, j] += y0 * power
+            along_y[1, j] += y1 * power
+            power *= y_unit
+    return int(seen), squares, weights
+
+
+@compiled
+def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: int, buffers: Buffers) -> None:
+    """Subtract row y of the template from what the fixed image shows there; see `look`."""
+    height, width = fixed.image.shape
+    image, weight, residual, combined = moving.image[y], moving.weight[y], buffers.residual[y], buffers.weight[y]
+    zero, tiny = np.float32(0), np.float32(1e-20)
+    first, last = seen_part(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
+    for x in range(first):
+        residual[x], combined[x] = zero, zero
+    for x in range(last, width):
+        residual[x], combined[x] = zero, zero
+    x = first
+    while x < last:
+        run = run_from(homography, x, y, last - x, height, width)
+        sample(fixed.image, run, residual[x : x + run.size])
+        # Interpolated too: from the nearest pixel, the border would jump.
+        sample(fixed.weight, run, combined[x : x + run.size])
+        x += run.size
+    # One loop for each image that is written to, since only such loops are vectorised.
+    image, weight, residual, combined = image[first:last], weight[first:last], residual[first:last], combined[first:last]
+    for t in range(len(image)):
+        residual[t] -= image[t]
+    for t in range(len(image)):
+        combined[t] *= weight[t] / max(weight[t] + combined[t], tiny)
+
+
+@compiled
+def _across(width: int, half: float) -> NDArray[np.float32]:
+    """Return the coordinates of the pixels of a row: (width,). Loops read them faster than they make them."""
+    return ((np.arange(width) - (width - 1) / 2) / half).astype(np.float32)
+
+
+@compiled
+def products(
+    first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32], sums: NDArray[np.float64]
+) -> None:
+    """Sum products of the derivatives of two images, times powers of x and y.
+
+    Args:
+        first: (2, H, W) derivatives of one image along x and y.
+        second: (2, H, W) those of the other.
+        weight: (H, W) what each pixel counts.
+        sums: (3, 5, 5), becomes the sums times x^i y^j of the products along x and x, along x and y, and along y and y.
+    """
+    height, width = weight.shape
+    half = max(height, width) / 2
+    across, zero = _across(width, half), np.float32(0)
+    sums[:] = 0
+    for y in range(height):
+        px, py, qx, qy, w = first[0][y], first[1][y], second[0][y], second[1][y], weight[y]
+        xx0, xx1, xx2, xx3, xx4 = zero, zero, zero, zero, zero
+        xy0, xy1, xy2, xy3 = zero, zero, zero, zero
+        yy0, yy1, yy2 = zero, zero, zero
+        for t in range(width):
+            x = across[t]
+            x2 = x * x
+            wx, wy = w[t] * px[t], w[t] * py[t]
+            xx, yy, xy = wx * qx[t], wy * qy[t], np.float32(0.5) * (wx * qy[t] + wy * qx[t])
+            xx0 += xx
+            xx1 += xx * x
+            xx2 += xx * x2
+            xx3 += xx * x2 * x
+            xx4 += xx * x2 * x2
+            xy0 += xy
+            xy1 += xy * x
+            xy2 += xy * x2
+            xy3 += xy * x2 * x
+            yy0 += yy
+            yy1 += yy * x
+            yy2 += yy * x2
+        y_unit = (y - (height - 1) / 2) / half
+        power = 1.0
+        for j in range(5):
+            if j < 3:
+                sums[0, 0, j] += xx0 * power
+                sums[0, 1, j] += xx1 * power
+                sums[0, 2, j] += xx2 * power
+                sums[0, 3, j] += xx3 * power
+                sums[0, 4, j] += xx4 * power
+            if j < 4:
+                sums[1, 0, j] += xy0 * power
+                sums[1, 1, j] += xy1 * power
+                sums[1, 2, j] += xy2 * power
+                sums[1, 3, j] += xy3 * power
+            sums[2, 0, j] += yy0 * power
+            sums[2, 1, j] += yy1 * power
+            sums[2, 2, j] += yy2 * power
+            power *= y_unit
+
+
+@compiled
+def differentiate(image: NDArray[np.float32], gradients: NDArray[np.float32]) -> None:
+    """Write the central differences of (H, W) pixels along x and y: (2, H, W); 0 at the borders."""
+    height, width = image.shape
+    half = np.float32(0.5)
+    for y in range(height):
+        along_x, along_y, here = gradients[0][y], gradients[1][y], image[y]
+        inner, right = along_x[1 : width - 1], here[2:]
+        along_x[0], along_x[width - 1] = np.float32(0), np.float32(0)
+        for t in range(len(inner)):
+            inner[t] = half * (right[t] - here[t])
+        if 0 < y < height - 1:
+            above, below = image[y - 1], image[y + 1]
+            for t in range(width):
+                along_y[t] = half * (below[t] - above[t])
+        else:
+            for t in range(width):
+                along_y[t] = np.float32(0)

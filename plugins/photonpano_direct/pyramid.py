@@ -1,0 +1,85 @@
+"""Pyramids of exposures on the scale on which photon noise is uniform."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+
+from photonpano.locating import view_pyramid
+from photonpano_direct.moments import differentiate
+from photonpano_direct.similarity import details_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano import VirtualExposure
+    from photonpano.locating import View
+    from photonpano_direct.similarity import Details
+
+_SMALLEST_SIDE = 24
+"""The pyramid ends before an image gets smaller than this, in px."""
+JUDGE = 2
+"""The layer on which images are compared in the end: coarse, so that noise is small and blur hardly counts."""
+
+
+class Layer(NamedTuple):
+    """One level of a pyramid.
+
+    Attributes:
+        image: (H, W) float32, variance-stabilised and blurred.
+        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
+        blur_px: standard deviation of the Gaussian that leaves as much of white noise as the blur and the halving did, in px
+            of the layer.
+        gradients: (2, H, W) float32, the derivatives of the image along x and y.
+        smoothed: (2, H, W) float32, the same, blurred once more as the noise was.
+    """
+
+    image: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    blur_px: float
+    gradients: NDArray[np.float32]
+    smoothed: NDArray[np.float32]
+
+
+class Pyramid(NamedTuple):
+    """An exposure and its halves.
+
+    Attributes:
+        layers: finest first.
+        details: of the layer of number `JUDGE`, or of the coarsest.
+    """
+
+    layers: tuple[Layer, ...]
+    details: Details
+
+    @property
+    def judge(self) -> int:
+        """The number of the layer that the details are of."""
+        return min(JUDGE, len(self.layers) - 1)
+
+
+def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> Pyramid:
+    """Return an exposure and its halves, finest first.
+
+    Args:
+        exposure: what is to be aligned.
+        levels: how many layers at most; small images have fewer.
+        blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
+    """
+    layers = tuple(_layer_of(view) for view in view_pyramid(exposure, blur_px, levels, _SMALLEST_SIDE))
+    return Pyramid(layers, details_of(layers[min(JUDGE, len(layers) - 1)]))
+
+
+def _layer_of(view: View) -> Layer:
+    """Return a view with its derivatives."""
+    # A Gaussian of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
+    blur_px = 1 / math.sqrt(4 * math.pi * view.noise_left)
+    gradients = np.empty((2, *view.shape), np.float32)
+    differentiate(np.ascontiguousarray(view.image), gradients)
+    smoothed = np.empty_like(gradients)
+    for axis in (0, 1):
+        cv2.GaussianBlur(gradients[axis], (0, 0), blur_px, dst=smoothed[axis])
+    return Layer(np.ascontiguousarray(view.image), np.ascontiguousarray(view.weight), blur_px, gradients, smoothed)

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group, Located, NotLocated, VirtualExposure
+from photonpano.evaluation import pair_bound_px
+from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.photometry import BinaryResponse, IntensityResponse
+from photonpano_direct.configs import DirectConfig
+from photonpano_direct.locator import DirectLocator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (160, 240)
+STILL = np.eye(3)
+LOCATOR = DirectLocator(DirectConfig())
+ROTATED = from_parameters([np.cos(0.03) - 1, np.sin(0.03), -np.sin(0.03), np.cos(0.03) - 1, 6.0, -3.0, 0, 0])
+PROJECTIVE = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
+
+
+def register(moving: VirtualExposure, fixed: VirtualExposure, initial: np.ndarray | None = None) -> Located | NotLocated:
+    return LOCATOR.register(LOCATOR.describe(moving), LOCATOR.describe(fixed), initial)
+
+
+@pytest.mark.parametrize(
+    ("true", "initial"),
+    [
+        (translation(0.3, -0.2), STILL),
+        (translation(20.25, 7.5), None),
+        (translation(-31.0, 0.0), None),
+        (ROTATED, None),
+        (PROJECTIVE, translation(8, 5)),
+    ],
+    ids=["sub-pixel", "shift", "backwards", "rotation", "projective"],
+)
+def test_it_finds_known_motions_and_not_their_inverse(
+    seen_from: Callable, true: np.ndarray, initial: np.ndarray | None
+) -> None:
+    located = register(seen_from(true, seed=1), seen_from(STILL, seed=2), initial)
+    assert isinstance(located, Located), located
+    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.15
+
+
+def test_forwards_and_backwards_agree(seen_from: Callable) -> None:
+    moving, fixed = seen_from(translation(12.3, 4.1), seed=1), seen_from(STILL, seed=2)
+    forwards, backwards = register(moving, fixed), register(fixed, moving)
+    assert isinstance(forwards, Located)
+    assert isinstance(backwards, Located)
+    assert corner_displacements(forwards.homography, inverse(backwards.homography), SHAPE).max() < 0.05
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.1])
+def test_the_information_is_that_of_the_scatter(seen_from: Callable, brightness: float) -> None:
+    # Whole pixels: between them, the fixture samples its street bluntly, and the images differ by more than noise.
+    true, frame = translation(10, -3), corners(SHAPE)
+    errors, predicted = [], []
+    for seed in range(12):
+        moving = seen_from(true, seed=2 * seed, brightness=brightness)
+        located = register(moving, seen_from(STILL, seed=2 * seed + 1, brightness=brightness), true)
+        assert isinstance(located, Located), located
+        assert located.information is not None
+        assert located.evidence["noise_ratio"] == pytest.approx(1, abs=0.2)
+        to_corners = jacobian(located.homography, frame).reshape(8, 8)
+        predicted.append(np.trace(to_corners @ np.linalg.inv(located.information) @ to_corners.T))
+        errors.append(np.sum((apply(located.homography, frame) - apply(true, frame)) ** 2))
+    assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
+
+
+def test_it_comes_close_to_what_photons_allow(seen_from: Callable, street: np.ndarray) -> None:
+    """At flux 0.1, over 48 pairs that start elsewhere: the bound of Cramer and Rao for a scene that nobody knows. Shifts by
+    whole pixels, because between them the fixture samples its street bluntly."""
+    errors, bounds = [], []
+    for seed in range(48):
+        shift = np.array([3 + seed % 7, -4 + seed % 5])
+        true = translation(*shift)
+        start = true @ translation(*np.random.default_rng(seed).normal(0, 0.2, 2))
+        located = register(
+            seen_from(true, seed=2 * seed, brightness=0.2), seen_from(STILL, seed=2 * seed + 1, brightness=0.2), start
+        )
+        assert isinstance(located, Located), located
+        errors.append(np.mean(corner_displacements(located.homography, true, SHAPE) ** 2))
+        rows, columns = (slice(280 + shift[1], 280 + shift[1] + SHAPE[0]), slice(400 + shift[0], 400 + shift[0] + SHAPE[1]))
+        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] + shift[::-1, None, None]
+        also_seen = (x < SHAPE[1]) & (y >= 0) & (y < SHAPE[0])
+        bounds.append(pair_bound_px(0.2 * street[rows, columns], BinaryResponse(), 250, np.where(also_seen, 250.0, 0.0)))
+    assert np.sqrt(np.mean(errors)) < 1.3 * np.sqrt(np.mean(np.square(bounds)))
+
+
+def test_unseen_pixels_do_not_pull(seen_from: Callable) -> None:
+    true = translation(6.5, 1.5)
+    moving = seen_from(true, seed=1)
+    half = np.zeros(SHAPE, bool)
+    half[:, :150] = True
+    masked = replace(moving, flux=np.where(half, moving.flux, np.nan), weight=np.where(half, moving.weight, 0))
+    located = register(masked, seen_from(STILL, seed=2), STILL)
+    assert isinstance(located, Located), located
+    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.3
+
+
+def test_masked_hot_pixels_are_bridged(seen_from: Callable) -> None:
+    """One in fifty, at the same places in both exposures, as on a sensor."""
+    hot = np.random.default_rng(7).random(SHAPE) < 0.02
+    true = translation(6.5, 1.5)
+    moving, fixed = (
+        replace(each, flux=np.where(hot, np.float32(np.nan), each.flux), weight=np.where(hot, np.float32(0), each.weight))
+        for each in (seen_from(true, seed=1), seen_from(STILL, seed=2))
+    )
+    located = register(moving, fixed, None)
+    assert isinstance(located, Located), located
+    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.15
+    assert located.evidence["overlap"] > 0.8
+
+
+def test_another_place_is_not_located_and_says_why(seen_from: Callable) -> None:
+    failure = register(seen_from(translation(330, 200), seed=1), seen_from(STILL, seed=2), STILL)
+    assert isinstance(failure, NotLocated)
+    assert any(word in failure.reason for word in ("diverges", "agree", "settled", "overlap"))
+
+
+def test_exposures_that_share_nothing_say_so(seen_from: Callable) -> None:
+    failure = register(seen_from(STILL, seed=1), seen_from(STILL, seed=2), translation(235, 0))
+    assert isinstance(failure, NotLocated)
+    assert "overlap" in failure.reason
+
+
+@pytest.mark.parametrize("initial", [None, STILL], ids=["unknown", "still"])
+def test_nothing_to_see_is_not_located_and_says_why(
+    photograph: Callable, seen_from: Callable, initial: np.ndarray | None
+) -> None:
+    flat, street = photograph(np.zeros(SHAPE)), seen_from(STILL)
+    unseen = replace(flat, flux=np.full(SHAPE, np.nan, np.float32), weight=np.zeros(SHAPE, np.float32))
+    assert register(flat, flat, initial) == NotLocated("where the images overlap, if they do, there is no texture")
+    for pair in ((unseen, unseen), (unseen, street), (street, unseen)):
+        assert register(*pair, initial) == NotLocated("nothing was seen far enough from what was not")
+
+
+def test_images_that_correlate_but_differ_by_more_than_noise_are_not_located(seen_from: Callable) -> None:
+    """As when lamps flicker: the same scene, half as bright."""
+    failure = register(seen_from(STILL, seed=1), seen_from(STILL, seed=2, brightness=0.5), STILL)
+    assert isinstance(failure, NotLocated)
+    assert failure.evidence["agreement"] > 0.9
+    assert "times the photon noise, more than max_noise_ratio = 100" in failure.reason
+
+
+def test_in_much_light_images_that_blur_tells_apart_are_located(street: np.ndarray) -> None:
+    """A few thousand photons a pixel: the difference is some hundred times the photon noise, and small against the scene."""
+    response = IntensityResponse(photons_per_level=40.0, black_level=0.0, saturation_level=1e4, read_noise=20.0)
+
+    def seen(left: int, blur_px: float, brightness: float = 1.0) -> VirtualExposure:
+        flux = brightness * 20_000 * cv2.GaussianBlur(street, (0, 0), blur_px)[280:440, left : left + 240]
+        noisy = np.random.default_rng(left).normal(flux, np.sqrt(flux)).astype(np.float32)
+        span = FrameSpan(0, 1)
+        return VirtualExposure(noisy, np.ones_like(noisy), Group(span, 0), 1.0, response)
+
+    motion = register(seen(400, 0.8), seen(402, 1.1), STILL)
+    assert isinstance(motion, Located)
+    assert motion.evidence["noise_ratio"] > 100
+    np.testing.assert_allclose(motion.homography[:2, 2], [-2, 0], atol=0.2)
+    flickering = register(seen(400, 0.8), seen(402, 0.8, brightness=0.5), STILL)
+    assert isinstance(flickering, NotLocated)
+    assert "times that blur explains" in flickering.reason

@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, StreamInfo
+from photonpano.captures.summary import summarise
+from photonpano.photometry import BinaryResponse
+from photonpano.testing import MemorySource
+
+SHAPE = (96, 128)
+
+
+class Film:
+    """A source of a texture that moves, made when it is asked for; the x of its frames is a function of their indices."""
+
+    def __init__(self, x_px: Any, n_frames: int, flux: float, contrast: float = 0.9, hot: bool = False) -> None:
+        rng = np.random.default_rng(5)
+        noise = cv2.GaussianBlur(rng.normal(0, 1, (SHAPE[0], 1500)), (0, 0), 3)
+        self.scene = (flux * np.clip(1 + contrast * noise / (2 * noise.std()), 0.05, None)).astype(np.float32)
+        self.info, self.response = StreamInfo(n_frames, *SHAPE, None), BinaryResponse()
+        self.valid = np.ones(SHAPE, bool)
+        self.hot = np.zeros(SHAPE, bool)
+        if hot:
+            self.hot = rng.random(SHAPE) < 0.02
+            self.valid = ~self.hot
+        self.x_px = x_px
+
+    def counts(self, span: FrameSpan) -> np.ndarray:
+        counts = np.zeros(SHAPE, np.uint32)
+        for frame in range(span.start, span.stop):
+            shift = np.float32([[1, 0, -float(self.x_px(frame))], [0, 1, 0]])
+            flux = cv2.warpAffine(self.scene, shift, SHAPE[::-1], borderMode=cv2.BORDER_REFLECT)
+            lit = np.random.default_rng(frame).random(SHAPE) < -np.expm1(-flux)
+            counts += lit | self.hot
+        return counts
+
+
+@pytest.mark.parametrize("speed_px", [0.05, 0.3, 2.0])
+def test_the_speed_of_a_pan_is_found(speed_px: float) -> None:
+    summary = summarise(Film(lambda frame: speed_px * frame, 400, 0.5))
+    assert summary.speed_px == pytest.approx(speed_px, rel=0.1)
+    assert summary.flux == pytest.approx(0.5, rel=0.1)
+
+
+def test_in_the_dark_longer_sums_tell_it() -> None:
+    bright, dark = (summarise(Film(lambda frame: 0.5 * frame, 400, flux)) for flux in (1.0, 0.05))
+    assert dark.speed_px == pytest.approx(0.5, rel=0.1)
+    assert dark.flux == pytest.approx(0.05, rel=0.1)
+    frames = [int(summary.how.split()[-2]) for summary in (bright, dark)]
+    assert frames[0] < frames[1]
+
+
+def test_the_fast_part_of_a_capture_counts() -> None:
+    def x_px(frame: int) -> float:
+        return 0.1 * frame + 0.9 * max(0, frame - 280)  # 1 px a frame in the last third
+
+    assert summarise(Film(x_px, 400, 0.5)).speed_px == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_capture_that_stands_still_is_slow() -> None:
+    speed_px = summarise(Film(lambda _: 0, 200, 0.5)).speed_px
+    assert speed_px is not None
+    assert speed_px < 0.02
+
+
+@pytest.mark.parametrize(("flux", "contrast"), [(1e-5, 0.9), (0.5, 0)])
+def test_a_capture_too_dark_or_without_texture_tells_nothing(flux: float, contrast: float) -> None:
+    summary = summarise(Film(lambda frame: 0.3 * frame, 200, flux, contrast))
+    assert summary.speed_px is None
+    assert summary.how == "no motion can be told at any of 12 places"
+
+
+def test_pixels_that_are_not_valid_do_not_pretend_to_stand_still() -> None:
+    summary = summarise(Film(lambda frame: 0.3 * frame, 400, 0.1, hot=True))
+    assert summary.speed_px == pytest.approx(0.3, rel=0.1)
+    assert summary.flux == pytest.approx(0.1, rel=0.1)
+
+
+def test_it_does_not_depend_on_the_number_of_threads() -> None:
+    film = Film(lambda frame: 0.3 * frame, 200, 0.1)
+    assert summarise(film, threads=1) == summarise(film, threads=4)
+
+
+def test_a_few_frames_tell_no_motion() -> None:
+    summary = summarise(Film(lambda frame: frame, 20, 0.5))
+    assert summary.speed_px is None
+    assert summary.how == "20 frames are too few to tell a motion"
+    assert summary.flux == pytest.approx(0.5, rel=0.1)
+
+
+class Veiled(MemorySource):
+    """Half of its counts are not the scene's."""
+
+    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
+        return counts.astype(np.float32) / 2
+
+
+def test_what_the_source_takes_out_of_sums_is_no_flux() -> None:
+    frames = np.random.default_rng(0).random((120, *SHAPE)) < 0.1
+    assert summarise(MemorySource(frames)).flux == pytest.approx(-np.log1p(-0.1), rel=0.02)
+    assert summarise(Veiled(frames)).flux == pytest.approx(-np.log1p(-0.05), rel=0.02)

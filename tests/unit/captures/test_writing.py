@@ -1,0 +1,289 @@
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tracemalloc
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError, OutputError, PluginError, StreamInfo
+from photonpano.captures.writing import truth_path, write_packed
+from photonpano.photometry import BinaryResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+class RandomSource:
+    """Frames that differ, each made from its index alone."""
+
+    def __init__(self, n_frames: int, height: int, width: int, fails_at: int | None = None, kind: Any = "binary") -> None:
+        self.info = StreamInfo(n_frames, height, width, None, kind)
+        self.response = BinaryResponse()
+        self.valid = np.ones((height, width), bool)
+        self.fails_at = fails_at
+
+    def frames(self, span: FrameSpan) -> np.ndarray:
+        if self.fails_at is not None and span.stop > self.fails_at:
+            raise InputError("the source has a flaw")
+        return np.stack([self._frame(index) for index in range(span.start, span.stop)])
+
+    def _frame(self, index: int) -> np.ndarray:
+        return np.random.default_rng(index).integers(0, 2, self.info.frame_shape, dtype=np.uint8)
+
+    def counts(self, span: FrameSpan) -> np.ndarray:
+        return self.frames(span).sum(axis=0, dtype=np.uint32)
+
+    def close(self) -> None:
+        pass
+
+    def __enter__(self) -> RandomSource:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class TruthfulSource(RandomSource):
+    def truth(self) -> dict[str, np.ndarray]:
+        return {"homographies": np.tile(np.eye(3), (self.info.n_frames, 1, 1)), "frame_shape": np.array(self.info.frame_shape)}
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("photonpano.captures.packed_frames._BLOCK_BYTES", 7 * 6 * 19)
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_the_file_holds_the_frames_bit_by_bit(tmp_path: Path, threads: int) -> None:
+    source, path, told = RandomSource(100, 6, 19), tmp_path / "cube.npy", []
+    assert write_packed(source, path, told.append, threads) == (path,)
+    packed = np.load(path, allow_pickle=False)
+    assert (packed.shape, packed.dtype) == ((100, 6, 3), np.uint8)
+    np.testing.assert_array_equal(np.unpackbits(packed, axis=-1, count=19), source.frames(FrameSpan(0, 100)))
+    assert told == [7] * 14 + [2]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_truth_lies_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    assert write_packed(TruthfulSource(5, 6, 19), path) == (path, tmp_path / "cube.truth.npz")
+    with np.load(truth_path(path), allow_pickle=False) as truth:
+        assert sorted(truth) == ["frame_shape", "homographies"]
+        assert truth["homographies"].shape == (5, 3, 3)
+
+
+def interrupt(n_frames: int) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize(
+    ("fails_at", "progress", "error"), [(50, None, InputError), (None, interrupt, KeyboardInterrupt)], ids=["flaw", "Ctrl-C"]
+)
+def test_nothing_is_left_when_it_fails_half_way(
+    tmp_path: Path, fails_at: int | None, progress: Callable[[int], object] | None, error: type[BaseException]
+) -> None:
+    with pytest.raises(error):
+        write_packed(TruthfulSource(100, 6, 19, fails_at), tmp_path / "cube.npy", progress)
+    assert list(tmp_path.iterdir()) == []
+
+
+_RUNS_OUT_OF_DISK = """
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from photonpano import OutputError, StreamInfo
+from photonpano.captures.writing import write_packed
+
+class Source:
+    info = StreamInfo(4000, 64, 64, None)
+    def frames(self, span):
+        return np.ones((len(span), 64, 64), np.uint8)
+    def truth(self):
+        return {"frame_shape": np.array([64, 64])}
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_200_000, 1_200_000))
+try:
+    write_packed(Source(), Path(sys.argv[1]))
+except OutputError as error:
+    print(error)
+"""
+
+
+def test_nothing_is_left_when_the_system_cuts_the_file_short(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    done = subprocess.run([sys.executable, "-c", _RUNS_OUT_OF_DISK, path], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == (
+        f"cannot write {path}: File too large; raise the limit on file sizes or choose another file system"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_too_small_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, 1_000_000_000))
+    path = tmp_path / "cube.npy"
+    with pytest.raises(OutputError) as caught:
+        write_packed(RandomSource(100_000, 254, 496, fails_at=0), path)
+    assert str(caught.value) == (
+        f"cannot write {path}: it takes 1.6 GB, and its disk has 1.0 GB free; free some space or choose another folder"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_folder_is_told_before_the_work(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "cube.npy"
+    with pytest.raises(OutputError, match=r"there is no folder .*nowhere; create it or choose another"):
+        write_packed(TruthfulSource(5, 6, 19, fails_at=0), path)
+
+
+def test_another_suffix_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught:
+        write_packed(RandomSource(5, 6, 19), tmp_path / "cube")
+    assert str(caught.value) == f"cannot write {tmp_path / 'cube'}: a packed capture is a .npy file; name it cube.npy"
+
+
+def test_intensities_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        write_packed(RandomSource(5, 6, 19, kind="intensity"), tmp_path / "cube.npy")
+    assert str(caught.value) == (
+        f"cannot write {tmp_path / 'cube.npy'}: packed .npy files hold binary frames, and this source gives intensities"
+    )
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
+    def peak(n_frames: int) -> int:
+        tracemalloc.start()
+        try:
+            write_packed(RandomSource(n_frames, 6, 19), tmp_path / "cube.npy")
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(100)
+    assert peak(2000) < peak(500) + 20_000
+
+
+class PackedRandomSource(RandomSource):
+    """Would fail if its frames were asked for one by one."""
+
+    def packed(self, span: FrameSpan) -> np.ndarray:
+        return np.packbits(super().frames(span), axis=-1)
+
+    def frames(self, span: FrameSpan) -> np.ndarray:
+        raise AssertionError("frames are packed, and need not be unpacked")
+
+
+def interrupted_after(n_frames: int, path: Path, source: RandomSource) -> None:
+    """Write a capture so that it can be continued, and interrupt it after so many frames."""
+    told: list[int] = []
+
+    def count(n_written: int) -> None:
+        told.append(n_written)
+        if sum(told) >= n_frames:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_packed(source, path, count, resumed=told.append)
+
+
+def test_packed_frames_are_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    write_packed(PackedRandomSource(50, 6, 19), path)
+    np.testing.assert_array_equal(np.load(path), np.packbits(RandomSource(50, 6, 19).frames(FrameSpan(0, 50)), axis=-1))
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("kind", [RandomSource, PackedRandomSource])
+@pytest.mark.parametrize("more", [b"", b"half a frame"])
+def test_what_was_interrupted_is_continued(tmp_path: Path, kind: type[RandomSource], more: bytes) -> None:
+    path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
+    interrupted_after(30, path, kind(100, 6, 19))
+    assert list(tmp_path.iterdir()) == [part]
+    with part.open("ab") as file:
+        file.write(more)
+    found: list[int] = []
+    told: list[int] = []
+    write_packed(kind(100, 6, 19), path, told.append, resumed=found.append)
+    assert list(tmp_path.iterdir()) == [path]
+    assert found[0] >= 30
+    assert told[0] == found[0]
+    assert sum(told) == 100
+    whole = tmp_path / "whole.npy"
+    write_packed(kind(100, 6, 19), whole)
+    assert path.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("other", ["another shape", "another last frame", "another first frame", "no header"])
+def test_a_part_of_another_capture_is_written_anew(tmp_path: Path, other: str) -> None:
+    path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
+    interrupted_after(30, path, RandomSource(100, 7 if other == "another shape" else 6, 19))
+    frame_bytes = 6 * 3
+    place = {"another last frame": -frame_bytes, "another first frame": 128, "no header": 0}.get(other)
+    if place is not None:
+        data = bytearray(part.read_bytes())
+        data[place] ^= 1
+        part.write_bytes(data)
+    found: list[int] = []
+    write_packed(RandomSource(100, 6, 19), path, resumed=found.append)
+    assert found == [0]
+    np.testing.assert_array_equal(
+        np.unpackbits(np.load(path), axis=-1, count=19), RandomSource(100, 6, 19).frames(FrameSpan(0, 100))
+    )
+
+
+def test_a_part_that_is_longer_than_the_capture_is_cut(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    write_packed(RandomSource(20, 6, 19), path)
+    whole = path.read_bytes()
+    path.rename(tmp_path / "cube.npy.part").write_bytes(whole + b"more")
+    found: list[int] = []
+    write_packed(RandomSource(20, 6, 19), path, resumed=found.append)
+    assert (found, path.read_bytes()) == ([20], whole)
+
+
+def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+
+    def write_again(n_frames: int) -> None:
+        write_packed(RandomSource(20, 6, 19), path, resumed=lambda _: None)
+
+    with pytest.raises(OutputError) as caught:
+        write_packed(RandomSource(20, 6, 19), path, write_again, resumed=lambda _: None)
+    assert str(caught.value) == f"cannot write {path}: another process is writing it; wait for it, or choose another name"
+
+
+def test_a_full_disk_leaves_what_can_be_continued(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    script = _RUNS_OUT_OF_DISK.replace("Path(sys.argv[1])", "Path(sys.argv[1]), resumed=print")
+    done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"cannot write {path}: File too large; ")
+    assert [file.name for file in tmp_path.iterdir()] == ["cube.npy.part"]
+    again = script.replace("(1_200_000, 1_200_000)", "(2**30, 2**30)")
+    done = subprocess.run([sys.executable, "-c", again, path], capture_output=True, text=True, check=True)
+    assert int(done.stdout) > 2000
+    assert np.load(path).shape == (4000, 64, 8)
+    assert np.load(path).min() == 255
+
+
+@pytest.mark.parametrize(
+    "packed", [np.zeros((5, 6, 4), np.uint8), np.zeros((5, 6, 3), np.uint16), np.zeros((4, 6, 3), np.uint8)]
+)
+def test_a_source_that_breaks_its_contract_is_told(tmp_path: Path, packed: np.ndarray) -> None:
+    source = PackedRandomSource(5, 6, 19)
+    source.packed = lambda _span: packed
+    with pytest.raises(PluginError) as caught:
+        write_packed(source, tmp_path / "cube.npy")
+    assert str(caught.value) == (
+        "the source broke its contract at frames 0 to 4: expected packed frames of uint8 (5, 6, 3), "
+        f"got {packed.dtype} {packed.shape}"
+    )
+    assert list(tmp_path.iterdir()) == []

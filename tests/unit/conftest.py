@@ -1,0 +1,107 @@
+"""A level whose components know the true motion, so that the pipeline is tested without plugins."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group, Located, VirtualExposure
+from photonpano.geometry import inverse, normalised, rescaled
+from photonpano.photometry import BinaryResponse
+from photonpano.pipeline.components import Level, NamedLocator
+from photonpano.threads import one_thread_inside
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from photonpano import NotLocated, Source, Trajectory
+
+FRAMES = 10
+"""Frames of a group."""
+
+
+class SideBySide:
+    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+        step = FRAMES // level
+        starts = range(0, n_frames - FRAMES + 1, step)
+        return tuple(Group(FrameSpan(start, start + FRAMES), start + (FRAMES - 1) / 2) for start in starts)
+
+
+class Noise:
+    """Merges nothing: a noisy exposure for each group."""
+
+    def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
+        shape = tuple(max(1, round(side * scale)) for side in source.info.frame_shape)
+        flux = np.random.default_rng(group.span.start).random(shape, np.float32)
+        return VirtualExposure(flux, np.full(shape, FRAMES, np.float32), group, scale, BinaryResponse())
+
+
+class Knowing:
+    """Returns the true motion of a pair, in px of exposures, or what `answer` makes of it."""
+
+    def __init__(self, motion: Trajectory, answer: Callable[..., Any]) -> None:
+        self._motion = motion
+        self._answer = answer
+        self.initials: list[np.ndarray | None] = []
+
+    def describe(self, exposure: VirtualExposure) -> VirtualExposure:
+        return exposure
+
+    def register(self, moving: VirtualExposure, fixed: VirtualExposure, initial: np.ndarray | None) -> Located | NotLocated:
+        self.initials.append(initial)
+        to_plane = self._motion.at([moving.group.reference, fixed.group.reference])
+        found = Located(rescaled(normalised(inverse(to_plane[1]) @ to_plane[0]), moving.scale))
+        return self._answer(moving.group, fixed.group, found)
+
+
+class Knots:
+    """Linear between the knots, element by element."""
+
+    def __init__(self, instants: np.ndarray, homographies: np.ndarray) -> None:
+        self._instants, self._rows = instants, homographies.reshape(-1, 9).T
+
+    def at(self, frame_indices: Any) -> np.ndarray:
+        frames = np.atleast_1d(frame_indices)
+        return np.stack([np.interp(frames, self._instants, row) for row in self._rows], axis=-1).reshape(-1, 3, 3)
+
+
+class Linear:
+    def fit(self, instants: np.ndarray, homographies: np.ndarray, information: np.ndarray | None) -> Knots:
+        return Knots(instants, homographies)
+
+
+def _truth(moving: Group, fixed: Group, found: Located) -> Located:
+    return found
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Let libraries start no threads, as in a run: over the matrices of small graphs they would fight for the cores."""
+    with one_thread_inside():
+        yield
+
+
+@pytest.fixture
+def make_level() -> Callable[..., Level]:
+    """Build a level: `make_level(motion, answer, number, scale)`, other components by their kinds, fallbacks by their names.
+
+    `answer(moving, fixed, found)` gets the groups of a pair and its true motion, and returns what the locator returns.
+    """
+
+    def make(
+        motion: Trajectory,
+        answer: Callable[..., Any] = _truth,
+        number: int = 1,
+        scale: float = 1.0,
+        fallbacks: Mapping[str, Any] | None = None,
+        locator: Any = None,
+        **components: Any,
+    ) -> Level:
+        named = {"toy": locator or Knowing(motion, answer)} | (fallbacks or {})
+        locators = tuple(NamedLocator(name, each, f"locator {name!r} of toys 1.0") for name, each in named.items())
+        toys = {"resampler": SideBySide(), "merger": Noise(), "interpolator": Linear()} | components
+        return Level(number, scale, locators=locators, **toys, origins={kind: f"{kind} 'toy' of toys 1.0" for kind in toys})
+
+    return make

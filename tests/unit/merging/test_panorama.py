@@ -1,0 +1,196 @@
+from __future__ import annotations
+
+import tracemalloc
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import CanvasTooLargeError, FrameSpan, LocationError, Panorama
+from photonpano.context import Context, Quiet
+from photonpano.geometry import Canvas, apply, from_parameters, translation
+from photonpano.merging.panorama import BYTES_PER_PIXEL, Overview, Tile, plan_canvas, render, render_tiles, tiles_of
+from photonpano.photometry import tone_mapped
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHAPE = (30, 40)
+N = 60
+ALL = FrameSpan(0, N)
+GIB = 1024**3
+
+
+def test_the_canvas_holds_the_frames_of_the_span_only(pan: Callable) -> None:
+    """At 2 px a frame, frames 10 to 19 span 18 px and a frame."""
+    canvas = plan_canvas(pan(2), FrameSpan(10, 20), SHAPE, 1.0, GIB)
+    assert canvas.shape == (30, 40 + 18)
+    np.testing.assert_array_equal(canvas.transform, translation(-20, 0))
+
+
+def test_a_canvas_far_beyond_the_memory_is_refused_before_it_is_made(pan: Callable) -> None:
+    """40,000 px wide and 50,000 high at scale 10."""
+    with pytest.raises(CanvasTooLargeError) as caught:
+        plan_canvas(pan(3960 / (N - 1), 4970 / (N - 1)), ALL, SHAPE, 10.0, 2 * GIB)
+    assert str(caught.value) == (
+        "the panorama would have 40000 x 50000 pixels, 37 times what the 2 GiB of run.memory hold. "
+        "Up to 16 times is rendered in parts; more is often a sign of a wrong motion. "
+        "Raise run.memory, lower render.scale from 10 to 6.5, "
+        "or choose a render.reference nearer to the middle of the motion"
+    )
+
+
+@pytest.mark.parametrize(("scale", "memory"), [(8.0, GIB // 8), (1.0, GIB // 256), (0.9, GIB // 256)])
+def test_the_scale_that_it_suggests_fits_and_is_not_much_too_small(pan: Callable, scale: float, memory: int) -> None:
+    with pytest.raises(CanvasTooLargeError) as caught:
+        plan_canvas(pan(5), ALL, (1000, 2000), scale, memory)
+    suggested = float(str(caught.value).split(f"render.scale from {scale:g} to ")[1].split(",")[0])
+    plan_canvas(pan(5), ALL, (1000, 2000), suggested, memory)
+    with pytest.raises(CanvasTooLargeError):
+        plan_canvas(pan(5), ALL, (1000, 2000), 1.1 * suggested, memory)
+
+
+def test_a_turn_to_the_horizon_is_told(known_motion: type) -> None:
+    motion = known_motion(lambda frame: from_parameters([0, 0, 0, 0, 0, 0, -frame / N / 20, 0]))
+    with pytest.raises(LocationError) as caught:
+        plan_canvas(motion, ALL, SHAPE, 1.0, GIB)
+    assert str(caught.value) == (
+        "the motion turns so far away from the reference frame that a flat panorama cannot show it "
+        "(homography 59 of 60 sends part of its frame behind the reference plane); "
+        "choose a render.reference in the middle of the motion, or fewer frames"
+    )
+
+
+def scene(width: int) -> np.ndarray:
+    """Mean counts of stripes 8 px wide: (30, width)."""
+    return np.tile(np.where(np.arange(width) // 8 % 2, 0.8, 0.2), (SHAPE[0], 1))
+
+
+@pytest.fixture(scope="module")
+def panning(memory_source: type) -> Any:
+    """Frame t shows the scene from column t on."""
+    rng, wide = np.random.default_rng(0), scene(SHAPE[1] + N)
+    return memory_source(np.array([rng.random(SHAPE) < wide[:, start : start + SHAPE[1]] for start in range(N)]))
+
+
+def rendered(source: Any, motion: Any, scale: float = 1.0, span: FrameSpan = ALL) -> tuple[Panorama, Canvas]:
+    canvas = plan_canvas(motion, span, SHAPE, scale, GIB)
+    return render(source, motion, span, canvas, 0.25, Context()), canvas
+
+
+def test_the_panorama_shows_the_scene(panning: Any, pan: Callable) -> None:
+    panorama, canvas = rendered(panning, pan(1))
+    assert canvas.shape == panorama.flux.shape == (30, 40 + N - 1)
+    np.testing.assert_allclose(panorama.weight[0], np.minimum(np.arange(99), 98 - np.arange(99)).clip(max=39) + 1, rtol=1e-5)
+    mean_count = panning.response.mean_count(panorama.flux)[:, 10:-10]
+    error = mean_count - scene(99)[:, 10:-10]
+    weight = panorama.weight[:, 10:-10]
+    # The rule for saturated pixels pulls few of them by half a photon.
+    assert abs(error.mean()) < 4 * np.sqrt(0.16 / weight.sum()) + 1e-3
+    assert (error * np.sqrt(weight)).std() == pytest.approx(np.sqrt(0.16), rel=0.1)
+
+
+def test_frames_beyond_the_span_are_left_out(panning: Any, pan: Callable) -> None:
+    panorama, _ = rendered(panning, pan(1), span=FrameSpan(10, 20))
+    assert panorama.weight.max() == pytest.approx(10)
+    assert panorama.weight.sum() == pytest.approx(10 * 30 * 40)
+
+
+def test_at_twice_the_scale_every_pixel_is_four(panning: Any, pan: Callable) -> None:
+    panorama, canvas = rendered(panning, pan(1), scale=2.0)
+    assert canvas.shape == panorama.flux.shape == (60, 2 * 99)
+    mean_count = panning.response.mean_count(panorama.flux)
+    # The middle of a stripe is as bright as it is at scale 1.
+    bright = [mean_count[10:50, 2 * column : 2 * column + 2].mean() for column in (44, 60)]
+    dark = [mean_count[10:50, 2 * column : 2 * column + 2].mean() for column in (36, 52)]
+    np.testing.assert_allclose(bright, 0.8, atol=0.03)
+    np.testing.assert_allclose(dark, 0.2, atol=0.03)
+
+
+@pytest.mark.parametrize("motion", [(1, 0.0), (0.2, 1.5)], ids=["wide", "high"])
+@pytest.mark.parametrize("scale", [1.0, 1.7])
+def test_tiles_make_up_the_panorama(panning: Any, known_motion: type, motion: tuple[float, float], scale: float) -> None:
+    right, down = motion
+    turning = known_motion(lambda t: from_parameters([1e-4 * t, 2e-4 * t, -2e-4 * t, 0, right * t, down * t, 1e-6 * t, 0]))
+    canvas = plan_canvas(turning, ALL, SHAPE, scale, GIB)
+    whole = render(panning, turning, ALL, canvas, 0.25, Context())
+    tiles, reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL // 3)
+    assert len(tiles) > 2
+    flux, weight = np.zeros(canvas.shape), np.zeros(canvas.shape)
+    shown = Overview(canvas, reduction)
+    for tile, part in zip(tiles, render_tiles(panning, turning, ALL, tiles, 0.25, Context(2)), strict=True):
+        box = np.s_[tile.top : tile.top + tile.canvas.height, tile.left : tile.left + tile.canvas.width]
+        flux[box], weight[box] = part.flux, part.weight
+        shown.add(tile, part)
+    np.testing.assert_allclose(weight, whole.weight, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(flux, whole.flux, rtol=1e-3, atol=1e-4)
+    single = Overview(canvas, reduction)
+    single.add(Tile(0, 0, canvas), Panorama(flux.astype(np.float32), weight.astype(np.float32), canvas.transform))
+    np.testing.assert_allclose(shown.panorama.flux, single.panorama.flux, rtol=1e-6)
+    np.testing.assert_allclose(shown.panorama.weight, single.panorama.weight, rtol=1e-6)
+
+
+def test_an_overview_averages_what_was_seen() -> None:
+    flux = np.array([[1, 3, np.nan], [np.nan, 5, np.nan], [4, 4, 8]], np.float32)
+    canvas = Canvas(3, 3, translation(2, 1))
+    shown = Overview(canvas, 2)
+    shown.add(Tile(0, 0, canvas), Panorama(flux, np.where(np.isnan(flux), 0, 8).astype(np.float32), canvas.transform))
+    np.testing.assert_array_equal(shown.panorama.flux, [[3, np.nan], [4, 8]])
+    np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
+    # The centre of the first square lies between the pixels 0 and 1.
+    np.testing.assert_allclose(apply(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
+
+
+def test_what_fits_is_rendered_at_once(pan: Callable) -> None:
+    canvas = plan_canvas(pan(1), ALL, SHAPE, 1.0, GIB)
+    (tile,), reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL)
+    assert (tile.left, tile.top, tile.canvas, reduction) == (0, 0, canvas, 1)
+
+
+@pytest.mark.parametrize("size", [(3000, 40_000), (50_000, 3000), (3001, 3003)])
+@pytest.mark.parametrize("excess", [1.01, 3, 16])
+def test_tiles_and_their_overview_fit_into_the_memory(size: tuple[int, int], excess: float) -> None:
+    canvas, memory = Canvas(*size, np.eye(3)), int(size[0] * size[1] * BYTES_PER_PIXEL / excess)
+    tiles, reduction = tiles_of(canvas, memory)
+    assert sum(tile.canvas.height * tile.canvas.width for tile in tiles) == size[0] * size[1]
+    assert all(tile.left % reduction == tile.top % reduction == 0 for tile in tiles)
+    most = max(tile.canvas.height * tile.canvas.width for tile in tiles)
+    assert BYTES_PER_PIXEL * (most + size[0] * size[1] / reduction**2) <= memory
+    assert len(tiles) <= 4 * excess
+
+
+def test_it_tells_of_every_frame(panning: Any, pan: Callable) -> None:
+    class Counting(Quiet):
+        def __init__(self) -> None:
+            self.frames: list[int] = []
+
+        def stage(self, title: str, total: int, unit: str) -> Any:
+            self.title = (title, total, unit)
+            return self
+
+        def __enter__(self) -> Any:
+            return self.frames.append
+
+        def __exit__(self, *_: object) -> None: ...
+
+    progress = Counting()
+    motion, span = pan(1), FrameSpan(10, 40)
+    render(panning, motion, span, plan_canvas(motion, span, SHAPE, 1.0, GIB), 2.0, Context(2, progress))
+    assert progress.title == ("panorama", 30, "frames")
+    assert sum(progress.frames) == 30
+    assert len(progress.frames) == 15
+
+
+def test_the_memory_of_a_pixel_is_no_more_than_is_predicted(memory_source: type, pan: Callable) -> None:
+    """A still camera at a scale that makes 2.4 megapixels of every frame: what is held at the same time at most."""
+    source = memory_source(np.random.default_rng(0).random((4, 60, 100)) < 0.5)
+    canvas = plan_canvas(pan(0), source.info.span, source.info.frame_shape, 20.0, GIB)
+    tracemalloc.start()
+    try:
+        panorama = render(source, pan(0), source.info.span, canvas, 0.25, Context())
+        white = np.quantile(panorama.flux[panorama.weight > 0], 0.995)
+        tone_mapped(panorama.flux, float(white))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 0.5 * BYTES_PER_PIXEL < peak / (canvas.height * canvas.width) < BYTES_PER_PIXEL

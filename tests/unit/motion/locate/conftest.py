@@ -1,0 +1,82 @@
+"""A level of twelve exposures, in each of which a known motion is located, or lost."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import Located, NotLocated
+from photonpano.context import Context
+from photonpano.geometry import inverse
+from photonpano.motion.locate import locate
+from photonpano.motion.merge import VirtualExposures
+from photonpano.specs.settings import GraphSettings
+from photonpano.threads import Stopwatch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from photonpano import Group, Trajectory
+    from photonpano.motion.locate import LocatedLevel
+    from photonpano.pipeline.components import Level
+
+SHAPE = (40, 60)
+N_FRAMES = 120
+CHAIN = GraphSettings(skips=())
+
+
+@pytest.fixture(scope="module")
+def source(memory_source: type) -> Any:
+    return memory_source(np.zeros((N_FRAMES, *SHAPE)))
+
+
+@pytest.fixture
+def run(source: Any) -> Callable[..., LocatedLevel]:
+    def run(level: Level, known: Trajectory | None = None, graph: GraphSettings = CHAIN, threads: int = 2) -> LocatedLevel:
+        groups = level.resampler.groups(N_FRAMES, level.number)
+        clock = Stopwatch(threads)
+        return locate(level, VirtualExposures(level, source, groups, known, clock), known, graph, clock, Context(threads))
+
+    return run
+
+
+@pytest.fixture
+def failing() -> Callable[..., Any]:
+    """Make an answer that loses every pair of these exposures."""
+
+    def failing(*lost: int) -> Callable[..., Any]:
+        def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+            return NotLocated("lost") if {moving.span.start // 10, fixed.span.start // 10} & set(lost) else found
+
+        return answer
+
+    return failing
+
+
+def _truth(moving: Group, fixed: Group, found: Located) -> Located:
+    return found
+
+
+class Second:
+    """A fallback that knows the motion, remembers what it was shown, and answers as it is told."""
+
+    def __init__(self, motion: Trajectory, answer: Callable[..., Any] = _truth) -> None:
+        self._motion, self._answer = motion, answer
+        self.shown: list[int] = []
+
+    def describe(self, exposure: Any) -> Any:
+        time.sleep(0.002)  # long enough that two threads that ask for the same one would meet
+        self.shown.append(exposure.group.span.start // 10)
+        return exposure
+
+    def register(self, moving: Any, fixed: Any, initial: np.ndarray | None) -> Any:
+        to_plane = self._motion.at([moving.group.reference, fixed.group.reference])
+        return self._answer(moving.group, fixed.group, Located(inverse(to_plane[1]) @ to_plane[0]))
+
+
+@pytest.fixture
+def make_second() -> type[Second]:
+    return Second

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import Group, Located, NotLocated, PluginError
+from photonpano.geometry import rescaled, translation
+from photonpano.motion.registration import broken_promise
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+BROKEN = [
+    (None, "expected Located or NotLocated, got NoneType"),
+    (np.eye(3), "expected Located or NotLocated, got ndarray"),
+    (
+        Located(np.full((3, 3), np.nan)),
+        "a homography is a finite (3, 3) matrix with h33 = 1, got [[nan, nan, nan], [nan, nan, nan], [nan, nan, nan]]; "
+        "a failure is NotLocated",
+    ),
+    (
+        Located(np.eye(2)),
+        "a homography is a finite (3, 3) matrix with h33 = 1, got [[1.0, 0.0], [0.0, 1.0]]; a failure is NotLocated",
+    ),
+    (
+        Located(np.diag([1.0, 1.0, 0.0])),
+        "a homography is a finite (3, 3) matrix with h33 = 1, got [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]; "
+        "a failure is NotLocated",
+    ),
+    *(
+        (
+            Located(np.eye(3), information),
+            "information is an inverse covariance: an (8, 8) matrix, finite and positive definite; None if there is none",
+        )
+        for information in (np.eye(9), -np.eye(8), np.zeros((8, 8)), np.full((8, 8), np.nan))
+    ),
+    (Located(translation(3, 1), evidence={"inliers": "many"}), "evidence consists of numbers, got inliers = 'many'"),
+    (NotLocated("lost", {"matches": [3, 4]}), "evidence consists of numbers, got matches = [3, 4]"),
+]
+
+
+@pytest.mark.parametrize(("answer", "problem"), BROKEN)
+def test_what_is_no_motion_is_refused_with_the_name_of_the_locator(
+    run: Callable, make_level: Callable, pan: Callable, answer: Any, problem: str
+) -> None:
+    assert broken_promise(answer) == problem
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.3), lambda *_: answer))
+    assert str(caught.value) == f"locator 'toy' of toys 1.0 broke its contract at level 1: {problem}"
+
+
+def test_a_motion_that_keeps_its_promise() -> None:
+    assert broken_promise(Located(np.eye(3), np.eye(8))) is None
+    assert broken_promise(Located(rescaled(translation(3, 1), 2))) is None
+    assert broken_promise(Located(translation(3, 1), evidence={"inliers": np.int64(3), "ncc": np.float32(0.5)})) is None
+    assert broken_promise(NotLocated("lost", {"matches": 3})) is None
+
+
+def in_whole_pixels(moving: Group, fixed: Group, found: Located) -> Located:
+    return replace(found, homography=np.round(found.homography))
+
+
+STILL = (
+    "broke its contract at level 1: every pair that was located is exactly the identity, which a camera that stands still does "
+    "not give; a failure is NotLocated"
+)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_a_level_in_which_nothing_moves_to_the_last_digit_is_refused(
+    run: Callable, make_level: Callable, pan: Callable, scale: float
+) -> None:
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.0), scale=scale))
+    assert str(caught.value) == f"locator 'toy' of toys 1.0 {STILL}"
+
+
+def test_both_locators_that_see_nothing_move_are_named(
+    run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
+) -> None:
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.0), failing(4), fallbacks={"second": make_second(pan(0.0))}))
+    both = "locator 'toy' of toys 1.0 and locator 'second' of toys 1.0"
+    assert str(caught.value) == f"{both} {STILL.replace('its', 'their')}"
+
+
+def test_a_camera_that_stands_still_is_believed(run: Callable, make_level: Callable, pan: Callable) -> None:
+    def nearly(moving: Group, fixed: Group, found: Located) -> Located:
+        return replace(found, homography=found.homography @ translation(1e-4, 0))
+
+    assert run(make_level(pan(0.0), nearly)).n_located == 12
+
+
+def test_pairs_that_move_less_than_a_locator_tells_are_believed(
+    run: Callable, make_level: Callable, known_motion: type
+) -> None:
+    """Slow at first: pairs are the identity in whole pixels, and the motion known so far errs by 2 px."""
+    motion = known_motion(lambda frame: translation(0.001 * frame**2, 0))
+    found = run(make_level(motion, in_whole_pixels), known_motion(lambda frame: translation(0.2 * frame, 0)))
+    identities = [bool((edge.motion.homography == np.eye(3)).all()) for edge in found.edges]
+    assert identities == [True] * 2 + [False] * 9
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_the_identity_is_refused_where_the_motion_is_known_to_be_far_from_it(
+    run: Callable, make_level: Callable, pan: Callable, scale: float
+) -> None:
+    with pytest.raises(PluginError) as caught:
+        run(make_level(pan(0.0), scale=scale), pan(0.6))
+    assert str(caught.value) == (
+        "locator 'toy' of toys 1.0 broke its contract at level 1: got the identity where the motion known so far moves the "
+        "corners by 6 px; a failure is NotLocated"
+    )

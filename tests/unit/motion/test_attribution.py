@@ -1,0 +1,110 @@
+"""Whoever asks a source or a trajectory, what goes wrong carries its name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, PluginError
+from photonpano.motion.attribution import AttributedSource, AttributedTrajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+ORIGIN = "source 'toy' of toys 1.0"
+SPAN = FrameSpan(2, 5)
+
+
+@pytest.fixture
+def source(memory_source: type) -> Any:
+    return memory_source(np.random.default_rng(0).random((8, 4, 6)) < 0.5)
+
+
+def raising(error: BaseException) -> Callable[..., Any]:
+    def fail(*_: Any) -> Any:
+        raise error
+
+    return fail
+
+
+def test_a_source_is_what_it_was(source: Any) -> None:
+    named = AttributedSource(source, ORIGIN)
+    assert (named.info, named.response) == (source.info, source.response)
+    assert named.valid is source.valid
+    np.testing.assert_array_equal(named.counts(SPAN), source.counts(SPAN))
+    np.testing.assert_array_equal(named.frames(SPAN), source.frames(SPAN))
+
+
+def test_it_has_what_the_source_has(source: Any) -> None:
+    assert not isinstance(AttributedSource(source, ORIGIN), PackedSource | LinearlyCorrectedSource)
+    source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
+    source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
+    named = AttributedSource(source, ORIGIN)
+    assert isinstance(named, PackedSource)
+    assert isinstance(named, LinearlyCorrectedSource)
+    np.testing.assert_array_equal(named.packed(SPAN), source.packed(SPAN))
+    np.testing.assert_array_equal(named.corrected(source.counts(SPAN), 3), source.counts(SPAN) - np.float32(3))
+    source.packed = raising(OSError("gone"))
+    with pytest.raises(PluginError, match=r"failed at frames 2 to 4: OSError: gone"):
+        AttributedSource(source, ORIGIN).packed(SPAN)
+
+
+def test_it_closes_what_it_names(source: Any) -> None:
+    closed: list[bool] = []
+    source.close = lambda: closed.append(True)
+    with AttributedSource(source, ORIGIN):
+        assert not closed
+    assert closed
+
+
+@pytest.mark.parametrize("method", ["counts", "frames"])
+def test_a_source_that_raises_or_gives_another_shape_is_named(source: Any, method: str) -> None:
+    named = AttributedSource(source, ORIGIN)
+    setattr(source, method, raising(OSError("gone")))
+    with pytest.raises(PluginError) as caught:
+        getattr(named, method)(SPAN)
+    assert str(caught.value) == f"{ORIGIN} failed at frames 2 to 4: OSError: gone"
+    setattr(source, method, lambda _: np.zeros((6, 4)))
+    with pytest.raises(PluginError) as caught:
+        getattr(named, method)(SPAN)
+    expected = {"counts": "(4, 6)", "frames": "(3, 4, 6)"}[method]
+    assert str(caught.value) == f"{ORIGIN} broke its contract at frames 2 to 4: expected the shape {expected}, got (6, 4)"
+
+
+def test_what_is_meant_for_users_passes(source: Any) -> None:
+    error = InputError("the disk was pulled out")
+    source.counts = raising(error)
+    with pytest.raises(InputError) as caught:
+        AttributedSource(source, ORIGIN).counts(SPAN)
+    assert caught.value is error
+
+
+def test_a_trajectory_is_what_it_was(pan: Callable) -> None:
+    motion = pan(0.3)
+    named = AttributedTrajectory(motion, "interpolator 'toy' of toys 1.0", 2)
+    for frames in ([3], [0, 2.5, 7], np.arange(4), 3):
+        np.testing.assert_array_equal(named.at(frames), motion.at(frames))
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        (raising(KeyError("knot")), "failed at level 2: KeyError: 'knot'"),
+        (lambda _: np.eye(3), "broke its contract at level 2: expected homographies of the shape (2, 3, 3), got (3, 3)"),
+        (
+            lambda _: [np.eye(3), np.diag([1.0, 1.0, 0.0])],
+            "broke its contract at level 2: a homography is finite with h33 = 1, that of frame 7.5 is "
+            "[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]",
+        ),
+    ],
+    ids=["raises", "shape", "h33"],
+)
+def test_the_interpolator_of_a_trajectory_is_named(answer: Callable[..., Any], problem: str) -> None:
+    class Odd:
+        at = staticmethod(answer)
+
+    with pytest.raises(PluginError) as caught:
+        AttributedTrajectory(Odd(), "interpolator 'toy' of toys 1.0", 2).at([3, 7.5])
+    assert str(caught.value) == f"interpolator 'toy' of toys 1.0 {problem}"

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+from textwrap import dedent
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photonpano import FrameSpan, Group, Located, LocationError, NotLocated, VirtualExposure
+from photonpano.motion.diagnosis import Contrast, contrast_of, require_tied
+from photonpano.photometry import BinaryResponse
+from photonpano.values import Edge
+
+if TYPE_CHECKING:
+    from typing import Any, Literal
+
+RESPONSE = BinaryResponse()
+
+
+def exposed(counts: np.ndarray, frames: int) -> VirtualExposure:
+    weight = np.full(counts.shape, frames, np.float32)
+    flux = RESPONSE.flux((counts / frames).astype(np.float32), weight)
+    return VirtualExposure(flux, weight, Group(FrameSpan(0, frames), 0), 1.0, RESPONSE)
+
+
+@given(st.integers(1, 100_000))
+def test_an_exposure_that_is_lit_in_every_frame_is_blank(frames: int) -> None:
+    assert contrast_of(exposed(np.full((4, 6), frames), frames)).blank == (
+        "every pixel is as bright as can be told, so that its flux is unknown; use a darker aperture"
+    )
+
+
+@given(st.integers(1, 100_000))
+def test_one_dark_frame_of_one_pixel_is_not(frames: int) -> None:
+    counts = np.full((4, 6), frames)
+    counts[1, 2] -= 1
+    assert contrast_of(exposed(counts, frames)).blank is None
+
+
+def test_an_exposure_without_photons_is_blank() -> None:
+    assert contrast_of(exposed(np.zeros((4, 6)), 100)).blank == (
+        "no pixel saw a photon; is the shutter closed, or the file the right one?"
+    )
+
+
+def test_an_exposure_that_saw_nothing_is_blank() -> None:
+    exposure = exposed(np.zeros((4, 6)), 100)
+    exposure.flux[:], exposure.weight[:] = np.nan, 0
+    assert contrast_of(exposure).blank == "no pixel was seen"
+
+
+N = 10
+GROUPS = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(N))
+CLEAR, DARK = Contrast(12.34), Contrast(0.17)
+BLANK = Contrast(0.0, "no pixel saw a photon")
+
+
+def require(
+    lost: tuple[int, ...],
+    contrast: Contrast = CLEAR,
+    disconnected: Literal["error", "largest"] = "error",
+    reason: str = "3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)",
+) -> None:
+    """Ask for a chain of ten exposures, of which those that are lost fail in every pair."""
+    found, failed = Located(np.eye(3)), NotLocated(reason)
+    edges = [Edge(later, later - 1, failed if {later, later - 1} & set(lost) else found) for later in range(1, N)]
+    tied = np.array([0 if index not in lost else 1 + index for index in range(N)])
+    contrasts = {index: contrast if index in lost else CLEAR for index in range(N)}
+    require_tied(2, GROUPS, edges, tied, contrasts, disconnected)
+
+
+@pytest.mark.parametrize("lost", [(), (0,), (4,), (4, 5), (0, 3, 6, 9), (8, 9)])
+def test_single_exposures_may_be_lost(lost: tuple[int, ...]) -> None:
+    require(lost)
+
+
+@pytest.mark.parametrize("lost", [(4, 5, 6), (0, 1, 2, 3, 4, 5, 6, 7)])
+def test_the_largest_part_is_enough_if_the_spec_says_so(lost: tuple[int, ...]) -> None:
+    require(lost, disconnected="largest")
+
+
+def test_a_lone_group_needs_no_ties() -> None:
+    require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
+
+
+def refusal(*args: Any, **kwargs: Any) -> str:
+    with pytest.raises(LocationError) as caught:
+        require(*args, **kwargs)
+    return str(caught.value)
+
+
+def golden(text: str) -> str:
+    return dedent(text).strip()
+
+
+def test_a_part_without_texture_is_named_with_its_pairs() -> None:
+    assert refusal((4, 5, 6)) == golden(
+        """
+        level 2: 4 of 9 pairs of exposures could not be located, so that frames 400 to 699 cannot be tied to the rest
+        Tied together are frames 0 to 399 with frames 700 to 999.
+          frames 400 to 499 onto frames 300 to 399: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
+          frames 500 to 599 onto frames 400 to 499: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
+          frames 600 to 699 onto frames 500 to 599: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
+          frames 700 to 799 onto frames 600 to 699: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
+        In these exposures of 100 frames the scene varies 12 times as much as a pixel's photon noise, so darkness is \
+not the cause: either motion blurs them (try smaller groups, such as resample.with.group_size=50), or the scene has no \
+texture there.
+        To go on with the largest part alone, set graph.disconnected to largest.
+        """
+    )
+
+
+def test_darkness_is_told_from_blur() -> None:
+    assert refusal((0, 1, 2, 7, 8, 9), DARK).splitlines()[-2:] == [
+        "In these exposures of 100 frames the scene varies 0.17 times as much as a pixel's photon noise: either they are too "
+        "dark (try larger groups, such as resample.with.group_size=200), or the scene has no texture there.",
+        "To go on with the largest part alone, set graph.disconnected to largest.",
+    ]
+
+
+def test_where_either_may_be_the_cause_it_says_so() -> None:
+    faint = Contrast(0.8)
+    assert refusal((4, 5, 6), faint).splitlines()[-2] == (
+        "In these exposures of 100 frames the scene varies 0.8 times as much as a pixel's photon noise: either motion blurs "
+        "them (try smaller groups, such as resample.with.group_size=50), or they are too dark for what texture there is (try "
+        "larger ones, such as resample.with.group_size=200)."
+    )
+
+
+def test_several_spans_are_listed() -> None:
+    assert refusal((0, 1, 2, 7, 8, 9)).splitlines()[0] == (
+        "level 2: 6 of 9 pairs of exposures could not be located, "
+        "so that frames 0 to 299 and frames 700 to 999 cannot be tied to the rest"
+    )
+
+
+def parts_refusal(parts: list[int]) -> str:
+    groups = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(len(parts)))
+    contrasts = dict.fromkeys(range(len(parts)), CLEAR)
+    with pytest.raises(LocationError) as caught:
+        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], np.array(parts), contrasts, "error")
+    return str(caught.value).splitlines()[1]
+
+
+def test_the_parts_are_named_by_what_they_hold_the_largest_first() -> None:
+    """Exposures that are tied to no other make no part."""
+    assert parts_refusal([1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2]) == (
+        "Tied together are frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099."
+    )
+    assert parts_refusal([0, 0, 1, 2, 3]) == "Tied together are frames 0 to 199."
+
+
+def test_a_long_list_of_parts_is_cut() -> None:
+    shown = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
+    assert parts_refusal([part for part in range(6) for _ in range(2)]) == f"Tied together are {shown}."
+    assert parts_refusal([part for part in range(7) for _ in range(2)]) == f"Tied together are {shown}; and others."
+
+
+def test_a_long_list_of_pairs_is_cut() -> None:
+    lines = refusal((2, 3, 4, 5, 6, 7, 8, 9)).splitlines()
+    assert [line for line in lines if line.startswith("  ")][6:] == ["  ... and 2 more"]
+
+
+def test_blank_exposures_need_no_advice() -> None:
+    assert refusal((4, 5, 6), BLANK, reason="frames 400 to 499: no pixel saw a photon").splitlines()[-2:] == [
+        "  frames 700 to 799 onto frames 600 to 699: frames 400 to 499: no pixel saw a photon",
+        "To go on with the largest part alone, set graph.disconnected to largest.",
+    ]
+
+
+def test_when_nothing_is_tied_there_is_no_largest_part() -> None:
+    """Of ten exposures without a pair, the largest component is one."""
+    for disconnected in ("error", "largest"):
+        lines = refusal(tuple(range(1, N)), disconnected=disconnected).splitlines()
+        assert lines[0] == "level 2: none of the 9 pairs of exposures could be located"
+        assert lines[-1].endswith("or the scene has no texture there.")

@@ -1,0 +1,361 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import (
+    align_planes,
+    apply,
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    jacobian,
+    normalised,
+    parameters,
+    rescaled,
+    translation,
+)
+from photonpano.motion import adjustment
+from photonpano.motion.graph import components, solve
+from photonpano.values import Edge
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SHAPE = (254, 496)
+NOISE_PX = 0.1
+
+
+def true_motion(n_nodes: int, seed: int = 0) -> np.ndarray:
+    """A camera that wanders by about 20 px from exposure to exposure, and turns."""
+    steps = np.random.default_rng(seed).normal(size=(n_nodes, 8)) * [2e-3, 2e-3, 2e-3, 2e-3, 20, 5, 2e-6, 2e-6]
+    return from_parameters(np.cumsum(steps, axis=0))
+
+
+def edge(true: np.ndarray, moving: int, fixed: int, rng: np.random.Generator | None = None, std_px: float = NOISE_PX) -> Edge:
+    """Measure a pair; with a generator, every corner errs by `std_px` along each axis, and the information says so."""
+    homography = normalised(inverse(true[fixed]) @ true[moving])
+    to_corners = jacobian(homography, corners(SHAPE)).reshape(8, 8)
+    information = to_corners.T @ to_corners / std_px**2
+    if rng is not None:
+        change = np.linalg.solve(to_corners, rng.normal(scale=std_px, size=8))
+        homography = from_parameters(parameters(homography) + change)
+    return Edge(moving, fixed, Located(homography, information))
+
+
+def measured(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator | None = None) -> list[Edge]:
+    return [edge(true, moving, moving - skip, rng) for moving in range(len(true)) for skip in skips if skip <= moving]
+
+
+def error_px(homographies: np.ndarray, true: np.ndarray, anchor: int) -> float:
+    moved = inverse(normalised(inverse(true[anchor]) @ true)) @ homographies
+    return float(corner_displacements(moved, np.eye(3), SHAPE).mean())
+
+
+def moved(wrong: Edge, x_px: float, y_px: float) -> Edge:
+    """Return the edge as if its locator had been off by so many pixels."""
+    return replace(wrong, motion=replace(wrong.motion, homography=translation(x_px, y_px) @ wrong.motion.homography))
+
+
+def confident(edges: list[Edge], times: float) -> list[Edge]:
+    """Let edges say that they err by so many times less than they do."""
+    return [replace(each, motion=replace(each.motion, information=each.motion.information * times**2)) for each in edges]
+
+
+def without_information(edges: list[Edge]) -> list[Edge]:
+    return [Edge(each.moving, each.fixed, replace(each.motion, information=None)) for each in edges]
+
+
+@pytest.mark.parametrize("skips", [(1,), (1, 2, 4), (1, 29)], ids=["chain", "loops", "closed once"])
+@pytest.mark.parametrize("anchor", [0, 15, 29])
+def test_without_noise_it_is_exact(skips: tuple[int, ...], anchor: int) -> None:
+    true = true_motion(30)
+    solution = solve(30, measured(true, skips), anchor, SHAPE)
+    assert error_px(solution.homographies, true, anchor) < 1e-9
+    assert solution.located.all()
+    assert solution.contradictions == ()
+    assert solution.residual_px < 1e-9
+
+
+def test_the_anchor_is_the_identity() -> None:
+    solution = solve(30, measured(true_motion(30), (1, 2, 4), np.random.default_rng(0)), 7, SHAPE)
+    np.testing.assert_array_equal(solution.homographies[7], np.eye(3))
+    np.testing.assert_array_equal(solution.homographies[:, 2, 2], 1)
+
+
+def test_a_pair_may_be_measured_in_either_direction_and_twice() -> None:
+    true = true_motion(4)
+    edges = [edge(true, 1, 0), edge(true, 1, 2), edge(true, 2, 1), edge(true, 2, 3), edge(true, 0, 3), edge(true, 1, 0)]
+    assert error_px(solve(4, edges, 0, SHAPE).homographies, true, 0) < 1e-9
+
+
+def test_more_edges_beat_the_chain() -> None:
+    """Errors of 0.1 px a pair: over 120 exposures a chain drifts by 0.7 px; second and fourth neighbours leave 0.14 px."""
+    errors: dict[tuple[int, ...], list[float]] = {(1,): [], (1, 2, 4): [], (1, 2, 4, 40): []}
+    for seed in range(2):
+        true, rng = true_motion(120, seed), np.random.default_rng(seed)
+        for skips, found in errors.items():
+            found.append(error_px(solve(120, measured(true, skips, rng), 60, SHAPE).homographies, true, 60))
+    chain, neighbours, revisits = (float(np.mean(found)) for found in errors.values())
+    assert chain > 0.5
+    assert neighbours < 0.35 * chain
+    assert revisits < 0.15 * chain
+
+
+def test_the_residual_is_that_of_the_measurements() -> None:
+    """Every corner errs by 0.1 px along two axes; half of the residuals are taken up by the unknowns."""
+    true = true_motion(200)
+    edges = measured(true, (1, 2), np.random.default_rng(0))
+    solution = solve(200, edges, 100, SHAPE)
+    assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - 199 / len(edges)), rel=0.05)
+
+
+@pytest.mark.parametrize("told_by", ["information", "residual_px"])
+def test_edges_count_by_what_they_say_of_themselves(told_by: str) -> None:
+    """Every second measurement of a pair is twenty times as noisy."""
+    true, rng = true_motion(40), np.random.default_rng(0)
+    good = measured(true, (1, 2), rng)
+    noisy = [edge(true, each.moving, each.fixed, rng, 20 * NOISE_PX) for each in good]
+    best = error_px(solve(40, good, 20, SHAPE).homographies, true, 20)
+    told = good + noisy
+    if told_by == "residual_px":
+        stds = np.repeat([NOISE_PX, 20 * NOISE_PX], len(good))
+        told = [
+            Edge(each.moving, each.fixed, replace(each.motion, residual_px=std_px))
+            for each, std_px in zip(without_information(told), stds, strict=True)
+        ]
+    weighted = error_px(solve(40, told, 20, SHAPE).homographies, true, 20)
+    alike = error_px(solve(40, without_information(good + noisy), 20, SHAPE).homographies, true, 20)
+    assert weighted < 1.2 * best
+    assert alike > 1.5 * weighted
+
+
+def test_one_gross_outlier_is_outvoted_and_reported_wherever_it_is() -> None:
+    true = true_motion(9)
+    edges = measured(true, (1, 2, 4), np.random.default_rng(0))
+    clean = error_px(solve(9, edges, 4, SHAPE).homographies, true, 4)
+    for index, each in enumerate(edges):
+        solution = solve(9, [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, SHAPE)
+        assert solution.contradictions == (index,)
+        assert error_px(solution.homographies, true, 4) < 1.5 * clean
+
+
+def test_what_contradicts_is_dropped_as_if_it_were_not_there() -> None:
+    true = true_motion(20)
+    edges = measured(true, (1, 2, 4), np.random.default_rng(0))
+    wrong = {7: moved(edges[7], 3, 0), 30: moved(edges[30], 40, -30), 31: moved(edges[31], 0, 500)}
+    solution = solve(20, [wrong.get(index, each) for index, each in enumerate(edges)], 10, SHAPE)
+    without = solve(20, [each for index, each in enumerate(edges) if index not in wrong], 10, SHAPE)
+    assert solution.contradictions == tuple(wrong)
+    assert without.contradictions == ()
+    assert corner_displacements(solution.homographies, without.homographies, SHAPE).max() < 1e-3
+    assert solution.residual_px == pytest.approx(without.residual_px, rel=1e-4)
+    np.testing.assert_allclose(solution.information, without.information, rtol=0.01, atol=1e-4 * solution.information.max())
+    # Both are estimated from as many draws.
+    np.testing.assert_allclose(solution.std_px, without.std_px, rtol=0.25)
+
+
+def test_what_would_fall_apart_without_them_keeps_its_contradictions() -> None:
+    """The last exposure hangs by two pairs that are 40 px apart: nothing tells which is right, and that is what it says."""
+    still = np.broadcast_to(np.eye(3), (21, 3, 3))
+    told = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
+    solution = solve(21, without_information(told), 10, SHAPE)
+    assert solution.located.all()
+    assert solution.contradictions == ()
+    assert error_px(solution.homographies, still, 10) < 1e-6
+    assert solution.residual_px == pytest.approx(20 * np.sqrt(2 / len(told)))
+    assert solution.std_px[:20].max() < 2 < 5 < solution.std_px[20] < 40
+
+
+def test_failures_are_skipped_and_positions_are_those_of_the_whole_list() -> None:
+    true = true_motion(20)
+    edges = measured(true, (1, 2, 4), np.random.default_rng(0))
+    failure = Edge(5, 3, NotLocated("nothing to see"))
+    given = [failure, *edges[:30], failure, moved(edges[30], 40, -30), *edges[31:]]
+    assert solve(20, given, 10, SHAPE).contradictions == (32,)
+
+
+def test_half_of_the_pairs_agree_perfectly_where_the_search_starts_and_do_not_outvote_the_rest() -> None:
+    """The tree that it starts from holds one pair in two; their errors are three times what they say."""
+    true = true_motion(60)
+    edges = confident(measured(true, (1, 2), np.random.default_rng(0)), 3)
+    solution = solve(60, edges, 30, SHAPE)
+    assert solution.contradictions == ()
+    assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - 59 / len(edges)), rel=0.1)
+
+
+def test_what_is_not_tied_to_the_anchor_is_unknown() -> None:
+    true = true_motion(7)
+    edges = [edge(true, 1, 0), edge(true, 2, 1), edge(true, 2, 0), Edge(3, 2, NotLocated("lost")), edge(true, 5, 4)]
+    solution = solve(7, edges, 1, SHAPE)
+    np.testing.assert_array_equal(solution.located, [True, True, True, False, False, False, False])
+    assert error_px(solution.homographies[:3], true[:3], 1) < 1e-9
+    for values in (solution.homographies, solution.information, solution.std_px):
+        assert np.isfinite(values[:3]).all()
+        assert np.isnan(values[3:]).all()
+
+
+def test_a_graph_without_edges_is_its_anchor() -> None:
+    solution = solve(3, [], 2, SHAPE)
+    np.testing.assert_array_equal(solution.located, [False, False, True])
+    np.testing.assert_array_equal(solution.homographies[2], np.eye(3))
+    assert np.isnan(solution.homographies[:2]).all()
+    assert np.isnan(solution.information).all()
+    assert np.isnan(solution.std_px).all()
+
+
+def test_the_solution_does_not_depend_on_the_unit_of_length() -> None:
+    true = true_motion(20)
+    edges = without_information(measured(true, (1, 2, 4), np.random.default_rng(0)))
+    halved = [
+        Edge(each.moving, each.fixed, replace(each.motion, homography=rescaled(each.motion.homography, 0.5))) for each in edges
+    ]
+    whole = solve(20, edges, 10, SHAPE)
+    # Rescaling keeps pixel edges in place, so that corner pixels are not quite the same points: to 1/1000 px it is one motion.
+    half = solve(20, halved, 10, (SHAPE[0] // 2, SHAPE[1] // 2))
+    moved = inverse(whole.homographies) @ rescaled(half.homographies, 2)
+    assert corner_displacements(moved, np.eye(3), SHAPE).max() < 1e-3
+
+
+def test_components_are_numbered_from_the_largest() -> None:
+    true = true_motion(7)
+    edges = [edge(true, 1, 0), Edge(2, 1, NotLocated("lost")), edge(true, 3, 2), edge(true, 4, 3), edge(true, 6, 4)]
+    assert [len(np.flatnonzero(components(7, edges) == part)) for part in (0, 1, 2)] == [4, 2, 1]
+    np.testing.assert_array_equal(components(7, edges) == 0, [False, False, True, True, True, False, True])
+    assert sorted(components(3, [])) == [0, 1, 2]
+
+
+def squared_errors(homographies: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the mean square distance of the corners from where they should be, after the best alignment of planes: (N,)."""
+    frame = corners(SHAPE)
+    missed = apply(np.linalg.inv(true) @ align_planes(homographies, true, SHAPE) @ homographies, frame) - frame
+    return np.sum(missed**2, axis=-1).mean(axis=-1)
+
+
+def unequal(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator) -> list[Edge]:
+    """Measure pairs that err by 0.03 to 0.3 px, and say so."""
+    stds = np.random.default_rng(1).choice([0.03, 0.1, 0.3], size=len(true) * len(skips))
+    pairs = [(moving, moving - skip) for moving in range(len(true)) for skip in skips if skip <= moving]
+    return [edge(true, *pair, rng, std_px) for pair, std_px in zip(pairs, stds, strict=False)]
+
+
+GRAPHS: dict[str, Callable[..., list[Edge]]] = {
+    "a chain": lambda true, rng: measured(true, (1,), rng),
+    "second neighbours": lambda true, rng: measured(true, (1, 2), rng),
+    "closed at the end": lambda true, rng: measured(true, (1, len(true) - 1), rng),
+    "closed in a part": lambda true, rng: [*measured(true, (1,), rng), edge(true, 8, 1, rng)],
+    "unequal noise": lambda true, rng: unequal(true, (1, 2), rng),
+    "overconfident": lambda true, rng: confident(measured(true, (1, 2), rng), 3),
+}
+
+
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_the_error_is_what_it_says_for_every_exposure(graph: str) -> None:
+    """Sixteen measurements of one motion: the error of every exposure is as large as expected."""
+    true = true_motion(10)
+    found = [solve(10, GRAPHS[graph](true, np.random.default_rng(seed)), 5, SHAPE) for seed in range(16)]
+    squares = np.array([squared_errors(solution.homographies, true) for solution in found])
+    expected = np.array([solution.std_px for solution in found])
+    ratios = np.sqrt(squares.mean(axis=0) / (expected**2).mean(axis=0))
+    assert 0.7 < ratios.min() < ratios.max() < 1.2
+    # A single loop tells little of the size of errors, and in doubt they are taken to be larger.
+    assert 0.8 < np.sqrt(squares.mean() / (expected**2).mean()) < 1.1
+    assert np.mean(np.sqrt(squares) < 3 * expected) > 0.99
+
+
+@pytest.mark.parametrize("n_nodes", [9, 36])
+def test_a_chain_drifts_as_a_random_walk_about_its_middle(n_nodes: int) -> None:
+    """Step j of a walk over N exposures weighs j / N in the distance of those after it from the mean, (N - j) / N before.
+
+    The camera stands still, so that the best alignment of planes takes out the mean.
+    """
+    true = np.broadcast_to(np.eye(3), (n_nodes, 3, 3))
+    solution = solve(n_nodes, measured(true, (1,)), 0, SHAPE)
+    steps = np.arange(1, n_nodes)
+    shares = [np.where(steps <= k, steps, n_nodes - steps) / n_nodes for k in range(n_nodes)]
+    walk = NOISE_PX * np.sqrt(2) * np.linalg.norm(shares, axis=1)
+    np.testing.assert_allclose(solution.std_px, walk, rtol=0.12)
+
+
+def test_what_is_expected_does_not_depend_on_the_anchor() -> None:
+    true = true_motion(20)
+    edges = measured(true, (1, 2), np.random.default_rng(0))
+    first, last = (solve(20, edges, anchor, SHAPE).std_px for anchor in (0, 19))
+    np.testing.assert_allclose(first, last, rtol=0.01)
+
+
+@pytest.mark.parametrize("skips", [(1, 2), (1,)], ids=["loops", "chain"])
+def test_only_loops_tell_that_pairs_are_too_sure_of_themselves(skips: tuple[int, ...]) -> None:
+    true = true_motion(40)
+    edges = measured(true, skips, np.random.default_rng(0))
+    honest, sure, modest = (solve(40, confident(edges, times), 20, SHAPE).std_px.mean() for times in (1, 5, 0.2))
+    assert sure == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.1)
+    assert modest == pytest.approx(5 * honest, rel=0.15)
+
+
+def test_the_information_is_the_curvature_of_the_disagreement_while_the_others_are_held() -> None:
+    true = true_motion(5)
+    edges = [
+        edge(true, 1, 0),
+        edge(true, 2, 1, std_px=0.2),
+        edge(true, 2, 0),
+        edge(true, 1, 3, std_px=0.05),
+        edge(true, 4, 3),
+        edge(true, 4, 2),
+    ]
+    solution = solve(5, edges, 1, SHAPE)
+
+    def disagreement(node: int, change: np.ndarray) -> float:
+        homographies = solution.homographies.copy()
+        homographies[node] = from_parameters(parameters(homographies[node]) + change)
+        total = 0.0
+        for each in (each for each in edges if node in (each.moving, each.fixed)):
+            relative = normalised(inverse(homographies[each.fixed]) @ homographies[each.moving])
+            missed = parameters(relative) - parameters(each.motion.homography)
+            total += missed @ each.motion.information @ missed / 2
+        return total
+
+    # Each step moves the corners by about as much.
+    steps = 1e-3 / np.array([250, 250, 250, 250, 1, 1, 250**2, 250**2])
+    for node in range(5):
+        curvature = np.zeros((8, 8))
+        for first, second in np.ndindex(8, 8):
+            for one, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                change = one * steps * (np.arange(8) == first) + other * steps * (np.arange(8) == second)
+                curvature[first, second] += one * other * disagreement(node, change) / 4
+        told = solution.information[node] * np.outer(steps, steps)
+        np.testing.assert_allclose(told, curvature, rtol=0.01, atol=1e-3 * np.abs(told).max())
+
+
+@pytest.mark.parametrize(("closures", "most"), [(0, 20), (100, 50)])
+def test_a_large_graph_takes_few_steps_that_grow_with_its_size_only(
+    monkeypatch: pytest.MonkeyPatch, closures: int, most: int
+) -> None:
+    """The normal equations stay sparse: the factors hold so many blocks for each exposure."""
+    filled: list[int] = []
+    factorise = adjustment.splu
+
+    def counting(matrix: Any, **options: Any) -> Any:
+        factors = factorise(matrix, **options)
+        filled.append(factors.L.nnz + factors.U.nnz)
+        return factors
+
+    monkeypatch.setattr(adjustment, "splu", counting)
+    true, rng = true_motion(300), np.random.default_rng(0)
+    edges = measured(true, (1, 2, 4), rng)
+    ends = np.sort(rng.choice(300, (closures, 2)))
+    edges += [
+        Edge(int(late), int(early), Located(normalised(inverse(true[early]) @ true[late])))
+        for early, late in ends
+        if late - early > 4
+    ]
+    solve(300, edges, 150, SHAPE)
+    assert len(filled) <= 12
+    assert max(filled) < 300 * 8**2 * most

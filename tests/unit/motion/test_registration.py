@@ -1,0 +1,257 @@
+"""Places seen again: which pairs close loops, and what becomes of those that show another place."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import Located, NotLocated, VirtualExposure
+from photonpano.context import Context
+from photonpano.geometry import inverse, rescaling, translation
+from photonpano.motion.locate import locate
+from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.registration import MIN_AGREEMENT
+from photonpano.photometry import BinaryResponse
+from photonpano.specs.settings import GraphSettings
+from photonpano.threads import Stopwatch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from photonpano import Group, Trajectory
+    from photonpano.motion.locate import LocatedLevel
+    from photonpano.pipeline.components import Level
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SHAPE = (40, 60)
+N = 24
+"""Exposures of ten frames: twelve on the way there, 9 px apart, and twelve on the way back."""
+PAIRS = [(12 + i, 11 - i) for i in range(2, 12)]
+"""The exposures that see one place twice, apart from those around the turn."""
+PERIOD_PX = 20
+DRIFT_PX = 0.05
+
+
+class Scenery:
+    """Merges what a camera on a known path sees of a plane that repeats itself every 20 px; remembers what it merged."""
+
+    def __init__(self, motion: Trajectory) -> None:
+        self._motion = motion
+        self.merged: list[int] = []
+        self._images: list[weakref.ref[Any]] = []
+        tile = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(3 * PERIOD_PX,) * 2), (0, 0), 2)
+        self._plane = np.exp(3 * np.tile(tile[:PERIOD_PX, :PERIOD_PX], (4, 12)))
+
+    def merge(self, source: Any, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
+        height, width = (round(side * scale) for side in SHAPE)
+        to_plane = self._motion.at([group.reference])[0] @ inverse(rescaling(scale))
+        mean = cv2.warpPerspective(self._plane, to_plane, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        counts = np.random.default_rng(group.span.start).binomial(1000, 1 - np.exp(-mean))
+        weight = np.full(mean.shape, 1000, np.float32)
+        flux = BinaryResponse().flux((counts / 1000).astype(np.float32), weight)
+        self.merged.append(group.span.start // 10)
+        self._images.append(weakref.ref(flux))
+        return VirtualExposure(flux, weight, group, scale, BinaryResponse())
+
+    @property
+    def alive(self) -> int:
+        """How many exposures are held by anyone."""
+        gc.collect()
+        return sum(image() is not None for image in self._images)
+
+
+@pytest.fixture(scope="module")
+def there_and_back(known_motion: type) -> Trajectory:
+    """A path of 0.9 px a frame that returns after half of the frames."""
+    return known_motion(lambda frame: translation(20 + 0.9 * min(frame, 10 * N - 1 - frame), 20))
+
+
+@pytest.fixture
+def level(make_level: Callable, there_and_back: Trajectory) -> Callable[..., Level]:
+    def level(answer: Callable[..., Any] = drifting, **changes: Any) -> Level:
+        return make_level(there_and_back, answer, **{"merger": Scenery(there_and_back)} | changes)
+
+    return level
+
+
+@pytest.fixture
+def run(memory_source: type) -> Callable[..., LocatedLevel]:
+    source = memory_source(np.zeros((10 * N, *SHAPE)))
+
+    def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
+        groups, clock = level.resampler.groups(10 * N, level.number), Stopwatch(threads)
+        graph = GraphSettings(skips=(1.0, 2.0), closure_overlap=closure_overlap)
+        return locate(level, VirtualExposures(level, source, groups, None, clock), None, graph, clock, Context(threads))
+
+    return run
+
+
+def is_revisit(moving: Group, fixed: Group) -> bool:
+    return moving.reference - fixed.reference > 20
+
+
+def drifting(moving: Group, fixed: Group, found: Located) -> Located:
+    """Neighbours err by 0.05 px of an exposure for each group length, all in one direction; views of one place do not."""
+    off_px = 0.0 if is_revisit(moving, fixed) else DRIFT_PX * (moving.reference - fixed.reference) / 10
+    return replace(found, homography=translation(0, off_px) @ found.homography, evidence={"inliers": 30})
+
+
+def at_revisits(change: Callable[[Located], Located | NotLocated]) -> Callable[..., Any]:
+    def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+        return change(found) if is_revisit(moving, fixed) else drifting(moving, fixed, found)
+
+    return answer
+
+
+def drift_px(found: LocatedLevel) -> float:
+    """How far the first and the last exposure lie apart, which saw the same place."""
+    return abs(float(found.homographies[-1, 1, 2] - found.homographies[0, 1, 2]))
+
+
+def revisits_of(found: LocatedLevel) -> list[tuple[int, int]]:
+    return [(edge.moving, edge.fixed) for edge in found.revisits]
+
+
+def test_places_seen_again_stop_the_drift(run: Callable, level: Callable) -> None:
+    with_them, without = run(level()), run(level(), closure_overlap=None)
+    assert revisits_of(with_them) == PAIRS
+    assert revisits_of(without) == []
+    assert len(with_them.edges) == len(without.edges) + len(PAIRS)
+    assert drift_px(without) == pytest.approx(DRIFT_PX * (N - 1), rel=0.02)
+    assert drift_px(with_them) < 0.1 * drift_px(without)
+
+
+def test_what_was_accepted_tells_how_alike_the_two_are(run: Callable, level: Callable) -> None:
+    for edge in run(level()).revisits:
+        assert edge.locator == "toy"
+        assert edge.motion.evidence["inliers"] == 30
+        assert 0.9 < edge.motion.evidence["revisit_agreement"] < 1.05
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_the_search_starts_where_the_other_pairs_put_them(run: Callable, level: Callable, scale: float) -> None:
+    toy = level(scale=scale)
+    run(toy)
+    initials = toy.locators[0].component.initials
+    assert all(initial is None for initial in initials[: -len(PAIRS)])
+    # Both of a pair lie at one place, but since then neighbours have drifted, by 0.05 px of an exposure each.
+    expected = [translation(0, DRIFT_PX * (moving - fixed)) for moving, fixed in PAIRS]
+    np.testing.assert_allclose(initials[-len(PAIRS) :], expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_pairs_that_show_another_place_are_refused(run: Callable, level: Callable, scale: float) -> None:
+    wrong = at_revisits(lambda found: replace(found, homography=translation(7, 9) @ found.homography, evidence={"inliers": 12}))
+    found = run(level(wrong, scale=scale))
+    assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS == revisits_of(found)
+    for edge in found.failures:
+        assert edge.locator == ""
+        assert edge.motion.evidence["inliers"] == 12
+        alike = edge.motion.evidence["revisit_agreement"]
+        assert alike < MIN_AGREEMENT
+        assert edge.motion.reason == f"they may show one place, but agree by {alike:.2f} only (at least 0.7 is needed)"
+    np.testing.assert_array_equal(found.homographies, run(level(wrong, scale=scale), closure_overlap=None).homographies)
+
+
+def test_some_that_are_right_stop_the_drift_though_others_are_refused(run: Callable, level: Callable) -> None:
+    def answer(moving: Group, fixed: Group, found: Located) -> Located:
+        wrong = is_revisit(moving, fixed) and moving.span.start // 10 % 2
+        return (
+            replace(drifting(moving, fixed, found), homography=translation(7, 9)) if wrong else drifting(moving, fixed, found)
+        )
+
+    found = run(level(answer))
+    assert [(edge.moving, edge.fixed) for edge in found.failures] == [pair for pair in PAIRS if pair[0] % 2]
+    assert found.solution.contradictions == ()
+    assert drift_px(found) < 0.15
+
+
+def test_what_no_locator_finds_keeps_its_reason(run: Callable, level: Callable) -> None:
+    found = run(level(at_revisits(lambda _: NotLocated("3 matches", {"matches": 3}))))
+    assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS
+    assert {edge.motion.reason for edge in found.failures} == {"3 matches"}
+    assert found.n_located == N
+
+
+def test_a_fallback_is_asked_and_checked_as_well(
+    run: Callable, level: Callable, make_level: Callable, known_motion: type
+) -> None:
+    def lost(_: Located) -> NotLocated:
+        return NotLocated("3 matches")
+
+    still = make_level(known_motion(lambda _: np.eye(3))).locators[0].component
+    found = run(level(at_revisits(lost), fallbacks={"second": still}))
+    assert {edge.locator for edge in found.revisits} == {"second"}
+    astray = make_level(known_motion(lambda frame: translation(0.1 * frame, 0))).locators[0].component
+    found = run(level(at_revisits(lost), fallbacks={"second": astray}))
+    assert all("they may show one place" in edge.motion.reason for edge in found.failures)
+    assert (len(PAIRS) - 2) <= len(found.failures) <= len(PAIRS)
+
+
+def test_a_contradiction_that_looks_right_is_outvoted_and_found_among_all_pairs(run: Callable, level: Callable) -> None:
+    """The plane repeats itself: off by its period, two exposures look as much alike."""
+
+    def answer(moving: Group, fixed: Group, found: Located) -> Located:
+        motion = drifting(moving, fixed, found)
+        wrong = (moving.span.start // 10, fixed.span.start // 10) == PAIRS[5]
+        return replace(motion, homography=translation(PERIOD_PX, 0) @ motion.homography) if wrong else motion
+
+    found = run(level(answer))
+    (position,) = found.solution.contradictions
+    edge = found.edges[position]
+    assert (edge.moving, edge.fixed) == PAIRS[5]
+    assert edge.motion.evidence["revisit_agreement"] > 0.9
+    assert found.failures == ()
+    assert drift_px(found) < 0.15
+
+
+@pytest.mark.parametrize("threads", [2, 4])
+def test_any_number_of_threads_finds_the_same(run: Callable, level: Callable, threads: int) -> None:
+    alone, several = run(level(), threads=1), run(level(), threads=threads)
+    np.testing.assert_array_equal(several.homographies, alone.homographies)
+    np.testing.assert_array_equal(several.solution.std_px, alone.solution.std_px)
+    assert [(each.moving, each.fixed, each.locator) for each in several.edges] == [
+        (each.moving, each.fixed, each.locator) for each in alone.edges
+    ]
+    assert [each.motion.evidence for each in several.edges] == [each.motion.evidence for each in alone.edges]
+
+
+def test_only_exposures_of_places_seen_again_are_merged_again(run: Callable, level: Callable) -> None:
+    toy = level()
+    run(toy, threads=1)
+    assert toy.merger.merged[:N] == list(range(N))
+    assert toy.merger.merged[N:] == [index for pair in PAIRS for index in pair]
+
+
+def test_an_exposure_that_several_pairs_need_is_merged_again_once(run: Callable, level: Callable, known_motion: type) -> None:
+    """Three sweeps over six places: the last one meets both others."""
+    sweeps = known_motion(lambda frame: translation(20 + 0.9 * abs((frame + 80) % 160 - 80), 20))
+    toy = level(merger=Scenery(sweeps), locator=level().locators[0].component.__class__(sweeps, drifting))
+    found = run(toy, threads=1)
+    needed = {index for pair in revisits_of(found) for index in pair}
+    assert len(revisits_of(found)) > len(needed) / 2
+    assert sorted(toy.merger.merged[N:]) == sorted(needed)
+
+
+def test_all_are_forgotten_when_their_last_pair_is_done(run: Callable, level: Callable) -> None:
+    toy = level()
+    locator, most = toy.locators[0].component, 0
+    register = locator.register
+
+    def watched(*args: Any) -> Any:
+        nonlocal most
+        if len(toy.merger.merged) > N:
+            most = max(most, toy.merger.alive)
+        return register(*args)
+
+    locator.register = watched
+    run(toy)
+    assert most == 2
+    assert toy.merger.alive == 0

@@ -1,0 +1,181 @@
+"""`use: auto` is written for the source that recognises the path, and means that source."""
+
+import logging
+
+import pytest
+from pydantic import Field
+
+from photonpano import Config, Recognised, Requirement, SourceContribution, SpecError, SpecPath
+from photonpano.specs import load_spec, parse_spec
+from photonpano.values import Decision
+
+
+class HalvesConfig(Config):
+    path: SpecPath = Field(description="a folder of halves")
+    order: str = Field("left", description="which half comes first")
+    rows: int = Field(4, ge=1, description="rows of a frame")
+
+
+def halves(path):
+    if not (path / "left.bin").exists():
+        return None
+    return Recognised({"path": path, "order": "right", "rows": 8}, "left.bin lies in it")
+
+
+HALVES = SourceContribution(
+    name="halves", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=halves, check=lambda _: ()
+)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "cube.npy").touch()
+    (tmp_path / "cube.dat").write_bytes(b"12345")
+    (tmp_path / "recording").mkdir()
+    (tmp_path / "recording" / "left.bin").touch()
+    return tmp_path
+
+
+def parsed(folder, catalog, **keys):
+    return parse_spec({"version": 1, "source": {"use": "auto", "with": keys}}, directory=folder, catalog=catalog)
+
+
+def told(folder, catalog, text):
+    """Return what is said of a spec, without the folder."""
+    (folder / "scan.yaml").write_text(f"version: 1\n{text}")
+    with pytest.raises(SpecError) as caught:
+        load_spec(folder / "scan.yaml", catalog=catalog)
+    return str(caught.value).replace(f"{folder}/", "")
+
+
+def test_auto_is_the_source_that_recognises_the_path(folder, catalog):
+    plan = parsed(folder, catalog, path="cube.npy", frame_rate_hz=96800)
+    named = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy"), "frame_rate_hz": 96800}}
+    assert plan.document == parse_spec({"version": 1, "source": named}, directory=folder, catalog=catalog).document
+    assert plan.decisions == (Decision("source", "packed-npy", "cube.npy is taken for it: its name ends in .npy"),)
+
+
+def test_a_source_that_is_named_is_no_decision(folder, catalog):
+    again = parse_spec(parsed(folder, catalog, path="cube.npy").document, catalog=catalog)
+    assert again.decisions == ()
+
+
+def test_what_was_recognised_is_laid_under_what_is_written(folder, catalog):
+    plan = parsed(folder, catalog.including(HALVES), path="recording", rows=16)
+    assert plan.source.config == HalvesConfig(path=folder / "recording", order="right", rows=16)
+    assert set(plan.places) >= {"source.with.path", "source.with.order", "source.with.rows"}
+
+
+def fussy(name, *suffixes):
+    """Offer a source that recognises nothing and has something against everything."""
+    return SourceContribution(
+        name=name,
+        summary="Toy",
+        config=HalvesConfig,
+        build=lambda *_: None,
+        check=lambda config: [f"{config.path} is not mine"],
+        suffixes=suffixes,
+    )
+
+
+FUSSY = [fussy("any"), fussy("bins", ".bin"), fussy("dats", ".dat", ".data")]
+
+
+@pytest.mark.parametrize(
+    ("path", "looks", "heard"),
+    [("cube.dat", "a file of 5 bytes", ["any", "dats"]), ("recording", "a folder of left.bin", ["any", "bins"])],
+)
+def test_nobody_recognises_it(folder, catalog, path, looks, heard):
+    """Those speak whose files it could be, or who do not say what theirs are called."""
+    said = told(folder, catalog.including(*FUSSY), f"source: {{use: auto, with: {{path: {path}}}}}")
+    first, *others = said.splitlines()
+    assert first == f"scan.yaml:2:34: source.with.path: no source recognises {path}, {looks}; name the one that reads it"
+    assert others == [f"  {name}: {path} is not mine" for name in heard]
+
+
+def test_nobody_has_files_that_are_called_so(folder, catalog):
+    (folder / "cube.txt").touch()
+    said = told(folder, catalog.including(*FUSSY[1:]), "source: {use: auto, with: {path: cube.txt}}")
+    assert said.splitlines()[1:] == ["  the names of files of captures end in .bin, .dat and .data"]
+
+
+@pytest.mark.parametrize(
+    ("names", "looks"),
+    [
+        ([], "an empty folder"),
+        (["b", "a"], "a folder of a and b"),
+        (["d", "c", "b", "a"], "a folder of a, b, c and more"),
+    ],
+)
+def test_folders_are_told_by_what_is_in_them(folder, catalog, names, looks):
+    (folder / "odd").mkdir()
+    for name in names:
+        (folder / "odd" / name).touch()
+    assert f"no source recognises odd, {looks}; " in told(folder, catalog, "source: {use: auto, with: {path: odd}}")
+
+
+def test_several_recognise_it(folder, catalog):
+    def greedy(path):
+        return Recognised({"path": path}, "it is there")
+
+    also = SourceContribution(name="greedy", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=greedy)
+    said = told(folder, catalog.including(also), "source: {use: auto, with: {path: cube.npy}}")
+    assert said == (
+        "scan.yaml:2:34: source.with.path: cube.npy is recognised by greedy (it is there) and packed-npy "
+        "(its name ends in .npy); name the right one"
+    )
+
+
+def test_one_that_raises_is_named_and_does_not_stop_the_others(folder, catalog, caplog):
+    def raises(path):
+        raise LookupError("not today")
+
+    sulky = SourceContribution(name="sulky", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=raises)
+    with caplog.at_level(logging.WARNING):
+        assert parsed(folder, catalog.including(sulky), path="cube.npy").source.contribution.name == "packed-npy"
+    complaint = f"recognise of the source 'sulky' of {__name__} unreleased raised LookupError: not today"
+    assert caplog.messages == [complaint]
+    assert complaint in told(folder, catalog.including(sulky), "source: {use: auto, with: {path: cube.dat}}")
+
+
+def test_a_wrong_key_is_told_at_its_place_with_whom_it_was_given_to(folder, catalog):
+    said = told(folder, catalog, "source:\n  use: auto\n  with:\n    path: cube.npy\n    frame_rate: 5\n    width: 3\n")
+    because = "(cube.npy is taken for packed-npy: its name ends in .npy)"
+    assert said.splitlines() == [
+        f"scan.yaml:6:5: source.with.frame_rate: unknown key; did you mean 'frame_rate_hz'? {because}",
+        f"scan.yaml:7:5: source.with.width: unknown key; known: frame_rate_hz and path {because}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("source: {use: auto}", "scan.yaml:2:1: source.with.path: required: a path"),
+        ("source: {use: auto, with: {path: 5}}", "scan.yaml:2:34: source.with.path: expected a path, got 5"),
+        ("source: {use: auto, with: [a]}", "scan.yaml:2:27: source.with: expected a mapping, got a list of 1"),
+        ("source: {use: auto, with: {file: a}}", "scan.yaml:2:21: source.with.path: required: a path"),
+        (
+            "source: {use: auto, with: {path: no.npy}}",
+            "scan.yaml:2:34: source.with.path: there is no file or folder no.npy; check the path",
+        ),
+        ("source: {use: auto, path: cube.npy}", "scan.yaml:2:21: source.path: unknown key; it belongs under `with`"),
+    ],
+)
+def test_what_is_wrong_with_the_path(folder, catalog, text, said):
+    assert told(folder, catalog, text).splitlines()[-1] == said
+
+
+def test_a_source_that_lacks_a_library_says_so(folder, catalog):
+    needy = SourceContribution(
+        name="needy",
+        summary="Toy",
+        config=HalvesConfig,
+        build=lambda *_: None,
+        recognise=lambda path: Recognised({"path": path}, "it is heavy"),
+        requires=(Requirement("no_such_library", "photonpano[heavy]"),),
+    )
+    said = told(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
+    assert said == (
+        "scan.yaml:2:15: source.use: the source 'needy' needs no_such_library, which is not installed: pip install "
+        '"photonpano[heavy]" (cube.dat is taken for needy: it is heavy)'
+    )

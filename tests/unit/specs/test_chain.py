@@ -1,0 +1,72 @@
+"""A chain of locators is written as one locator, and means one with fallbacks."""
+
+import pytest
+
+from photonpano import PluginError, SpecError
+from photonpano.registry.chain import CHAIN, ChainConfig
+from photonpano.specs import parse_spec
+
+MINIMAL = {"version": 1, "source": {"use": "simulator"}}
+SHORT = {"use": "direct", "with": {"max_steps": 5}}
+CLEAR = {"use": "opencv-sift", "with": {"ratio": 0.6}}
+
+
+def chain(*backends):
+    return {"use": "chain-of-backends", "with": {"backends": list(backends)}}
+
+
+def document(catalog, **sections):
+    return parse_spec(MINIMAL | sections, catalog=catalog).document
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        (chain(SHORT, "opencv-sift", CLEAR), SHORT | {"fallback": ["opencv-sift", CLEAR]}),
+        (chain("opencv-sift"), {"use": "opencv-sift"}),
+        (chain("opencv-sift", "direct"), {"use": "opencv-sift", "fallback": "direct"}),
+        ({"use": "chain-of-backends"}, {"use": "direct", "fallback": "opencv-sift"}),
+        ({"use": "chain-of-backends", "with": None}, {"use": "direct", "fallback": "opencv-sift"}),
+    ],
+)
+def test_a_chain_is_its_first_locator_with_the_others_as_fallbacks(written, meant, catalog):
+    assert document(catalog, locate=written) == document(catalog, locate=meant)
+    level = {"locate": CLEAR}
+    assert document(catalog, locate=CLEAR, levels=[level | {"locate": written}]) == document(
+        catalog, locate=CLEAR, levels=[level | {"locate": meant}]
+    )
+
+
+def test_a_level_goes_on_from_the_first_of_a_chain_and_keeps_the_others(catalog):
+    levels = [{"locate": {"with": {"max_steps": 9}}}, {"locate": {"fallback": []}}]
+    assert document(catalog, locate=chain("direct", CLEAR), levels=levels) == document(
+        catalog, locate={"use": "direct", "fallback": CLEAR}, levels=levels
+    )
+
+
+def test_one_word_is_enough(catalog):
+    plan = parse_spec(MINIMAL, overrides=["locate.use=chain-of-backends"], catalog=catalog)
+    assert plan.document == document(catalog)
+
+
+def test_places_are_found_by_the_paths_of_what_a_chain_means(catalog):
+    spec = (
+        "version: 1\nsource: {use: simulator}\nlocate:\n  use: chain-of-backends\n  with:\n    backends:\n"
+        "      - {use: direct, with: {max_steps: 5}}\n      - opencv-sift\n"
+        "levels:\n  - {locate: {use: chain-of-backends}}"
+    )
+    places = parse_spec(spec, catalog=catalog).places
+    wanted = ["locate", "locate.use", "locate.with.max_steps", "locate.fallback.0", "levels.0.locate.use"]
+    assert [(places[path].line, places[path].column) for path in wanted] == [(7, 9), (7, 10), (7, 30), (8, 9), (10, 15)]
+
+
+def test_a_default_that_is_not_on_offer_is_an_error_where_the_chain_is_named(catalog):
+    rows = tuple(entry for entry in catalog.rows if entry.name != "opencv-sift")
+    with pytest.raises(SpecError) as caught:
+        parse_spec("version: 1\nsource: {use: simulator}\nlocate: {use: chain-of-backends}", catalog=type(catalog)(rows))
+    assert str(caught.value).startswith("3:15: locate.use: there is no locator 'opencv-sift'; known: ")
+
+
+def test_nothing_is_built_of_a_chain():
+    with pytest.raises(PluginError, match=r"^chain-of-backends stands for other locators: "):
+        CHAIN.build(ChainConfig(), None)

@@ -1,0 +1,62 @@
+"""The list of corrections: files, overrides, and what is recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from photonpano import SpecError
+from photonpano.corrections.geometry import Crop, Rot90
+from photonpano.specs import load_spec, parse_spec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from photonpano.registry import Catalog
+
+
+def spec(*corrections: Any) -> dict[str, Any]:
+    return {"version": 1, "source": {"use": "simulator"}, "corrections": list(corrections)}
+
+
+def test_files_count_from_the_folder_of_the_spec(catalog: Catalog, tmp_path: Path) -> None:
+    np.save(tmp_path / "bad.npy", np.zeros((2, 2), bool))
+    plan = parse_spec(spec({"mask": {"file": "bad.npy"}}), directory=tmp_path, catalog=catalog)
+    assert plan.document["corrections"] == [{"mask": {"file": str(tmp_path / "bad.npy")}}]
+    assert parse_spec(plan.document, catalog=catalog).corrections == plan.corrections
+
+
+def test_files_that_are_missing_are_told_with_their_place(catalog: Catalog, tmp_path: Path) -> None:
+    path = tmp_path / "scan.yaml"
+    path.write_text(
+        "version: 1\n"
+        "source: {use: simulator}\n"
+        "corrections:\n"
+        "  - mask: {file: bad.npy}\n"
+        "  - dark-counts:\n"
+        "      dark: dark.npz\n"
+        "  - hot-pixels\n"
+    )
+    with pytest.raises(SpecError) as caught:
+        load_spec(path, catalog=catalog)
+    assert str(caught.value) == (
+        f"{path}:4:18: corrections.0.mask.file: there is no file {tmp_path / 'bad.npy'}; check the path\n"
+        f"{path}:6:13: corrections.1.dark-counts.dark: there is no file {tmp_path / 'dark.npz'}; check the path"
+    )
+
+
+def test_settings_can_be_overridden(catalog: Catalog) -> None:
+    written = spec("rot90", {"crop": {"rows": [0, 4]}})
+    changed = parse_spec(written, overrides=["corrections.1.crop.rows=[2, null]"], catalog=catalog)
+    assert changed.corrections == (Rot90(), Crop(rows=(2, None)))
+    replaced = parse_spec(written, overrides=["corrections=[rot90]"], catalog=catalog)
+    assert replaced.corrections == (Rot90(),)
+    assert replaced.document["corrections"] == ["rot90"]
+
+
+def test_a_spec_needs_none(catalog: Catalog) -> None:
+    plan = parse_spec({"version": 1, "source": {"use": "simulator"}}, catalog=catalog)
+    assert plan.corrections == ()
+    assert list(plan.document)[:3] == ["version", "source", "corrections"]

@@ -1,0 +1,108 @@
+"""YAML, read into plain values with their places."""
+
+import json
+import string
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+
+from photonpano.specs.tree import Place
+from photonpano.specs.yaml_reader import read_yaml
+
+
+def read(text):
+    problems = []
+    value = read_yaml(text, problems, Place())
+    assert problems == []
+    return value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("on", "on"),
+        ("yes", "yes"),
+        ("True", True),
+        ("false", False),
+        ("~", None),
+        ("1e3", 1000),
+        ("1E+3", 1000),
+        ("1e30", 1e30),
+        ("-2e2", -200),
+        ("1.0e3", 1000.0),
+        ("1e-3", 0.001),
+        ("0.5  ", 0.5),
+        ("1_000", 1000),
+        ("0x1F", 31),
+        ("0o17", 15),
+        ("007", 7),
+        ("+5", 5),
+        (".5", 0.5),
+        ("-.inf", float("-inf")),
+        ("2 GiB", "2 GiB"),
+        ("'5'", "5"),
+        ("2020-01-01", "2020-01-01"),
+        ("1:30", "1:30"),
+        ("!!str 5", "5"),
+        ("!!float 5", 5.0),
+        ("=", "="),
+        ("|\n  a\n  b\n", "a\nb\n"),
+        ("{}", {}),
+        ("{a: &x [1], b: *x}", {"a": [1], "b": [1]}),
+        ("a: &x {p: 1, q: 2}\nb: {<<: *x, q: 3}", {"a": {"p": 1, "q": 2}, "b": {"p": 1, "q": 3}}),
+        ("{<<: [{a: 1}, {a: 2, b: 3}], c: 4}", {"a": 1, "b": 3, "c": 4}),
+        ("&x 1", 1),
+        ("{a: &x 1, b: &x 2, c: *x}", {"a": 1, "b": 2, "c": 2}),
+    ],
+)
+def test_value(text, value):
+    plain = read(text).plain()
+    assert plain == value
+    assert type(plain) is type(value)
+
+
+def test_whole_numbers_beyond_a_float_keep_their_size():
+    assert read("123456789012345678901234567890").plain() == 123456789012345678901234567890
+
+
+def test_places_of_values_and_keys():
+    root = read("a: 1\nb:\n  - x: {y: 2}\n  -\nc:\n")
+    seen = {value.place.where: (value.place.line, value.place.column, value.key and value.key.column) for value in root.walk()}
+    assert seen == {
+        "": (1, 1, None),
+        "a": (1, 4, 1),
+        "b": (3, 3, 1),
+        "b.0": (3, 5, None),
+        "b.0.x": (3, 8, 5),
+        "b.0.x.y": (3, 12, 9),
+        "b.1": (4, 4, None),
+        "c": (5, 1, 1),
+    }
+
+
+keys = st.text(string.ascii_letters, min_size=1, max_size=5)
+texts = st.text("aé𐀀 1.:#-'\"\n\t", max_size=8)
+scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | texts
+documents = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3), max_leaves=12
+)
+
+
+@settings(deadline=None)  # the machine may be busy
+@given(documents)
+def test_reads_what_json_writes(document):
+    """JSON is YAML, up to whole floats such as 1e16, which are read as integers."""
+    assert read(json.dumps(document, ensure_ascii=False)).plain() == document
+
+
+@settings(deadline=None)  # the machine may be busy
+@given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))
+def test_any_text_is_a_value_or_a_problem(text):
+    problems = []
+    value = read_yaml(text, problems, Place())
+    if value is None and not problems:
+        assert YAML(typ="safe", pure=True).load(text) is None
+    for problem in problems:
+        assert problem.line is None or problem.line <= text.count("\n") + 2

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import cv2
+import pytest
+from threadpoolctl import threadpool_info
+
+from photonpano.threads import Stopwatch, in_order, one_thread_inside, thread_count
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def test_auto_is_a_thread_for_each_core_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 2, 5}, raising=False)
+    assert thread_count("auto") == 3
+    assert thread_count(7) == 7
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    yield
+    cv2.setNumThreads(before)
+
+
+def threads_of_libraries() -> list[int]:
+    return [cv2.getNumThreads(), *(library["num_threads"] for library in threadpool_info())]
+
+
+def look_inside_and_fail() -> None:
+    with one_thread_inside():
+        assert set(threads_of_libraries()) == {1}
+        raise ValueError("half-way")
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_libraries_keep_to_one_thread_inside_and_get_theirs_back() -> None:
+    before = threads_of_libraries()
+    with pytest.raises(ValueError, match="half-way"):
+        look_inside_and_fail()
+    assert threads_of_libraries() == before
+
+
+def test_a_stopwatch_adds_up_by_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter([0.0, 1.5, 10.0, 10.25, 20.0, 22.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
+    clock = Stopwatch(2)
+    for stage in ("merge", "merge", "locate"):
+        with clock(stage):
+            pass
+    assert clock.seconds == {"merge": 1.75, "locate": 2.0}
+
+
+def test_what_runs_in_a_pool_counts_for_its_share() -> None:
+    """Two threads that are busy for the same 0.1 s take 0.1 s together."""
+    clock, together = Stopwatch(2), threading.Barrier(2)
+
+    def work() -> None:
+        with clock("merge"):
+            together.wait()
+            time.sleep(0.1)
+            together.wait()
+
+    with ThreadPoolExecutor(2) as pool:
+        for future in [pool.submit(work), pool.submit(work)]:
+            future.result()
+    assert 0.1 <= clock.seconds["merge"] < 0.19
+
+
+def test_the_time_of_a_failure_counts() -> None:
+    clock = Stopwatch(1)
+    with pytest.raises(ValueError, match="half-way"), clock("merge"):
+        raise ValueError("half-way")
+    assert set(clock.seconds) == {"merge"}
+
+
+def test_results_come_in_order_and_few_are_waiting() -> None:
+    made: list[int] = []
+
+    def work(item: int) -> int:
+        time.sleep(0.01 if item % 3 == 0 else 0)
+        made.append(item)
+        return -item
+
+    ahead = []
+    for taken, result in enumerate(in_order(work, iter(range(30)), threads=3)):
+        assert result == -taken
+        ahead.append(len(made) - taken)
+    assert len(made) == 30
+    assert max(ahead) <= 4
+
+
+def test_an_error_comes_when_it_is_its_turn() -> None:
+    results = in_order(lambda item: 1 / (3 - item), range(9), threads=2)
+    assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
