@@ -11,10 +11,12 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
+from pydantic import BaseModel
 
 from photonpano import discover, hookspecs
 from photonpano.cli.app import app
@@ -23,11 +25,6 @@ from photonpano.registry import KINDS
 from photonpano.registry.description import config_rows
 from photonpano.specs.resolution import SETTINGS
 from photonpano.specs.settings import LevelSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pydantic import BaseModel
 
 REFERENCE = Path(__file__).parent / "reference"
 BLOCK = re.compile(r"(?<=<!-- generated: )(?P<what>[^>]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, VirtualExposure
+from photonpano.api import RunResult
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import KnownMotion, MemorySource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano.api import RunResult
 
 
 @pytest.fixture(scope="session")

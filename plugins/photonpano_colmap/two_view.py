@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised
 from photonpano.locating import blur_against_noise, motion_from_points, stabilised_8_bit
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import VirtualExposure
-    from photonpano_colmap.configs import PycolmapTwoViewConfig
+from photonpano_colmap.configs import PycolmapTwoViewConfig
 
 CENTRE_OF_FIRST_PIXEL = 0.5
 """In COLMAP pixel centres lie at halves; here they are integers."""

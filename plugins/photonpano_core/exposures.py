@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
+from photonpano import Group, Source, Trajectory
 from photonpano.geometry import inverse, rescaling
-from photonpano.merging import Chunk, accumulate
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import Group, Source, Trajectory
-    from photonpano.merging import PhotonSum
+from photonpano.merging import Chunk, PhotonSum, accumulate
 
 
 def scaled_shape(frame_shape: tuple[int, int], scale: float) -> tuple[int, int]:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import numpy as np
+from numpy.typing import NDArray
 
+from photonpano_core.configs import GeodesicConfig
 from photonpano_core.group_spline import GroupTrajectory
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from photonpano_core.configs import GeodesicConfig
 
 
 class GeodesicInterpolator:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
+from photonpano import CaptureSummary, Group, Resampler, StageContext
 from photonpano_core.grouping import shortest_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import CaptureSummary, Group, Resampler, StageContext
 
 _BLUR = 0.15
 """Groups of the first level may be blurred by this share of the shorter side of a frame; twice as much spoils the result."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from photonpano import LocationError
@@ -13,10 +12,7 @@ from photonpano_core.extrapolation import HeldTrajectory
 from photonpano_core.lucas_kanade import interpolating_spline
 from photonpano_core.sl3 import exponential, logarithm, unimodular
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 class GroupTrajectory(HeldTrajectory):

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano import FrameSpan, Group, InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from photonpano import StreamInfo
-    from photonpano_core.configs import GroupedConfig
+from photonpano import FrameSpan, Group, InputError, StreamInfo
+from photonpano_core.configs import GroupedConfig
 
 _SHORTEST = {"binary": 16, "intensity": 1}
 """Groups whose length is chosen by us get no shorter than this: too few binary frames tell nothing, a grey one is a picture."""

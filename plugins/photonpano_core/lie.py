@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import splu
 
 from photonpano import LocationError
 from photonpano.geometry import apply, corners, inverse
+from photonpano_core.configs import LieConfig
 from photonpano_core.group_spline import GroupTrajectory
 from photonpano_core.lucas_kanade import interpolating_spline
 from photonpano_core.sl3 import exponential, logarithm, unimodular
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_core.configs import LieConfig
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 DEGREE = 3
 MAX_ITERATIONS = 50

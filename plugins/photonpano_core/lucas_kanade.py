@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from scipy.interpolate import make_interp_spline
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
 
 from photonpano.geometry import from_parameters, parameters
+from photonpano_core.configs import LucasKanadeConfig
 from photonpano_core.extrapolation import HeldTrajectory
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from scipy.interpolate import BSpline
-
-    from photonpano_core.configs import LucasKanadeConfig
 
 
 def interpolating_spline(instants: NDArray[np.float64], values: NDArray[np.float64], degree: int = 3) -> BSpline:

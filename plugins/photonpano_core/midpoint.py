@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from photonpano import Group
+from photonpano_core.configs import MidpointConfig
 from photonpano_core.grouping import centred, evenly_spread, require_a_group, size_of, spans_at, with_ends
-
-if TYPE_CHECKING:
-    from photonpano import Group
-    from photonpano_core.configs import MidpointConfig
 
 
 class MidpointResampler:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from pydantic import Field
@@ -11,6 +12,7 @@ from photonpano import Config, InputError, Recognised, SourceContribution, SpecP
 from photonpano.reading import (
     FrameFile,
     FrameLayout,
+    NpyHeader,
     PackedFileSource,
     gzipped_npy_header,
     is_gzip,
@@ -20,13 +22,6 @@ from photonpano.reading import (
     unpacked,
     unpacked_start,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from photonpano.reading import NpyHeader
-
 
 _CHANNELS = 3
 _GREEN = 1

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Lock
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonpano import VirtualExposure
+from photonpano import Group, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, rescaling
 from photonpano.merging import Chunk, SharedCounts, accumulate, chunks_of, clipped
+from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.exposures import scaled_shape
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Group, Source, Trajectory
-    from photonpano_core.configs import PhotonMleConfig
-
-    Decide = Callable[[str, float, str], None]
+Decide = Callable[[str, float, str], None]
 
 _SHARED_BYTES = 64 * 1024**2
 """Sums that overlapping groups share are kept up to this: a group of them."""

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano import FrameSpan, VirtualExposure
+from photonpano import FrameSpan, Group, Response, Source, Trajectory, VirtualExposure
 from photonpano.merging import PhotonSum, accumulate, chunks_of
+from photonpano_core.configs import RobustMergeConfig
 from photonpano_core.exposures import scaled_shape, summed_as_they_lie, to_exposure
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import Group, Response, Source, Trajectory
-    from photonpano_core.configs import RobustMergeConfig
-
-    Image = NDArray[np.float32]
+Image = NDArray[np.float32]
 
 _LEAST_SHARE = 1e-3
 """Where less than this of a neighbourhood was seen by both, nothing is compared."""

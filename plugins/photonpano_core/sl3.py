@@ -6,14 +6,10 @@ one of the algebra sl(3). Nothing here depends on the unit of a pixel, or on whe
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _TERMS = 19
 """Of the exponential series where eigenvalues are below 1: what is left out is below 1 / 19!, a rounding error."""

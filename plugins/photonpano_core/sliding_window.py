@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from photonpano import Group
+from photonpano_core.configs import SlidingWindowConfig
 from photonpano_core.grouping import centred, evenly_spread, require_a_group, size_of, spans_at
-
-if TYPE_CHECKING:
-    from photonpano import Group
-    from photonpano_core.configs import SlidingWindowConfig
 
 
 class SlidingWindowResampler:

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_banded
 
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
+from photonpano_core.configs import SmoothingSplineConfig
 from photonpano_core.lucas_kanade import ParameterTrajectory, interpolating_spline
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano_core.configs import SmoothingSplineConfig
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 ORDER = 3
 """Of the derivative that is penalised. A parabola, which fits any three knots, goes free."""

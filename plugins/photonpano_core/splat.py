@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, VirtualExposure
+from photonpano import FrameSpan, Group, InputError, LinearlyCorrectedSource, Source, Trajectory, VirtualExposure
 from photonpano.geometry import apply, corners, inverse
 from photonpano.merging import PhotonSum
 from photonpano_core.exposures import scaled_shape, summed_as_they_lie, to_exposure
 from photonpano_core.splatting import add_coverage, splat
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from photonpano import Group, Source, Trajectory
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _READ_BYTES = 1024**2
 """So much of unpacked frames is held at a time: about what a core's cache holds."""

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import seen_part
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Frames = NDArray[np.unsignedinteger[Any]]
+Frames = NDArray[np.unsignedinteger[Any]]
 
 _WORD = np.uint64
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from photonpano import Group
+from photonpano_core.configs import StratifiedConfig
 from photonpano_core.grouping import centred, evenly_spread, require_a_group, size_of, spans_at, with_ends
-
-if TYPE_CHECKING:
-    from photonpano import Group
-    from photonpano_core.configs import StratifiedConfig
 
 
 class StratifiedResampler:

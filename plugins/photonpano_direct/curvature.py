@@ -7,19 +7,13 @@ moments of a few products, and no image for each parameter is ever made. Paramet
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano_direct.moments import differentiate, products
+from photonpano_direct.layers import Layer
+from photonpano_direct.moments import Buffers, differentiate, products
 from photonpano_direct.small_matrices import cholesky, dot, product, solve_lower, transposed
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_direct.moments import Buffers
-    from photonpano_direct.pyramid import Layer
 
 _BY_CHANCE = 1.0
 """The best alignment of noise has a curvature in common of up to so many times what noise has in common anywhere; that much

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry.shapes import fault
 from photonpano_direct.curvature import ALONG_X, ALONG_Y, by_chance, curvatures, expected_px
-from photonpano_direct.moments import look
+from photonpano_direct.layers import Layer
+from photonpano_direct.moments import Buffers, look
 from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_direct.moments import Buffers
-    from photonpano_direct.pyramid import Layer
 
 SETTLED, LOST, UNSETTLED, DIVERGED = 0, 1, 2, 3
 """How a descent ends: at a minimum, where the images have nothing in common, not at all, or where no camera gets to."""

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import translation
-from photonpano_direct.pyramid import pyramid_of
+from photonpano.photometry import Likeness
+from photonpano_direct.configs import DirectConfig
+from photonpano_direct.layers import Layer
+from photonpano_direct.pyramid import Pyramid, pyramid_of
 from photonpano_direct.similarity import agreement
 from photonpano_direct.small_matrices import rescaled
-from photonpano_direct.template import ALL, Aligned, Template
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano import VirtualExposure
-    from photonpano.photometry import Likeness
-    from photonpano_direct.configs import DirectConfig
-    from photonpano_direct.pyramid import Layer, Pyramid
-    from photonpano_direct.template import Quality
+from photonpano_direct.template import ALL, Aligned, Quality, Template
 
 _COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
 """What moves at the coarsest level of the pyramid (translation) and at the next (affine); the others use all of p1..p8."""

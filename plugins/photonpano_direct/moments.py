@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, sample, seen_part
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_direct.pyramid import Layer
+from photonpano_direct.layers import Layer
 
 
 class Buffers(NamedTuple):

@@ -3,45 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from photonpano.locating import view_pyramid
+from photonpano import VirtualExposure
+from photonpano.locating import View, view_pyramid
+from photonpano_direct.layers import Layer
 from photonpano_direct.moments import differentiate
-from photonpano_direct.similarity import details_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import VirtualExposure
-    from photonpano.locating import View
-    from photonpano_direct.similarity import Details
+from photonpano_direct.similarity import Details, details_of
 
 _SMALLEST_SIDE = 24
 """The pyramid ends before an image gets smaller than this, in px."""
 JUDGE = 2
 """The layer on which images are compared in the end: coarse, so that noise is small and blur hardly counts."""
-
-
-class Layer(NamedTuple):
-    """One level of a pyramid.
-
-    Attributes:
-        image: (H, W) float32, variance-stabilised and blurred.
-        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
-        blur_px: standard deviation of the Gaussian that leaves as much of white noise as the blur and the halving did, in px
-            of the layer.
-        gradients: (2, H, W) float32, the derivatives of the image along x and y.
-        smoothed: (2, H, W) float32, the same, blurred once more as the noise was.
-    """
-
-    image: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    blur_px: float
-    gradients: NDArray[np.float32]
-    smoothed: NDArray[np.float32]
 
 
 class Pyramid(NamedTuple):

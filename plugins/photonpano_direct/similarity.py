@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, sample, seen_part
 from photonpano.photometry import Likeness, autocorrelation, likeness_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano.values import FloatArray
-    from photonpano_direct.pyramid import Layer
+from photonpano.values import FloatArray
+from photonpano_direct.layers import Layer
 
 _SURROUNDINGS_PX = 13
 """What counts as the surroundings of a pixel: a square of this side, in px of the layer."""

@@ -5,19 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from threading import local
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.geometry import corners, generators, implausibility, slopes, unit_coordinates
 from photonpano_direct.curvature import told
 from photonpano_direct.descent import DIVERGED, LOST, SETTLED, descend
+from photonpano_direct.layers import Layer
 from photonpano_direct.moments import Buffers
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_direct.pyramid import Layer
 
 ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 """All of p1..p8."""

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from kornia.geometry import RANSAC
+from numpy.typing import NDArray
 
-from photonpano import NotLocated
+from photonpano import Located, NotLocated
 from photonpano.geometry import apply, normalised
-from photonpano.locating import least_agreeing, motion_from_points
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from numpy.typing import NDArray
-
-    from photonpano import Located
-    from photonpano.locating import MatchingConfig
+from photonpano.locating import MatchingConfig, least_agreeing, motion_from_points
 
 _CONFIDENCE = 0.999
 """RANSAC stops when it has found the best motion with this probability."""

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled, match_adalam, match_smnn
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
 from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_kornia.configs import KorniaFeaturesConfig
 from photonpano_kornia.consensus import Matches, motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from photonpano import Located, NotLocated, VirtualExposure
-    from photonpano_kornia.configs import KorniaFeaturesConfig
 
 _FAR = 1e3
 """The distance between the descriptors of keypoints that lie too far apart; those of others differ by 2 at most."""

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from photonpano import NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
 from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_kornia.configs import KorniaLoftrConfig
 from photonpano_kornia.consensus import Matches, motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 from photonpano_kornia.weights import loftr_from
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from photonpano import Located, VirtualExposure
-    from photonpano_kornia.configs import KorniaLoftrConfig
 
 _SMALLEST_SIDE = 32
 """An image has at least so many px, which are four cells of those that LoFTR matches first."""

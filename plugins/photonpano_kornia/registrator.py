@@ -7,15 +7,17 @@ used here.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from kornia.filters import spatial_gradient
 from kornia.geometry.transform import HomographyWarper
+from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import (
     corner_displacements,
     corners,
@@ -26,17 +28,9 @@ from photonpano.geometry import (
     rescaled,
     translation,
 )
-from photonpano.locating import blur_against_noise, motion_from_images, view_pyramid
+from photonpano.locating import View, blur_against_noise, motion_from_images, view_pyramid
+from photonpano_kornia.configs import KorniaRegistratorConfig
 from photonpano_kornia.runtime import device_of, images_on, one_thread
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from photonpano import VirtualExposure
-    from photonpano.locating import View
-    from photonpano_kornia.configs import KorniaRegistratorConfig
 
 _SMALLEST_SIDE = 24
 """The pyramid ends before an image gets smaller than this, in px."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import torch
 from kornia.feature import LoFTR
@@ -12,9 +13,6 @@ from kornia.feature.loftr.loftr import default_cfg
 
 from photonpano import InputError
 from photonpano_kornia.runtime import seeded
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def loftr_from(path: Path, device: torch.device, *, corrected_positions: bool, min_confidence: float) -> LoFTR:

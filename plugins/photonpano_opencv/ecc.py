@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import implausibility, normalised, rescaled, translation
-from photonpano.locating import blur_against_noise, motion_from_images, view_pyramid
+from photonpano.locating import View, blur_against_noise, motion_from_images, view_pyramid
+from photonpano_opencv.configs import OpencvEccConfig
 from photonpano_opencv.phase import NOTHING_TO_HOLD, shift_between
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import VirtualExposure
-    from photonpano.locating import View
-    from photonpano_opencv.configs import OpencvEccConfig
 
 _SMALLEST_SIDE = 32
 """The pyramid ends before an image gets smaller than this, in px."""

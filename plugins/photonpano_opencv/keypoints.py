@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, implausibility, normalised
-from photonpano.locating import least_agreeing, motion_from_points
+from photonpano.locating import KeypointConfig, least_agreeing, motion_from_points
 from photonpano_opencv.matching import match_everywhere, match_nearby
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.locating import KeypointConfig
 
 GUIDED_RADII = (1.5, 1.0)
 """Once a motion is fitted, more matches are looked for near where it puts them; radii in units of `threshold_px`."""

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from photonpano import VirtualExposure
 from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_opencv.configs import OpencvOrbConfig
 from photonpano_opencv.keypoints import KeypointMatcher, Keypoints, detected
 from photonpano_opencv.matching import unit_bits
-
-if TYPE_CHECKING:
-    from photonpano import VirtualExposure
-    from photonpano_opencv.configs import OpencvOrbConfig
 
 _ROUNDING_PX = math.sqrt(1 / 12)
 """Corners are found to whole pixels, and where a camera shifts, all of them are rounded alike: that is an error of up to half a

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply, normalised, translation
-from photonpano.locating import blur_against_noise, motion_from_images, view_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import VirtualExposure
-    from photonpano.locating import View
-    from photonpano_opencv.configs import PhaseCorrelationConfig
+from photonpano.locating import View, blur_against_noise, motion_from_images, view_of
+from photonpano_opencv.configs import PhaseCorrelationConfig
 
 TRANSLATION = (4, 5)
 """Which of p1..p8 shift."""

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 
+from photonpano import VirtualExposure
 from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_opencv.configs import OpencvSiftConfig
 from photonpano_opencv.keypoints import KeypointMatcher, Keypoints, detected
 from photonpano_opencv.matching import unit_descriptors
-
-if TYPE_CHECKING:
-    from photonpano import VirtualExposure
-    from photonpano_opencv.configs import OpencvSiftConfig
 
 
 class SiftLocator(KeypointMatcher):

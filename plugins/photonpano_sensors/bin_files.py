@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 from pydantic import Field
 
 from photonpano import Config, InputError, SpecPath
-from photonpano.reading import FrameFile, PackedFileSource, files_in, objections
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from photonpano.reading import FrameLayout
+from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, objections
 
 
 class BinConfig(Config):

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.reading import read_start
 from photonpano_sensors.damage import reading
 from photonpano_sensors.mat5 import mat5_array
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _VARIABLE = "OUTPUT"
 _BLOCK_FRAMES = 64

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from photonpano import SourceContribution
 from photonpano_sensors.mat_parts import MAT_PARTS
 from photonpano_sensors.spad512 import SPAD512
 from photonpano_sensors.spad512_sparse import SPAD512_SPARSE
 from photonpano_sensors.swissspad import SWISSSPAD_FULL, SWISSSPAD_HALF
 from photonpano_sensors.ubicept import UBICEPT_H5
 from photonpano_sensors.visionsim import VISIONSIM
-
-if TYPE_CHECKING:
-    from photonpano import SourceContribution
 
 SINGLE_PHOTON: tuple[SourceContribution[Any], ...] = (
     SWISSSPAD_HALF,

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from photonpano import Recognised, SourceContribution
 from photonpano.reading import FrameLayout
 from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LAYOUT = FrameLayout((512, 512), (512, 64))
 FOOTER_BYTES = 4

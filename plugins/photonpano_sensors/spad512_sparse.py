@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from photonpano import Config, InputError, Recognised, SourceContribution, SpecPath
+from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.reading import BinarySource, FrameLayout, files_in, objections, read_start
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from photonpano import FrameSpan
 
 _SIZE = 512
 _PIXELS = _SIZE**2

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeVar
+from pathlib import Path
+from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import Recognised, SourceContribution
 from photonpano.reading import FrameLayout, files_in
 from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 

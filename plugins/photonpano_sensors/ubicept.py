@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 from pydantic import Field
 
-from photonpano import Config, Recognised, Requirement, SourceContribution, SpecPath
+from photonpano import Config, Recognised, Requirement, Source, SourceContext, SourceContribution, SpecPath
 from photonpano.reading import read_start
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from photonpano import Source, SourceContext
 
 _SUFFIX = ".ubi.h5"
 _HDF = b"\x89HDF\r\n\x1a\n"

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, StreamInfo
 from photonpano.photometry import BinarySumResponse
 from photonpano_sensors.damage import reading
-
-if TYPE_CHECKING:
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from photonpano_sensors.ubicept import UbiceptConfig
+from photonpano_sensors.ubicept import UbiceptConfig
 
 _WHAT = "a .ubi.h5 file"
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.photometry import IntensityResponse
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_simulator.config import IntensitySensor
+from photonpano_simulator.config import IntensitySensor
 
 
 class IntensityCamera:

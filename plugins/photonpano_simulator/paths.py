@@ -8,22 +8,25 @@ Convention:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.geometry import apply, corners, normalised
 from photonpano_simulator.chance import Draw, generator
-from photonpano_simulator.config import FilePath, HandShakePath, LoopPath, PanPath, ScanPath, SplinePath
+from photonpano_simulator.config import (
+    FilePath,
+    HandShakePath,
+    LoopPath,
+    PanPath,
+    ScanPath,
+    Shake,
+    SimulationConfig,
+    SplinePath,
+)
 from photonpano_simulator.files import read_homographies
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_simulator.config import Shake, SimulationConfig
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _DENSE = 100_000
 """Points of a curve before it is sampled at constant speed: the error is far below a thousandth of a pixel."""

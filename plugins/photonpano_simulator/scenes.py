@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
 from photonpano_simulator.config import PhotoScene, StreetScene
 from photonpano_simulator.street import street
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _LUMINANCE = (0.0722, 0.7152, 0.2126)
 """Shares of blue, green and red, in the order of OpenCV (IEC 61966-2-1)."""

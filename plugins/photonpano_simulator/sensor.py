@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.photometry import BinaryResponse
 from photonpano_simulator.chance import Draw, generator
+from photonpano_simulator.config import Sensor
 from photonpano_simulator.files import read_mask, read_rates
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano_simulator.config import Sensor
 
 
 class SpadSensor:

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from types import TracebackType
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano import StreamInfo
+from photonpano import FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, inverse
 from photonpano_simulator.chance import Draw, generator
-from photonpano_simulator.config import IntensitySensor
+from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, SimulatorConfig
 from photonpano_simulator.intensity import IntensityCamera
 from photonpano_simulator.paths import camera_path
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.sensor import SpadSensor
-
-if TYPE_CHECKING:
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from photonpano import FrameSpan, SourceContext
-    from photonpano_simulator.config import CameraSimulatorConfig, SimulatorConfig
 
 
 class SimulatorSource:

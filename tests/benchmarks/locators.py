@@ -14,25 +14,32 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from pydantic import ValidationError
 
-from photonpano import FrameSpan, Group, Located, PhotonpanoError, StageContext, discover, open_source, parse_spec
+from photonpano import (
+    FrameSpan,
+    Group,
+    Located,
+    Locator,
+    PhotonpanoError,
+    StageContext,
+    VirtualExposure,
+    discover,
+    open_source,
+    parse_spec,
+)
 from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import apply, corner_displacements, corners, inverse, normalised
 from photonpano.protocols import KnowsTruth
+from photonpano.registry import Catalog
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from photonpano import Locator, VirtualExposure
-    from photonpano.registry import Catalog
 
 SHAPE = (254, 496)
 GROUP_SIZE = 250

@@ -13,12 +13,11 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from photonpano import FrameSpan, Group, SourceContext
+from photonpano import FrameSpan, Group, Merger, Source, SourceContext
 from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
@@ -28,9 +27,6 @@ from photonpano_core.robust_merge import RobustMerger
 from photonpano_core.splat import SplatMerger
 from photonpano_simulator.config import StreetScene
 from photonpano_simulator.scenes import scene_flux
-
-if TYPE_CHECKING:
-    from photonpano import Merger, Source
 
 SHAPE = (254, 496)
 SPEEDS_PX = (0.02, 0.15, 0.6)

@@ -16,10 +16,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import matplotlib.pyplot as plt
@@ -28,15 +29,11 @@ import numpy as np
 from photonpano import FrameSpan, SourceContext
 from photonpano.evaluation import FrameTrajectory, load_truth
 from photonpano.geometry import inverse
+from photonpano.protocols import Source
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.midpoint import MidpointResampler
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.photon_mle import PhotonMleMerger
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano.protocols import Source
 
 SHAPE = (254, 496)
 PX_A_FRAME = 0.02

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 
+from photonpano.api import RunResult
 from photonpano.geometry import apply, corners
 from photonpano.photometry import tone_mapped
 from photonpano.specs import parse_spec
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import Any
-
-    from photonpano.api import RunResult
 
 N_FRAMES, SHAPE = 300, (128, 160)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +15,12 @@ from photonpano import FrameSpan, SpecError, api
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.cli.app import app
 from photonpano.context import Context
+from photonpano.evaluation import Evaluation
 from photonpano.merging.panorama import plan_canvas, render
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import forecast
 from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano.evaluation import Evaluation
 
 SHAPE, N = (128, 160), 300
 RAW = (132, 168)

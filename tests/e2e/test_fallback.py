@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import Field
 
-from photonpano import Config, LocatorContribution, NotLocated, api
+from photonpano import Config, Homography, Located, LocatorContribution, NotLocated, StageContext, VirtualExposure, api
 from photonpano.context import Quiet
-from photonpano.pipeline.run import execute
+from photonpano.pipeline.run import RunOutcome, execute
 from photonpano.registry import Catalog, discover
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
-
-if TYPE_CHECKING:
-    from photonpano import Homography, Located, StageContext, VirtualExposure
-    from photonpano.pipeline.run import RunOutcome
 
 SIFT = discover().find("locator", "opencv-sift").contribution
 

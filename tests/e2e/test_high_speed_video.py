@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +13,8 @@ from typer.testing import CliRunner
 
 from photonpano import api
 from photonpano.cli.app import app
+from photonpano.evaluation import Evaluation
 from photonpano.specs import parse_spec
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano.evaluation import Evaluation
 
 SHAKE = {"rms_px": 1.0, "frequencies_hz": [3, 5, 8]}
 CAMERA = {

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from photonpano import LocationError, api
 from photonpano.context import Quiet
-from photonpano.pipeline.run import execute
+from photonpano.pipeline.run import RunOutcome, execute
 from photonpano.specs import parse_spec
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano.pipeline.run import RunOutcome
 
 
 def run(capture: Path, *overrides: str) -> RunOutcome:

@@ -6,20 +6,17 @@ import importlib
 import json
 import re
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import Result
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from photonpano.cli.app import app
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from click.testing import Result
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "follow-runs.md"
 CLUMSY = """

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,23 +13,15 @@ import pytest
 import tifffile
 
 from photonpano import api
+from photonpano.api import RunResult
 from photonpano.captures.writing import truth_path
 from photonpano.context import Quiet
-from photonpano.evaluation import corner_errors
+from photonpano.evaluation import Evaluation, corner_errors
 from photonpano.geometry import rescaling, translation
 from photonpano.merging.panorama import BYTES_PER_PIXEL
-from photonpano.pipeline.run import execute
+from photonpano.pipeline.run import RunOutcome, execute
 from photonpano.pipeline.run_folder import run_folder
-from photonpano.specs import parse_spec
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano.api import RunResult
-    from photonpano.evaluation import Evaluation
-    from photonpano.pipeline.run import RunOutcome
-    from photonpano.specs import Plan
+from photonpano.specs import Plan, parse_spec
 
 SHAPE = (128, 160)
 INSIDE = slice(25, 275)

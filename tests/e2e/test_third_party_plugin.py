@@ -12,15 +12,12 @@ import venv
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from subprocess import CompletedProcess
 
 import pytest
 from typer.testing import CliRunner
 
 from photonpano.cli.app import app
-
-if TYPE_CHECKING:
-    from subprocess import CompletedProcess
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "third_party_plugin"

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, Located, VirtualExposure
+from photonpano import FrameSpan, Group, Located, NotLocated, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, normalised, rescaled
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import Level, NamedLocator
 from photonpano.threads import one_thread_inside
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from photonpano import NotLocated, Source, Trajectory
 
 FRAMES = 10
 """Frames of a group."""

@@ -3,17 +3,14 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 import cv2
 import pytest
 from threadpoolctl import threadpool_info
 
 from photonpano.threads import Stopwatch, in_order, one_thread_inside, thread_count
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 def test_auto_is_a_thread_for_each_core_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:

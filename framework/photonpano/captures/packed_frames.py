@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING, BinaryIO
+from collections.abc import Iterator
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.errors import PluginError
-from photonpano.protocols import PackedSource
+from photonpano.protocols import PackedSource, Source
 from photonpano.values import FrameSpan
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from photonpano.protocols import Source
 
 _BLOCK_BYTES = 8 * 1024**2
 """Bytes of the frames that are asked for at once, as the source gives them: packed or not."""

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.merging import Chunk, accumulate
 from photonpano.photometry import tone_mapped
+from photonpano.protocols import Source
 from photonpano.threads import in_order
-from photonpano.values import FrameSpan
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.protocols import Source
-    from photonpano.values import FluxImage, StreamInfo
+from photonpano.values import FluxImage, FrameSpan, StreamInfo
 
 _PROBES = 16
 """White is chosen from so many exposures all over the capture."""

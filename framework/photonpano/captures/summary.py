@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from photonpano.errors import InputError
-from photonpano.protocols import LinearlyCorrectedSource
-from photonpano.values import CaptureSummary, FrameSpan
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonpano.protocols import Source
-    from photonpano.values import FloatArray, FluxImage
+from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
 
 _PLACES = 12
 _SPANS = (1, 2, 4, 8, 16, 32, 64, 128, 256)

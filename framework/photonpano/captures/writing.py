@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, BinaryIO
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from photonpano.atomic import atomic_path, require_space, resumable_path
 from photonpano.captures.packed_frames import PackedFrames
 from photonpano.errors import InputError, OutputError
-from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource
+from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, Source
 from photonpano.threads import in_order
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano.protocols import Source
 
 
 def truth_path(path: Path) -> Path:

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.geometry import corners, jacobian
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from photonpano.values import FluxImage, Homography, Response
+from photonpano.values import FluxImage, Homography, Response
 
 _NOISELESS = 1e9
 """Frames after which photons are as good as the scene itself."""

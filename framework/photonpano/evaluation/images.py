@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from photonpano.geometry import apply
+from photonpano.geometry import Canvas, apply
 from photonpano.photometry import linear_to_srgb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano.geometry import Canvas
-    from photonpano.values import BoolArray, FluxImage, Homography
+from photonpano.values import BoolArray, FluxImage, Homography
 
 WHITE_QUANTILE = 0.999
 """The quantile of the true scene that becomes white: the brightest pixel alone may be a lamp that darkens all others."""

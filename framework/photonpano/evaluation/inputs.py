@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.geometry import normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
+from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
 
 @dataclass(frozen=True, slots=True, eq=False)

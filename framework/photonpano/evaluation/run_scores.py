@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -13,10 +13,8 @@ from photonpano.evaluation.images import ImageScore, covered, image_score, true_
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.trajectory import FrameTrajectory, TrajectoryScore, corner_errors
 from photonpano.geometry import Canvas, inverse, normalised
-
-if TYPE_CHECKING:
-    from photonpano.protocols import Trajectory
-    from photonpano.values import Panorama
+from photonpano.protocols import Trajectory
+from photonpano.values import Panorama
 
 
 class Renderer(Protocol):

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.geometry import align_planes, corner_displacements
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from photonpano.values import BoolArray, FloatArray, Homography
+from photonpano.values import BoolArray, FloatArray, Homography
 
 
 @dataclass(frozen=True, slots=True, eq=False)

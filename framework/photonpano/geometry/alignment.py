@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from photonpano.geometry.homographies import apply, corners, from_parameters, normalised
-
-if TYPE_CHECKING:
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography
 
 FIT_FRAMES = 300
 """The alignment is fitted to so many frames, evenly spaced: it has eight parameters, and every frame gives eight numbers."""

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano.geometry.homographies import apply, corners, rescaling, translation
-
-if TYPE_CHECKING:
-    from photonpano.values import FloatArray, Homography
-
+from photonpano.values import FloatArray, Homography
 
 _AT_ONCE = 8192
 """So many frames are looked at together, which bounds the memory that it takes."""

@@ -8,14 +8,11 @@ Convention:
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography
 
 
 def normalised(matrices: ArrayLike) -> Homography:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from photonpano.geometry.homographies import apply, corners
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonpano.values import Homography
+from photonpano.values import Homography
 
 
 def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: float = 0.1) -> str | None:

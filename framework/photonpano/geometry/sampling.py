@@ -6,18 +6,14 @@ they lie in memory, and interpolation can be vectorised.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-if TYPE_CHECKING:
-    from typing import TypeAlias
-
-    from numpy.typing import NDArray
-
-    Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
+Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
 LONGEST_RUN = 512
 """So that small numbers stay exact enough in float32."""

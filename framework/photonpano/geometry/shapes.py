@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MAX_AREA_CHANGE = 2.0
 """Two exposures that share the field of view of one camera do not differ more than this in size."""

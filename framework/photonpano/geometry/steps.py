@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano.geometry.homographies import from_parameters
-
-if TYPE_CHECKING:
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography
 
 
 @cache

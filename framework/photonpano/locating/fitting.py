@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 REWEIGHTINGS = 4
 """Weights of soft L1 settle to a few per cent of the error in so many rounds."""

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
+from photonpano.locating.configs import ImageLimits
+from photonpano.locating.viewing import View
 from photonpano.photometry import Likeness, autocorrelation, likeness_of
-from photonpano.values import Located, NotLocated
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.locating.configs import ImageLimits
-    from photonpano.locating.viewing import View
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography, Located, NotLocated
 
 ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 """All of p1..p8."""

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.geometry import apply, implausibility
+from photonpano.locating.configs import PointLimits
 from photonpano.locating.fitting import fit_homography
-from photonpano.values import Located, NotLocated
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from photonpano.locating.configs import PointLimits
-    from photonpano.values import Homography
+from photonpano.values import Homography, Located, NotLocated
 
 
 def least_agreeing(matches: int, guided: bool) -> float:

@@ -5,18 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from photonpano.locating.configs import BlurPx
 from photonpano.photometry import signal_to_noise
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano.locating.configs import BlurPx
-    from photonpano.values import Homography, VirtualExposure
+from photonpano.values import Homography, VirtualExposure
 
 _CLIPPED = 0.001
 """Share of pixels at either end that may become black or white: single hot pixels must not flatten the rest."""

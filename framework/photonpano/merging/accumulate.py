@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from photonpano.geometry import translation
-from photonpano.merging.footprints import landings
+from photonpano.merging.chunks import Chunk
+from photonpano.merging.footprints import Landing, landings
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
-from photonpano.protocols import LinearlyCorrectedSource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from concurrent.futures import Executor
-
-    from photonpano.merging.chunks import Chunk
-    from photonpano.merging.footprints import Landing
-    from photonpano.protocols import Source
-    from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
+from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
 """So many chunks are summed before they are added to the grid."""

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano.geometry import corner_displacements, inverse
-from photonpano.values import FrameSpan
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonpano.protocols import Trajectory
-    from photonpano.values import FloatArray, Homography
-
+from photonpano.protocols import Trajectory
+from photonpano.values import FloatArray, FrameSpan, Homography
 
 _AT_ONCE = 8192
 """So many frames are looked at together, which bounds the memory that it takes."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano.geometry import apply, corners, inverse, rescaling
-
-if TYPE_CHECKING:
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography
 
 _LONG_RUN_PX = 96
 """Shorter runs of neighbours are warped faster pixel by pixel."""

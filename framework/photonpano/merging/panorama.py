@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Canvas, canvas_of, rescaling, translation
 from photonpano.merging import accumulate, chunks_of
-from photonpano.values import Panorama
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.context import Context
-    from photonpano.protocols import Source, Trajectory
-    from photonpano.values import FluxImage, FrameSpan
+from photonpano.protocols import Source, Trajectory
+from photonpano.values import FluxImage, FrameSpan, Panorama
 
 BYTES_PER_PIXEL = 40
 """Peak memory for each pixel that is rendered at a time: sums, estimate and what is written, as measured in the tests."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections import OrderedDict
 from concurrent.futures import Future
 from threading import Lock
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from photonpano.protocols import Source
-    from photonpano.values import Counts, FrameSpan
+from photonpano.protocols import Source
+from photonpano.values import Counts, FrameSpan
 
 
 class SharedCounts:

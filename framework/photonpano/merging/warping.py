@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import run_from, sample, seen_part
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano.geometry.sampling import Pixels
+from photonpano.geometry.sampling import Pixels, run_from, sample, seen_part
 
 
 @compiled

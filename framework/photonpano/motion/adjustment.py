@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -19,13 +20,7 @@ from photonpano.geometry import (
     slopes,
     unit_coordinates,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import BoolArray, FloatArray, Located
+from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import TracebackType
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from photonpano.errors import PhotonpanoError, PluginError
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from types import TracebackType
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from photonpano.protocols import Source, Trajectory
-    from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Response, StreamInfo
+from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source, Trajectory
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Response, StreamInfo
 
 ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
 

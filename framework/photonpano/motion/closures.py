@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.geometry import apply, corners, inverse, rescaled, rescaling, translation
 from photonpano.motion.pairs import instants_of, lengths_of
 from photonpano.photometry import noise_free_correlation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import BoolArray, FloatArray, FluxImage, Group, Homography, VirtualExposure
+from photonpano.values import BoolArray, FloatArray, FluxImage, Group, Homography, VirtualExposure
 
 _GRID = 8
 """The overlap of two fields of view is counted on so many points squared."""

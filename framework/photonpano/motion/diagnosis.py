@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.errors import LocationError
 from photonpano.photometry import signal_to_noise
-from photonpano.values import FrameSpan, NotLocated, true_spans
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import BoolArray, Edge, Group, VirtualExposure
+from photonpano.values import BoolArray, Edge, FrameSpan, Group, NotLocated, VirtualExposure, true_spans
 
 TOLERATED_RUN = 2
 """So many exposures in a row may be lost: the motion is interpolated across them."""

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from photonpano.geometry import inverse, normalised
 from photonpano.motion.adjustment import Adjustment
-from photonpano.values import Located
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import BoolArray, Edge, FloatArray
+from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 
 class GraphOptions(Protocol):

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from photonpano.motion.attribution import attributing
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from contextlib import AbstractContextManager
-
-    from photonpano.protocols import Interpolator, Locator, Merger, Resampler
+from photonpano.protocols import Interpolator, Locator, Merger, Resampler
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from photonpano.context import Context
 from photonpano.motion.closures import revisits
 from photonpano.motion.diagnosis import require_tied
-from photonpano.motion.graph import components, solve
+from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
+from photonpano.motion.level import Level
+from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import pairs_of
 from photonpano.motion.registration import Registrar, require_motion
-from photonpano.values import FrameSpan, NotLocated
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonpano.context import Context
-    from photonpano.motion.graph import GraphOptions, GraphSolution
-    from photonpano.motion.level import Level
-    from photonpano.motion.merge import VirtualExposures
-    from photonpano.protocols import Trajectory
-    from photonpano.threads import Stopwatch
-    from photonpano.values import Edge, FloatArray, Group
+from photonpano.protocols import Trajectory
+from photonpano.threads import Stopwatch
+from photonpano.values import Edge, FloatArray, FrameSpan, Group, NotLocated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

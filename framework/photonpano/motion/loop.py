@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
+from numpy.typing import ArrayLike
+
+from photonpano.context import Context
 from photonpano.errors import PluginError
 from photonpano.geometry import inverse, normalised
 from photonpano.motion.attribution import AttributedTrajectory
-from photonpano.motion.locate import locate
+from photonpano.motion.graph import GraphOptions
+from photonpano.motion.level import Level
+from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import merge
 from photonpano.motion.uncertainty import Uncertainty
+from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
-from photonpano.values import Group
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
-    from photonpano.context import Context
-    from photonpano.motion.graph import GraphOptions
-    from photonpano.motion.level import Level
-    from photonpano.motion.locate import LocatedLevel
-    from photonpano.protocols import Source, Trajectory
-    from photonpano.values import FloatArray
+from photonpano.values import FloatArray, Group
 
 
 @dataclass(frozen=True, slots=True, eq=False)

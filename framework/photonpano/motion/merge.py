@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from photonpano.errors import PluginError
-from photonpano.values import VirtualExposure
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonpano.motion.level import Level
-    from photonpano.protocols import Source, Trajectory
-    from photonpano.threads import Stopwatch
-    from photonpano.values import Group
+from photonpano.motion.level import Level
+from photonpano.protocols import Source, Trajectory
+from photonpano.threads import Stopwatch
+from photonpano.values import Group, VirtualExposure
 
 
 def merge(

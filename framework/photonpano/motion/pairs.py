@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import FloatArray, FrameSpan, Group
+from photonpano.values import FloatArray, FrameSpan, Group
 
 
 def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int, int]]:

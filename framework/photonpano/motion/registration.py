@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +16,13 @@ from photonpano.errors import PluginError
 from photonpano.geometry import corner_displacements, implausibility, inverse, rescaled
 from photonpano.motion.closures import agreement
 from photonpano.motion.diagnosis import Contrast, contrast_of
+from photonpano.motion.level import Level, NamedLocator
+from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import independent_share, shared_share
+from photonpano.protocols import Trajectory
 from photonpano.text import listed
-from photonpano.values import Edge, Located, NotLocated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from concurrent.futures import Future, ThreadPoolExecutor
-
-    from photonpano.motion.level import Level, NamedLocator
-    from photonpano.motion.merge import VirtualExposures
-    from photonpano.protocols import Trajectory
-    from photonpano.threads import Stopwatch
-    from photonpano.values import FloatArray, Homography, VirtualExposure
+from photonpano.threads import Stopwatch
+from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated, VirtualExposure
 
 BRIDGE = 3
 """An exposure that none of its pairs ties to an earlier one is tried against so many predecessors."""

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.geometry import align_planes, corner_displacements, inverse
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from photonpano.motion.locate import LocatedLevel
-    from photonpano.protocols import Trajectory
-    from photonpano.values import FloatArray
+from photonpano.motion.locate import LocatedLevel
+from photonpano.protocols import Trajectory
+from photonpano.values import FloatArray
 
 _COMPARED = 1000
 """Two levels are compared at so many frames."""

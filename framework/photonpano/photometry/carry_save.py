@@ -6,14 +6,10 @@ operations on words. Counters are columns of bits: word k of a pixel holds the b
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MOST_FRAMES = 255
 """Counts of a block stay below 2^8, so that the bits of a count fit into a byte."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from photonpano.values import VirtualExposure
+from photonpano.values import VirtualExposure
 
 _ROWS = 16
 _BLOCK = 4

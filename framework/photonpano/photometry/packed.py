@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano.values import Counts
+from photonpano.values import Counts
 
 BitOrder: TypeAlias = Literal["big", "little"]
 """Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano.values import FloatArray
+from photonpano.values import FloatArray
 
 _FEWEST = 50
 """Fewer independent pixels than this correlate by chance."""

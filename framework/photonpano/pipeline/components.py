@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-from photonpano.contributions import SourceContext, StageContext
+from photonpano.contributions import Contribution, SourceContext, StageContext
 from photonpano.corrections import CorrectedSource
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
 from photonpano.motion.attribution import AttributedSource, attributing
 from photonpano.motion.level import Level, NamedLocator
+from photonpano.protocols import Resampler, Source
+from photonpano.specs.plan import Choice, Plan
 from photonpano.specs.tree import Place
 from photonpano.threads import thread_count
-from photonpano.values import Decision
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from photonpano.contributions import Contribution
-    from photonpano.protocols import Resampler, Source
-    from photonpano.specs.plan import Choice, Plan
-    from photonpano.values import CaptureSummary, DecisionValue, Group
+from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
 
 HALVED_LEVELS = 2
 """So many levels, at most, are located at half size unless the spec says otherwise."""

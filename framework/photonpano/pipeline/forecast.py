@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from types import TracebackType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.context import Context
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
-from photonpano.motion.loop import estimate_motion, resample
+from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.record import peak_memory_bytes
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource
+from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source
+from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
-from photonpano.values import FrameSpan
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from photonpano.motion.loop import LevelResult
-    from photonpano.protocols import Source
-    from photonpano.specs.plan import Plan
-    from photonpano.values import BoolArray, Counts, FluxImage, Frames, Response, StreamInfo
+from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
 
 TRIAL_GROUPS = 12
 """So many groups of the first level, from the middle of the capture, are run through all levels."""

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano.geometry import Canvas
-    from photonpano.motion.loop import LevelResult
-    from photonpano.registry import Observer
+from photonpano.geometry import Canvas
+from photonpano.motion.loop import LevelResult
+from photonpano.registry import Observer
 
 logger = logging.getLogger(__name__)
 

@@ -5,20 +5,16 @@ from __future__ import annotations
 import importlib.metadata
 import re
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from photonpano.values import Decision, Located, NotLocated, true_spans
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from photonpano.motion.loop import LevelResult
-    from photonpano.specs.plan import Choice, Plan
-    from photonpano.values import FloatArray, Group, StreamInfo
+from photonpano.motion.loop import LevelResult
+from photonpano.specs.plan import Choice, Plan
+from photonpano.values import Decision, FloatArray, Group, Located, NotLocated, StreamInfo, true_spans
 
 UNCERTAIN_PX = 0.5
 """Frames whose expected corner error exceeds this are named: theirs is likely to show."""

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import datetime
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import told_once
-from photonpano.context import Context
+from photonpano.context import Context, Progress
 from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
-from photonpano.merging.panorama import Overview, plan_canvas, render_tiles, tiles_of
+from photonpano.geometry import Canvas
+from photonpano.merging.panorama import Overview, Tile, plan_canvas, render_tiles, tiles_of
 from photonpano.motion.attribution import AttributedSource
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_levels, origin_of
-from photonpano.pipeline.observers import NOBODY
+from photonpano.pipeline.observers import NOBODY, Observers
 from photonpano.pipeline.record import (
     level_record,
     levels_decision,
@@ -32,22 +35,12 @@ from photonpano.pipeline.record import (
     uncertain_frames,
     warnings_of,
 )
+from photonpano.pipeline.run_folder import RunFolder
+from photonpano.protocols import Source
+from photonpano.specs.plan import Plan
 from photonpano.specs.tree import Place
 from photonpano.threads import one_thread_inside, thread_count
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from photonpano.context import Progress
-    from photonpano.geometry import Canvas
-    from photonpano.merging.panorama import Tile
-    from photonpano.pipeline.observers import Observers
-    from photonpano.pipeline.run_folder import RunFolder
-    from photonpano.protocols import Source
-    from photonpano.specs.plan import Plan
-    from photonpano.values import BoolArray, FloatArray, Panorama
+from photonpano.values import BoolArray, FloatArray, Panorama
 
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 

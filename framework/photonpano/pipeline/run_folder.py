@@ -7,25 +7,21 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    from photonpano.geometry import Canvas
-    from photonpano.merging.panorama import Tile
-    from photonpano.values import BoolArray, FloatArray, FluxImage, Homography, Panorama
+from photonpano.geometry import Canvas
+from photonpano.merging.panorama import Tile
+from photonpano.values import BoolArray, FloatArray, FluxImage, Homography, Panorama
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.photometry import BinaryResponse
 from photonpano.reading.files import OpenFiles
-from photonpano.values import StreamInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import TracebackType
-    from typing import Self
-
-    from numpy.typing import NDArray
-
-    from photonpano.reading.packed_layout import FrameLayout
-    from photonpano.values import Counts, FrameSpan
+from photonpano.reading.packed_layout import FrameLayout
+from photonpano.values import Counts, FrameSpan, StreamInfo
 
 
 class BinarySource(ABC):

@@ -5,17 +5,12 @@ from __future__ import annotations
 import gzip
 import logging
 import zlib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError
 from photonpano.reading.files import read_start
-from photonpano.reading.npy import read_npy_header
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from photonpano.reading.npy import NpyHeader
+from photonpano.reading.npy import NpyHeader, read_npy_header
 
 logger = logging.getLogger(__name__)
 

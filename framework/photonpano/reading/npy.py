@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import IO, TYPE_CHECKING, NamedTuple
+from gzip import GzipFile
+from pathlib import Path
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from photonpano.errors import InputError
-
-if TYPE_CHECKING:
-    from gzip import GzipFile
-    from pathlib import Path
 
 
 class NpyHeader(NamedTuple):

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from pathlib import Path
 from threading import local
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.reading.binary_source import BinarySource
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from photonpano.reading.packed_layout import FrameLayout
-    from photonpano.values import FrameSpan
+from photonpano.reading.packed_layout import FrameLayout
+from photonpano.values import FrameSpan
 
 _READ_BYTES = 1024**2
 """So much is read at a time: a core's cache holds it until it is summed."""

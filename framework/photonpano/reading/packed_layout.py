@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.photometry import BitOrder, packed_counts, reversed_bits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from photonpano.values import Counts
+from photonpano.values import Counts
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 

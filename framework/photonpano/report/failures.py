@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonpano.report.record import FailureRecord, LevelRecord
+from photonpano.report.record import FailureRecord, LevelRecord
 
 MAX_EXAMPLES = 3
 """So many pairs of a group are named."""

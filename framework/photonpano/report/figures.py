@@ -5,25 +5,20 @@ from __future__ import annotations
 import importlib
 import io
 import re
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from photonpano.geometry import apply, corners
 from photonpano.report.pictures import shrunk
+from photonpano.report.record import LevelRecord, PanoramaRecord, RunArrays
 from photonpano.report.wording import duration
-from photonpano.values import true_spans
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from photonpano.report.record import LevelRecord, PanoramaRecord, RunArrays
-    from photonpano.values import FloatArray, FluxImage
+from photonpano.values import FloatArray, FluxImage, true_spans
 
 MAX_INSTANTS = 1500
 """The trajectory is drawn at so many instants at most, evenly spaced."""

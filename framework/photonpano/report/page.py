@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.report import figures, wording
 from photonpano.report.failures import failure_groups
 from photonpano.report.pictures import jpeg_uri, shrunk
+from photonpano.report.record import RunArrays, RunRecord
 from photonpano.values import true_spans
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from photonpano.report.record import RunArrays, RunRecord
 
 PICTURE_PIXELS = 1600
 """The longer side of the panorama on the page; the files of the run folder have all pixels."""

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable
+from types import TracebackType
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from photonpano.photometry import BinaryResponse
-from photonpano.values import FrameSpan, Group, StreamInfo, VirtualExposure
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from photonpano.protocols import Trajectory
-    from photonpano.testing.scenes import Scene
-    from photonpano.values import BoolArray, Counts, FloatArray, Homography
+from photonpano.protocols import Trajectory
+from photonpano.testing.scenes import Scene
+from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Group, Homography, StreamInfo, VirtualExposure
 
 Number = TypeVar("Number", bound=np.generic)
 

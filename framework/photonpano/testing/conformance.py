@@ -7,18 +7,15 @@ import json
 import subprocess
 import sys
 import typing
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from photonpano.contributions import AnyContribution
 from photonpano.registry import KINDS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from photonpano.contributions import AnyContribution
 
 HEAVY = frozenset(
     {

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
+from photonpano.contributions import InterpolatorContribution
 from photonpano.geometry import corner_displacements, from_parameters, translation
+from photonpano.protocols import Trajectory
 from photonpano.testing.captures import read_only
 from photonpano.testing.conformance import raising_nothing
 from photonpano.testing.sameness import fingerprint, in_threads
 from photonpano.testing.stages import STREAM, StageConformance, unharmed
-
-if TYPE_CHECKING:
-    from photonpano.contributions import InterpolatorContribution
-    from photonpano.protocols import Trajectory
-    from photonpano.values import FloatArray
+from photonpano.values import FloatArray
 
 INSTANTS = np.array([24.5, 130.0, 220.5, 340.0, 451.5, 560.0, 649.5, 780.0, 871.0])
 FAR = STREAM.n_frames

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import gc
 import weakref
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
+from photonpano.contributions import LocatorContribution
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano.testing.captures import photographed, read_only
 from photonpano.testing.conformance import raising_nothing
 from photonpano.testing.sameness import fingerprint, global_chance, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, unharmed
-from photonpano.values import Located, NotLocated, StreamInfo, VirtualExposure
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from photonpano.contributions import LocatorContribution
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography, Located, NotLocated, StreamInfo, VirtualExposure
 
 SHAPE = (144, 192)
 STILL = np.eye(3)

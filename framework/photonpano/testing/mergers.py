@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from photonpano.contributions import MergerContribution
 from photonpano.errors import InputError
 from photonpano.geometry import translation
+from photonpano.protocols import Merger, Source, Trajectory
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
 from photonpano.testing.sameness import fingerprint, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, unharmed
-from photonpano.values import FrameSpan, Group, VirtualExposure
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from photonpano.contributions import MergerContribution
-    from photonpano.protocols import Merger, Source, Trajectory
-    from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Homography
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, FrameSpan, Group, Homography, VirtualExposure
 
 SHAPE = (40, 56)
 N_FRAMES = 240

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from photonpano.contributions import ResamplerContribution
 from photonpano.errors import InputError
 from photonpano.testing.stages import STREAM, StageConformance
 from photonpano.values import Group
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano.contributions import ResamplerContribution
 
 LEVELS = (1, 2, 3, 4)
 LONG = (STREAM.n_frames, STREAM.n_frames + 37)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.geometry import apply
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography
 
 _WAVES = 64
 _PERIODS_PX = (6.0, 120.0)

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from photonpano.contributions import SourceContext
+from photonpano.contributions import SourceContext, SourceContribution
 from photonpano.errors import InputError
-from photonpano.protocols import PackedSource
+from photonpano.protocols import PackedSource, Source
 from photonpano.testing.conformance import Conformance, raising_nothing
 from photonpano.testing.sameness import fingerprint, global_chance, in_threads
 from photonpano.values import FrameSpan, StreamInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from photonpano.contributions import SourceContribution
-    from photonpano.protocols import Source
 
 _MOST_FRAMES = 200
 """Of a longer capture, the first and the last half of these are looked at."""

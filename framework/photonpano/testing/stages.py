@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from photonpano.contributions import StageContext
+from photonpano.contributions import StageContext, StageContribution
 from photonpano.errors import CaptureUnreadError
 from photonpano.photometry import BinaryResponse
 from photonpano.testing.conformance import Conformance
-from photonpano.values import CaptureSummary, StreamInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano.contributions import StageContribution
-    from photonpano.values import DecisionValue
+from photonpano.values import CaptureSummary, DecisionValue, StreamInfo
 
 STREAM = StreamInfo(2000, 254, 496, frame_rate_hz=96_800.0)
 """The capture for which a component is built, where nothing else is said."""

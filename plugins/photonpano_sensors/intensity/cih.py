@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 from xml.etree import ElementTree
 
 from photonpano import InputError
 from photonpano_sensors.intensity.levels import Encoding
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 _MOST_BYTES = 4 * 1024**2
 """Headers are a few kB; whatever is larger is something else."""

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from itertools import chain
 from threading import Lock
-from typing import TYPE_CHECKING
 
 import av
 import numpy as np
+from av import VideoFrame
 
 from photonpano import InputError
-from photonpano_sensors.intensity.video_index import open_video
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from av import VideoFrame
-
-    from photonpano_sensors.intensity.summing import Levels
-    from photonpano_sensors.intensity.video_index import VideoIndex
+from photonpano_sensors.intensity.summing import Levels
+from photonpano_sensors.intensity.video_index import VideoIndex, open_video
 
 
 class _Decoder:

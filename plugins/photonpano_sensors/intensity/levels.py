@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.photometry import IntensityResponse, srgb_to_linear
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from photonpano_sensors.intensity.configs import ResponseConfig
+from photonpano_sensors.intensity.configs import ResponseConfig
 
 _MOST = 2**16 - 1
 """The highest linear level."""

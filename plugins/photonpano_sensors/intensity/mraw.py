@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
-from photonpano import InputError
+from photonpano import FrameSpan, InputError
 from photonpano.reading import OpenFiles
-from photonpano_sensors.intensity.cih import read_header
+from photonpano_sensors.intensity.cih import Header, read_header
+from photonpano_sensors.intensity.configs import FastcamMrawConfig
 from photonpano_sensors.intensity.recognition import header_beside, mraw_beside, refuse_mdat
 from photonpano_sensors.intensity.source import IntensitySource
-from photonpano_sensors.intensity.summing import unpack_12_bits
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from photonpano import FrameSpan
-    from photonpano_sensors.intensity.cih import Header
-    from photonpano_sensors.intensity.configs import FastcamMrawConfig
-    from photonpano_sensors.intensity.summing import Levels
+from photonpano_sensors.intensity.summing import Levels, unpack_12_bits
 
 
 class FastcamMrawSource(IntensitySource):

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
+from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
-from photonpano import InputError
+from photonpano import FrameSpan, InputError
+from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import pictures_in
 from photonpano_sensors.intensity.source import IntensitySource
+from photonpano_sensors.intensity.summing import Levels
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from photonpano import FrameSpan
-    from photonpano_sensors.intensity.configs import ImageFolderConfig
-    from photonpano_sensors.intensity.summing import Levels
-
-    Image = NDArray[np.generic]
+Image = NDArray[np.generic]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Self
+from types import TracebackType
+from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, StreamInfo
-from photonpano_sensors.intensity.levels import linear_levels
-from photonpano_sensors.intensity.summing import add_levels, add_linear
-
-if TYPE_CHECKING:
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from photonpano_sensors.intensity.configs import IntensityConfig
-    from photonpano_sensors.intensity.levels import Encoding
-    from photonpano_sensors.intensity.summing import Levels
+from photonpano_sensors.intensity.configs import IntensityConfig
+from photonpano_sensors.intensity.levels import Encoding, linear_levels
+from photonpano_sensors.intensity.summing import Levels, add_levels, add_linear
 
 _PART_BYTES = 4 * 1024**2
 """So much is held at a time while frames are summed."""

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
+Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 _BLOCK = 4096
 """So many pixels are summed at a time: their sums stay in the fastest cache."""

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from photonpano import FrameSpan, SourceContext
+from photonpano_sensors.intensity.configs import VideoConfig
 from photonpano_sensors.intensity.decoding import DecodedFrames
 from photonpano_sensors.intensity.source import IntensitySource
+from photonpano_sensors.intensity.summing import Levels
 from photonpano_sensors.intensity.video_index import index_of
-
-if TYPE_CHECKING:
-    from photonpano import FrameSpan, SourceContext
-    from photonpano_sensors.intensity.configs import VideoConfig
-    from photonpano_sensors.intensity.summing import Levels
 
 _KEPT_BYTES = 256 * 1024**2
 """Decoded frames are kept up to this."""

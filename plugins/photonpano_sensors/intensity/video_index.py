@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import av
 import numpy as np
+from av.container import InputContainer
+from av.video.format import VideoFormat
+from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import refuse_mdat
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from av.container import InputContainer
-    from av.video.format import VideoFormat
-    from numpy.typing import NDArray
 
 _LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")
 """Formats of pixels whose first plane is the luma, as it stands."""

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,11 +13,10 @@ from photonpano.photometry import BinaryResponse
 
 pytest.importorskip("pycolmap")
 
+from collections.abc import Callable
+
 from photonpano_colmap.configs import PycolmapTwoViewConfig
 from photonpano_colmap.two_view import Features, TwoViewLocator
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

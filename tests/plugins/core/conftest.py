@@ -1,19 +1,15 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from photonpano import StageContext, StreamInfo, discover
+from photonpano import StageContext, StreamInfo, Trajectory, discover
 from photonpano.geometry import from_parameters, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from photonpano import Trajectory
 
 FRAME_SHAPE = (254, 496)
 FOCAL_PX = 1500.0

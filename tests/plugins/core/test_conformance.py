@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from photonpano import discover
 from photonpano.testing import InterpolatorConformance, MergerConformance, ResamplerConformance, SourceConformance
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CATALOG = discover()
 

@@ -3,9 +3,11 @@ from __future__ import annotations
 import gzip
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +16,6 @@ from hypothesis import strategies as st
 
 from photonpano import FrameSpan, InputError, OutputError, SourceContext
 from photonpano.reading import PackedFileSource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 
 

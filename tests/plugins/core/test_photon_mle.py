@@ -1,20 +1,15 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group
+from photonpano import FrameSpan, Group, Source
 from photonpano.geometry import translation
 from photonpano.merging import accumulate, chunks_of
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Source
 
 N = 60
 GROUP = Group(FrameSpan(0, N), 29.5)

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano import FrameSpan, InputError, StageContext, StreamInfo
+from photonpano import FrameSpan, Group, InputError, StageContext, StreamInfo
 from photonpano_core.configs import MidpointConfig
 from photonpano_core.hooks import photonpano_resamplers
 from photonpano_core.midpoint import MidpointResampler
-
-if TYPE_CHECKING:
-    from photonpano import Group
 
 NAMES = ("constant-groups", "sliding-window", "stratified")
 CONTRIBUTIONS = {each.name: each for each in photonpano_resamplers()}

@@ -1,20 +1,15 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group
+from photonpano import FrameSpan, Group, Source, Trajectory
 from photonpano.geometry import translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.robust_merge import RobustMerger, divided
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Source, Trajectory
 
 N, HEIGHT, WIDTH = 140, 60, 90
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)

@@ -1,14 +1,10 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
+from photonpano import Trajectory
 from photonpano.geometry import corner_displacements, corners, from_parameters, jacobian, parameters
-
-if TYPE_CHECKING:
-    from photonpano import Trajectory
 
 FRAME_SHAPE = (254, 496)
 

@@ -1,21 +1,17 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError
+from photonpano import FrameSpan, Group, InputError, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, rescaling
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.splat import SplatMerger
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Trajectory, VirtualExposure
 
 N, HEIGHT, WIDTH = 24, 30, 41
 GROUP = Group(FrameSpan(2, N - 2), 10.5)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,9 +13,6 @@ from photonpano.geometry import apply, corner_displacements, corners, from_param
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.locator import DirectLocator
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

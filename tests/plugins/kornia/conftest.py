@@ -1,18 +1,13 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import cv2
+import numpy as np
 import pytest
 
+from photonpano import VirtualExposure
 from photonpano.geometry import translation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import numpy as np
-
-    from photonpano import VirtualExposure
 
 
 @pytest.fixture(scope="session")

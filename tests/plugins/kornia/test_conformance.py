@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from photonpano import discover
 from photonpano.testing import LocatorConformance
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CATALOG = discover()
 

@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from photonpano import NotLocated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 pytest.importorskip("torch")
 pytest.importorskip("kornia")

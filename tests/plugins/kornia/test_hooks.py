@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -12,9 +12,6 @@ from typer.testing import CliRunner
 from photonpano import PluginError, SpecError, StreamInfo, discover, parse_spec
 from photonpano.cli.app import app
 from photonpano_kornia.configs import KorniaLoftrConfig
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NAMES = ("kornia-features", "kornia-loftr", "kornia-registrator")
 

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated, StageContext, StreamInfo
+from photonpano import Located, Locator, NotLocated, StageContext, StreamInfo, VirtualExposure
 from photonpano.geometry import corner_displacements, from_parameters, translation
 from photonpano.photometry import BinaryResponse
 from photonpano_kornia.hooks import photonpano_locators
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Locator, VirtualExposure
 
 pytest.importorskip("torch")
 pytest.importorskip("kornia")

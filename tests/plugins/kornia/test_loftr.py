@@ -1,16 +1,13 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from photonpano import InputError, Located, NotLocated
 from photonpano.geometry import apply, corner_displacements, from_parameters
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 pytest.importorskip("torch")
 pytest.importorskip("kornia")

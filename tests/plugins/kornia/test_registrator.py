@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from photonpano import NotLocated
 from photonpano.geometry import apply, inverse, rescaling, translation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 pytest.importorskip("torch")
 pytest.importorskip("kornia")

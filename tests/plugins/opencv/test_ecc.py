@@ -1,19 +1,15 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import cv2
 import numpy as np
+import pytest
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import corner_displacements, translation
 from photonpano_opencv.configs import OpencvEccConfig
 from photonpano_opencv.ecc import EccLocator
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import pytest
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

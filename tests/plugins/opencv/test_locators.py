@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated, StageContext, StreamInfo
+from photonpano import Located, Locator, NotLocated, StageContext, StreamInfo, VirtualExposure
 from photonpano.geometry import corner_displacements, from_parameters, translation
 from photonpano.photometry import BinaryResponse
 from photonpano_opencv.hooks import photonpano_locators
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Locator, VirtualExposure
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

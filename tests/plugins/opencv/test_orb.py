@@ -1,19 +1,15 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano import Located
 from photonpano.geometry import corner_displacements, translation
 from photonpano_opencv.configs import OpencvOrbConfig
+from photonpano_opencv.keypoints import Keypoints
 from photonpano_opencv.orb import OrbLocator
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano_opencv.keypoints import Keypoints
 
 SHAPE = (160, 240)
 

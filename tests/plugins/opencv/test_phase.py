@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,9 +12,6 @@ from photonpano.geometry import apply, from_parameters, generators, jacobian, tr
 from photonpano.locating import View
 from photonpano_opencv.configs import PhaseCorrelationConfig
 from photonpano_opencv.phase import PhaseCorrelationLocator, shift_between
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

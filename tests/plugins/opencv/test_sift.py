@@ -1,20 +1,15 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano_opencv.configs import OpencvSiftConfig
 from photonpano_opencv.keypoints import Keypoints
 from photonpano_opencv.sift import SiftLocator
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import VirtualExposure
 
 SHAPE = (160, 240)
 

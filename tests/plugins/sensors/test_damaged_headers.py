@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,6 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from photonpano import FrameSpan, InputError, SourceContext, discover
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CATALOG = discover()
 FRAMES = np.random.default_rng(0).integers(0, 2, (3, 10, 16), dtype=np.uint8)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import gzip
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, SourceContext, discover
+from photonpano import FrameSpan, Recognised, Source, SourceContext, discover
 from photonpano.photometry import BinaryResponse
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano import Recognised, Source
 
 NAMES = "packed-npy swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5"
 SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import savemat
 
-from photonpano import FrameSpan, InputError, SourceContext, discover
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
-
-    from photonpano import Source
+from photonpano import FrameSpan, InputError, Source, SourceContext, discover
 
 CATALOG = discover()
 HALF, FULL, DENSE, SPARSE = "swissspad-half", "swissspad-full", "spad512", "spad512-sparse"

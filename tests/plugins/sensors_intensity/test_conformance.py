@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,9 +11,6 @@ import tifffile
 
 from photonpano import discover
 from photonpano.testing import SourceConformance
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CATALOG = discover()
 CIH = """#Camera Information Header

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,13 +10,8 @@ from pydantic import ValidationError
 from photonpano import FrameSpan, InputError
 from photonpano.photometry import srgb_to_linear
 from photonpano_sensors.intensity.configs import FastcamMrawConfig, ResponseConfig
-from photonpano_sensors.intensity.levels import Encoding, linear_levels
+from photonpano_sensors.intensity.levels import Encoding, LinearLevels, linear_levels
 from photonpano_sensors.intensity.mraw import FastcamMrawSource
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from photonpano_sensors.intensity.levels import LinearLevels
 
 LIMITED = Encoding(8, 16.0, 235.0)
 

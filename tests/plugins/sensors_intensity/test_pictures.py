@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,9 +10,6 @@ import tifffile
 from photonpano import InputError
 from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.pictures import ImageFolderSource
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_pictures_come_in_natural_order_and_other_files_do_not_count(tmp_path: Path) -> None:

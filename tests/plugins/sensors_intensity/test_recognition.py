@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -10,9 +10,6 @@ import pytest
 import tifffile
 
 from photonpano_sensors.intensity.contributions import INTENSITY_SOURCES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 REAL = Path(__file__).parents[2] / "data" / "photron"
 

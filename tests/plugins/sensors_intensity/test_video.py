@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +12,13 @@ from photonpano_sensors.intensity.configs import ResponseConfig, VideoConfig
 
 pytest.importorskip("av")
 
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
 from photonpano_sensors.intensity import video_index
 from photonpano_sensors.intensity.decoding import DecodedFrames
 from photonpano_sensors.intensity.video import VideoSource
 from photonpano_sensors.intensity.video_index import index_of, open_video
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
 
 
 def opened(path: Path, threads: int = 1, **keys: Any) -> VideoSource:

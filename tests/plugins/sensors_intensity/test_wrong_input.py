@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.util
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,9 +16,6 @@ import tifffile
 from typer.testing import CliRunner
 
 from photonpano.cli.app import app
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 REAL = Path(__file__).parents[2] / "data" / "photron"
 SPEC = "version: 1\nsource: {{use: {use}, with: {{path: {path}{more}}}}}\nresample: {{with: {{group_size: 1}}}}\nlevels: 1\n"

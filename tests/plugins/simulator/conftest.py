@@ -1,6 +1,8 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,10 +11,6 @@ import pytest
 from photonpano import SourceContext
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.source import SimulatorSource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -10,9 +11,6 @@ from pydantic import ValidationError
 from photonpano import FrameSpan, SourceContext
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SIMULATOR, CAMERA = photonpano_sources()
 

@@ -1,15 +1,13 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import InputError
 from photonpano.geometry import apply, corners, translation
-
-if TYPE_CHECKING:
-    from pathlib import Path
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.paths import camera_path
 

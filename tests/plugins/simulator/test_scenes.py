@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,9 +9,6 @@ import pytest
 from photonpano import InputError
 from photonpano_simulator.config import PhotoScene, StreetScene
 from photonpano_simulator.scenes import scene_flux
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def written(path: Path, image: np.ndarray) -> Path:

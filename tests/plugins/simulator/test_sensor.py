@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +9,6 @@ from photonpano import InputError
 from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.config import Sensor
 from photonpano_simulator.sensor import SpadSensor
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SHAPE = (60, 81)
 

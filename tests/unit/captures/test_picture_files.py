@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import importlib.util
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,10 +11,6 @@ from PIL import Image
 
 from photonpano import OutputError
 from photonpano.captures.picture_files import write_pictures
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 NAMES = ["frame_00", "frame_10", "frame_20"]
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,9 +10,6 @@ import pytest
 
 from photonpano import FrameSpan, StreamInfo
 from photonpano.captures.preview import Look, pictures, preview_spans, white_flux
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 UNLABELLED = Look(white_flux=1.0, label=False)
 

@@ -4,7 +4,9 @@ import shutil
 import subprocess
 import sys
 import tracemalloc
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +14,6 @@ import pytest
 from photonpano import FrameSpan, InputError, OutputError, PluginError, StreamInfo
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.photometry import BinaryResponse
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 class RandomSource:

@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +17,6 @@ from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.plugins import observation_of
 from photonpano.specs import load_spec, parse_spec
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 def test_simulate_writes_a_capture_and_says_how_to_use_it(finished: Path) -> None:

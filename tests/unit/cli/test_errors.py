@@ -6,7 +6,9 @@ import logging
 import signal
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +16,6 @@ import typer
 
 from photonpano import PluginError
 from photonpano.cli.outcome import reported
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 SOURCE = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\n"
 

@@ -3,16 +3,14 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import typer
 
 import photonpano
 from photonpano.cli.app import app
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 HEAVY = {"numpy", "pydantic", "cv2", "scipy", "skimage", "matplotlib", "rich", "photonpano_core", "photonpano_opencv"}
 

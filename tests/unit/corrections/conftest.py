@@ -1,21 +1,18 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from photonpano import FrameSpan
+from photonpano.corrections import Correction
 from photonpano.photometry import packed_counts
 from photonpano.specs.corrections import resolved_corrections
 from photonpano.specs.tree import Place, from_data
 from photonpano.testing import MemorySource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from photonpano import FrameSpan
-    from photonpano.corrections import Correction
 
 
 class PackedMemorySource(MemorySource):

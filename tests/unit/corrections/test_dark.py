@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +14,6 @@ from photonpano import FrameSpan, InputError
 from photonpano.corrections import CorrectedSource, DarkFrames, measure_dark, read_dark, write_dark
 from photonpano.testing import MemorySource
 from photonpano.values import Decision
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 SHAPE = (20, 30)
 N = 2000

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +12,6 @@ import pytest
 from photonpano import FrameSpan, InputError
 from photonpano.corrections import CorrectedSource
 from photonpano.testing import MemorySource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 def bits(shape: tuple[int, int], n: int = 3) -> np.ndarray:

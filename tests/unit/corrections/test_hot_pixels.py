@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +11,6 @@ import pytest
 from photonpano import FrameSpan
 from photonpano.corrections import CorrectedSource, DarkFrames, hot_in_the_dark, write_dark
 from photonpano.testing import MemorySource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 SHAPE = (60, 80)
 N = 2000

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,10 +13,6 @@ import pytest
 from photonpano import FrameSpan, InputError
 from photonpano.corrections import CorrectedSource
 from photonpano.testing import MemorySource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 SHAPE = (6, 10)
 SPAN = FrameSpan(0, 50)

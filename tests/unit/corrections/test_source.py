@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +13,6 @@ from photonpano import Config, FrameSpan, InputError, LinearlyCorrectedSource, P
 from photonpano.corrections import CorrectedSource
 from photonpano.corrections.geometry import Crop, MissingRow, Rot90
 from photonpano.testing import MemorySource, SourceConformance
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 N, SHAPE = 40, (12, 16)
 SPAN = FrameSpan(0, N)

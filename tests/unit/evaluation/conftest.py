@@ -1,16 +1,13 @@
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import tifffile
 
 from photonpano.geometry import apply, canvas_of, normalised, rescaling, translation
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FRAME_SHAPE = (60, 90)
 

@@ -1,19 +1,14 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated
+from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import corners, from_parameters, inverse, jacobian, translation
 from photonpano.locating import ImageLimits, View, motion_from_images, view_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import VirtualExposure
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

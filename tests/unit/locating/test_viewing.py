@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from photonpano.geometry import translation
 from photonpano.locating import blur_against_noise, stabilised_8_bit, view_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (160, 240)
 

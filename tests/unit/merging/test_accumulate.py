@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -11,9 +11,6 @@ from photonpano.geometry import from_parameters, rescaling, translation
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (30, 40)
 FLUX = 0.7

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,9 +10,6 @@ from hypothesis import strategies as st
 from photonpano import FrameSpan
 from photonpano.geometry import corner_displacements, from_parameters, inverse, translation
 from photonpano.merging import chunks_of, clipped
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (30, 40)
 

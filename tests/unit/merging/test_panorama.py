@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import tracemalloc
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,6 @@ from photonpano.context import Context, Quiet
 from photonpano.geometry import Canvas, apply, from_parameters, translation
 from photonpano.merging.panorama import BYTES_PER_PIXEL, Overview, Tile, plan_canvas, render, render_tiles, tiles_of
 from photonpano.photometry import tone_mapped
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (30, 40)
 N = 60

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, PluginError
 from photonpano.motion.attribution import AttributedSource, AttributedTrajectory
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 ORIGIN = "source 'toy' of toys 1.0"
 SPAN = FrameSpan(2, 5)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,9 +11,6 @@ from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import agreement
 from photonpano.photometry import BinaryResponse
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SHAPE = (128, 160)
 RESPONSE = BinaryResponse()

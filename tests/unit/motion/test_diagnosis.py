@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from textwrap import dedent
-from typing import TYPE_CHECKING
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -12,9 +12,6 @@ from photonpano import FrameSpan, Group, Located, LocationError, NotLocated, Vir
 from photonpano.motion.diagnosis import Contrast, contrast_of, require_tied
 from photonpano.photometry import BinaryResponse
 from photonpano.values import Edge
-
-if TYPE_CHECKING:
-    from typing import Any, Literal
 
 RESPONSE = BinaryResponse()
 

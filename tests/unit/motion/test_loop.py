@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,12 +10,8 @@ from photonpano import FrameSpan, Group, InputError, PluginError
 from photonpano.context import Context, Quiet
 from photonpano.geometry import translation
 from photonpano.motion.loop import estimate_motion
+from photonpano.pipeline.components import Level
 from photonpano.specs.settings import GraphSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from photonpano.pipeline.components import Level
 
 N_FRAMES = 120
 

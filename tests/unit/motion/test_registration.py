@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import gc
 import weakref
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated, VirtualExposure
+from photonpano import Group, Located, NotLocated, Trajectory, VirtualExposure
 from photonpano.context import Context
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.motion.locate import locate
+from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.registration import MIN_AGREEMENT
 from photonpano.photometry import BinaryResponse
+from photonpano.pipeline.components import Level
 from photonpano.specs.settings import GraphSettings
 from photonpano.threads import Stopwatch
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Group, Trajectory
-    from photonpano.motion.locate import LocatedLevel
-    from photonpano.pipeline.components import Level
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

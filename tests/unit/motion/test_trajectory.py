@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.motion.loop import ReferencedTrajectory
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def test_it_is_seen_from_the_reference_frame(pan: Callable) -> None:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +9,7 @@ from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSou
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import TRIAL_GROUPS, PartOfSource, forecast
 from photonpano.specs import parse_spec
-
-if TYPE_CHECKING:
-    from photonpano.testing import MemorySource
+from photonpano.testing import MemorySource
 
 
 def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[MemorySource]) -> None:

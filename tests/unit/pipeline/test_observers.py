@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,6 @@ from photonpano.motion.loop import estimate_motion
 from photonpano.pipeline.observers import Observers, frozen
 from photonpano.registry import Catalog
 from photonpano.specs.settings import GraphSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 DIRECTORY = Path("runs/scan")
 

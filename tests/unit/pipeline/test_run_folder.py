@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import json
 import resource
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,13 +14,7 @@ import tifffile
 from photonpano import OutputError, Panorama
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.panorama import Tile
-from photonpano.pipeline.run_folder import run_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from photonpano.pipeline.run_folder import RunFolder
+from photonpano.pipeline.run_folder import RunFolder, run_folder
 
 FLUX = np.random.default_rng(0).random((60, 90), np.float32)
 FLUX[:, :5] = np.nan

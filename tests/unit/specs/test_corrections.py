@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import SpecError
 from photonpano.corrections.geometry import Crop, Rot90
+from photonpano.registry import Catalog
 from photonpano.specs import load_spec, parse_spec
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from photonpano.registry import Catalog
 
 
 def spec(*corrections: Any) -> dict[str, Any]:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import Located, NotLocated
+from photonpano import Group, Located, NotLocated, Trajectory
 from photonpano.context import Context
 from photonpano.geometry import inverse
-from photonpano.motion.locate import locate
+from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import VirtualExposures
+from photonpano.pipeline.components import Level
 from photonpano.specs.settings import GraphSettings
 from photonpano.threads import Stopwatch
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano import Group, Trajectory
-    from photonpano.motion.locate import LocatedLevel
-    from photonpano.pipeline.components import Level
 
 SHAPE = (40, 60)
 N_FRAMES = 120

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,10 +10,6 @@ import pytest
 from photonpano import Group, Located, NotLocated, PluginError
 from photonpano.geometry import rescaled, translation
 from photonpano.motion.registration import broken_promise
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import gc
 import weakref
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,6 @@ from photonpano import FrameSpan, Group, Located, LocationError
 from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, translation
 from photonpano.motion.registration import BRIDGE
 from photonpano.specs.settings import GraphSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
