@@ -38,7 +38,7 @@ def pan() -> Callable[..., KnownMotion]:
 
 @pytest.fixture(scope="session")
 def street() -> np.ndarray:
-    """(682, 1024) of flux, 0.5 photons per pixel and frame on average."""
+    """(682, 1024) of flux, 0.5 photons per pixel per frame on average."""
     from photonpano_simulator.config import StreetScene
     from photonpano_simulator.scenes import scene_flux
 

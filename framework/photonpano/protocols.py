@@ -112,7 +112,7 @@ class KnowsTruth(Protocol):
 
         Returns:
             `homographies` (T, 3, 3) float64, one for each frame, h33 = 1; `scene` (Hs, Ws) float32, the flux that is detected,
-            in photons per pixel per frame period, without dark counts; `frame_shape` (2,), height and width of a frame.
+            in photons per pixel per frame, without dark counts; `frame_shape` (2,), height and width of a frame.
         """
         ...
 

@@ -18,7 +18,7 @@ NOTHING_TO_HOLD = "where the images overlap, if they do, there is no texture"
 """Why there is no shift to be told."""
 _EFFICIENCY = 0.1
 """Frequencies count alike, also those that hold little but noise: squared errors of shifts are so much larger than photons
-would allow, 8 to 17 times between 0.01 and 0.6 photons per pixel and frame."""
+would allow, 8 to 17 times between 0.01 and 0.6 photons per pixel per frame."""
 _TAPER = 0.25
 """The window falls to nothing within this share of the shorter side, towards what was not seen."""
 

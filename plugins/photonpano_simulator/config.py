@@ -110,9 +110,9 @@ class Sensor(Config):
     """A single-photon camera whose pixels tell whether they detected a photon."""
 
     quantum_efficiency: float = Field(1.0, gt=0, le=1, description="detected share of the photons that reach a pixel")
-    dark_rate: float = Field(0.0, ge=0, le=100, description="dark counts per pixel per frame period")
+    dark_rate: float = Field(0.0, ge=0, le=100, description="dark counts per pixel per frame")
     dark_rates: SpecPath | None = Field(
-        None, description="a .npy file of frame shape: dark counts per frame period of each pixel, on top of dark_rate"
+        None, description="a .npy file of frame shape: dark counts per frame of each pixel, on top of dark_rate"
     )
     hot_fraction: float = Field(0.0, ge=0, le=1, description="share of the pixels that are hot, placed by chance")
     hot_pixels: SpecPath | None = Field(
@@ -120,7 +120,7 @@ class Sensor(Config):
     )
     hot_rate: tuple[Rate, Rate] = Field(
         (0.05, 2.0),
-        description="dark counts of a hot pixel per frame period: drawn between these two, evenly on a logarithmic scale",
+        description="dark counts per frame of a hot pixel, drawn log-uniformly between these two",
     )
     mask_hot_pixels: bool = Field(False, description="whether the capture says which pixels are hot, so that they are not used")
 

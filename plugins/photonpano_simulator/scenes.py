@@ -20,7 +20,7 @@ _LARGEST = 16384
 
 
 def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float32]:
-    """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame period, with the mean `flux`.
+    """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame, with the mean `flux`.
 
     Raises:
         InputError: the photograph cannot be used.

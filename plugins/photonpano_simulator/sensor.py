@@ -53,7 +53,7 @@ class SpadSensor:
         """Take a frame.
 
         Args:
-            flux: (H, W) photons that are detected per pixel per frame period, dark counts not included; it is overwritten.
+            flux: (H, W) photons that are detected per pixel per frame, dark counts not included; it is overwritten.
             rng: the chance of this frame.
         """
         # The chance that no photon is detected, less one: -p.

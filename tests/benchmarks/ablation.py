@@ -109,7 +109,7 @@ def plot(results: Results, bounds: dict[float, float], file: Path) -> None:
     axes.set_xticks(fluxes, [f"{flux:g}" for flux in fluxes])
     axes.set_xticks([], minor=True)
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_xlabel("flux (photons per pixel and frame)")
+    axes.set_xlabel("flux (photons per pixel per frame)")
     axes.set_ylabel("mean corner error (px)")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside right upper", frameon=False, title="locator, graph, groups")

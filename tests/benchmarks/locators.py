@@ -171,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path, help="the page whose table is replaced")
     parser.add_argument("--scenes", type=int, default=2, help="how many streets")
-    parser.add_argument("--fluxes", type=float, nargs="+", default=[0.5, 0.1, 0.02], help="photons per pixel and frame")
+    parser.add_argument("--fluxes", type=float, nargs="+", default=[0.5, 0.1, 0.02], help="photons per pixel per frame")
     arguments = parser.parse_args()
     page: Path = arguments.page
     before, rest = page.read_text(encoding="utf-8").split(BEGIN)

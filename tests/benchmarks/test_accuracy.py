@@ -1,7 +1,7 @@
 """How far the motion and the panorama are from the truth, on simulated captures of frames of 254x496.
 
 Every run has three levels and default components: `direct`, which offers the pairs that it loses to `opencv-sift`. Captures are
-10,000 frames along a random spline of 1,500 px, with half a photon per pixel and frame or less, and a hand that is still or
+10,000 frames along a random spline of 1,500 px, with half a photon per pixel per frame or less, and a hand that is still or
 trembles; a path at five times the speed; and a raster that comes back to places it has seen. Bounds are on means over scenes.
 
 `make bench` prints the tables. Scenes are three streets that are built in; photographs can be added, separated by colons:

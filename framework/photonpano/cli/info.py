@@ -151,7 +151,7 @@ def _rows(facts: Mapping[str, Any]) -> Iterator[list[str]]:
     yield ["source", facts["source"] + (f" ({facts['reason']})" if facts["reason"] else "")]
     yield ["capture", capture_words(stream)]
     yield ["duration", "unknown without frame_rate_hz" if facts["seconds"] is None else duration(facts["seconds"])]
-    yield ["flux", f"{facts['flux']:.3g} photons per pixel and frame"]
+    yield ["flux", f"{facts['flux']:.3g} photons per pixel per frame"]
     yield ["hot pixels", f"about {_percent(hot)}" if hot else "none"]
     yield ["speed", facts["speed_how"] if speed_px is None else f"{speed_px:.2g} px a frame ({facts['speed_how']})"]
     yield ["group size", "unknown" if size is None else f"{size}: {facts['group_size_reason']}"]

@@ -72,7 +72,7 @@ def preview(
         with progress_for_stderr().stage(f"writing {output.name}", len(spans), "pictures") as advance:
             write_pictures(output, _counted(pictures(capture, spans, look, threads), advance), names, fps)
     typer.echo(f"{output}: {len(spans):,} pictures of {capture_words(capture.info)}, {len(spans[0])} frames each")
-    typer.echo(f"white is {look.white_flux:.4g} photons per pixel and frame")
+    typer.echo(f"white is {look.white_flux:.4g} photons per pixel per frame")
 
 
 def _counted(pictures: "Iterable[Picture]", advance: Callable[[int], None]) -> "Iterator[Picture]":

@@ -24,7 +24,7 @@ class Truth:
     Attributes:
         homographies: (T, 3, 3), frame pixels to pixels of the scene.
         frame_shape: (height, width) of a frame.
-        scene: (H, W) float32, photons per pixel per frame period; None if only the motion is known.
+        scene: (H, W) float32, photons per pixel per frame; None if only the motion is known.
     """
 
     homographies: FloatArray

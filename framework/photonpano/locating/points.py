@@ -17,7 +17,7 @@ def least_agreeing(matches: int, guided: bool) -> float:
     """Return how many matches must agree to tell a motion from chance, in the form of Brown and Lowe (2007, section 3.2).
 
     Near where a motion is predicted, keypoints of pure noise match as well: 10 to 16 % of them agree on something, while 60 %
-    and more do of a scene at 0.01 photons per pixel and frame. All over the image chance agrees on next to nothing, but of
+    and more do of a scene at 0.01 photons per pixel per frame. All over the image chance agrees on next to nothing, but of
     matches between exposures that are blurred, few agree to a pixel or two even when the motion is right.
     """
     return 8.0 + (0.3 if guided else 0.1) * matches

@@ -22,7 +22,7 @@ def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -
     """Return 8 bits for looking at: `white` photons per pixel per frame become 255; unknown pixels are black.
 
     Args:
-        flux: photons per pixel per frame period, NaN where unknown.
+        flux: photons per pixel per frame, NaN where unknown.
         white: the flux from which on everything is white.
         srgb: whether levels follow the sRGB curve, as screens expect, or are in proportion to the flux.
     """

@@ -106,7 +106,7 @@ def photographed(flux: FloatArray, n_frames: int = 1000, seed: int = 0, unseen: 
     """Take a virtual exposure of a camera that stands still, with the photon noise of so many binary frames.
 
     Args:
-        flux: (H, W), photons per pixel per frame period.
+        flux: (H, W), photons per pixel per frame.
         n_frames: frames that are merged.
         seed: the chance of the photons.
         unseen: (H, W) pixels that are unknown.

@@ -20,7 +20,7 @@ class Scene:
     It is a sum of waves, not an image: nothing is interpolated, and a pixel sees a point.
 
     Convention:
-        Points of the plane are (x, y) in px; flux is photons per pixel per frame period.
+        Points of the plane are (x, y) in px; flux is photons per pixel per frame.
     """
 
     def __init__(self, seed: int = 0, flux: tuple[float, float] = (0.1, 1.2)) -> None:

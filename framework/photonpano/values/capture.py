@@ -14,7 +14,7 @@ class CaptureSummary:
     """How bright a capture is, and how fast its image moves.
 
     Attributes:
-        flux: mean over pixels and places, photons per pixel per frame period.
+        flux: mean over pixels and places, photons per pixel per frame.
         speed_px: how fast the image moves where it is fast, in px a frame; None if no place tells.
         how: a clause that says how the speed was measured, for the reasons of choices.
     """

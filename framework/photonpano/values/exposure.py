@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Response(Protocol):
     """How a camera turns flux into counts. Every method works element by element and keeps NaN.
 
-    Flux is photons per pixel per frame period; a mean count is the sum of some frames divided by their number.
+    Flux is photons per pixel per frame; a mean count is the sum of some frames divided by their number.
     """
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -47,7 +47,7 @@ class VirtualExposure:
         The grid is that of a frame, rescaled: pixel centres p of the frame lie at `(p + 0.5) * scale - 0.5`.
 
     Attributes:
-        flux: (H, W) float32, photons per pixel per frame period, NaN where nothing was seen.
+        flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen.
         weight: (H, W) float32, how many frames each pixel was seen in; 0 exactly where flux is NaN.
         group: the frames and the instant.
         scale: pixels of the exposure per pixel of a frame.
@@ -66,7 +66,7 @@ class Panorama:
     """Flux and weight on a canvas.
 
     Attributes:
-        flux: (H, W) float32, photons per pixel per frame period, NaN where nothing was seen.
+        flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen.
         weight: (H, W) float32, how many frames each pixel was seen in (the coverage).
         canvas: (3, 3) float64, pixels of the reference plane to pixels of the panorama.
     """

@@ -37,7 +37,7 @@ class ResponseConfig(Config):
         10_000.0,
         gt=0,
         le=1e9,
-        description="detected photons per pixel and frame at white_level: the unit of the flux, and how strong photon noise is",
+        description="detected photons per pixel per frame at white_level: the unit of the flux, and how strong photon noise is",
     )
     read_noise: float = Field(
         20.0,

@@ -32,7 +32,7 @@ def register(moving: VirtualExposure, fixed: Features, initial: np.ndarray | Non
 
 @pytest.fixture(scope="module")
 def still(seen_from: Callable) -> Features:
-    """The street at 0.5 photons per pixel and frame, 250 frames."""
+    """The street at 0.5 photons per pixel per frame, 250 frames."""
     return locator().describe(seen_from(STILL, 2))
 
 
@@ -74,7 +74,7 @@ def test_known_motions_are_found_and_not_their_inverse(seen_from: Callable, stil
 
 
 def test_in_the_dark_too(seen_from: Callable) -> None:
-    """At 0.02 photons per pixel and frame, 250 frames."""
+    """At 0.02 photons per pixel per frame, 250 frames."""
     true = MOTIONS["shift"]
     motion = register(seen_from(true, 1, 0.04), locator().describe(seen_from(STILL, 2, 0.04)))
     assert error_px(motion, true) < 0.8

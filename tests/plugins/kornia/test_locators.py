@@ -28,7 +28,7 @@ BACKENDS = {
     "smnn": ("kornia-features", {"max_keypoints": 400}, 0.3),
     "adalam": ("kornia-features", {"max_keypoints": 400, "matcher": "adalam"}, 0.3),
 }
-"""Locators, what they are told, and their tolerance in px at 0.5 photons per pixel and frame."""
+"""Locators, what they are told, and their tolerance in px at 0.5 photons per pixel per frame."""
 SHIFT = translation(20.25, 7.5)
 HOMOGRAPHY = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
 
@@ -75,7 +75,7 @@ def test_what_is_known_so_far_tells_what_looks_alike(backend: str, photograph: C
 
 
 def test_in_the_dark_too(backend: str, shot: Callable) -> None:
-    """At 0.02 photons per pixel and frame."""
+    """At 0.02 photons per pixel per frame."""
     assert error_px(register(backend, shot(SHIFT, 1, 0.04), shot(STILL, 2, 0.04)), SHIFT) < 0.8
 
 

@@ -60,7 +60,7 @@ def test_a_motion_known_so_far_is_corrected(name: str, seen_from: Callable) -> N
 
 
 def test_in_the_dark_too(name: str, seen_from: Callable) -> None:
-    """At 0.02 photons per pixel and frame."""
+    """At 0.02 photons per pixel per frame."""
     motion = register(name, seen_from(SHIFT, 1, 0.04), seen_from(STILL, 2, 0.04))
     assert error_px(motion, SHIFT) < 3 * TOLERANCE_PX[name]
 

@@ -50,7 +50,7 @@ MOTIONS = {
 @pytest.mark.parametrize(("brightness", "tolerance_px"), [(1.0, 0.2), (0.2, 0.4)])
 @pytest.mark.parametrize("true", MOTIONS.values(), ids=MOTIONS)
 def test_it_finds_known_motions(seen_from: Callable, true: np.ndarray, brightness: float, tolerance_px: float) -> None:
-    """At 0.5 and 0.1 photons per pixel and frame, 250 frames; from moving to fixed, not the other way."""
+    """At 0.5 and 0.1 photons per pixel per frame, 250 frames; from moving to fixed, not the other way."""
     moving, fixed = seen_from(true, 1, brightness), seen_from(np.eye(3), 2, brightness)
     motion = located(register(moving, fixed))
     assert error_px(motion, true) < tolerance_px

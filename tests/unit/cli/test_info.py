@@ -33,7 +33,7 @@ def test_what_it_is_and_how_it_looks(cube: Path, invoke: Callable[..., Any]) -> 
     assert rows["capture"] == "200 binary frames of 96x160 at 96,800 Hz"
     assert rows["duration"] == "2.07 ms"
     flux, _, unit = rows["flux"].partition(" ")
-    assert unit == "photons per pixel and frame"
+    assert unit == "photons per pixel per frame"
     assert 0.5 < float(flux) < 2
     assert rows["hot pixels"].startswith(("none", "about "))
     assert rows["speed"].startswith("0.1 px a frame (the second fastest of ")

@@ -20,7 +20,7 @@ def test_a_folder_of_pictures(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("preview", "cube.npy", "-o", "look", "--group-size", "50", "--step", "75", "--white", "1.5")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == (
-        "look: 3 pictures of 200 binary frames of 96x160, 50 frames each\nwhite is 1.5 photons per pixel and frame\n"
+        "look: 3 pictures of 200 binary frames of 96x160, 50 frames each\nwhite is 1.5 photons per pixel per frame\n"
     )
     files = sorted((cube.parent / "look").iterdir())
     assert [file.name for file in files] == ["frame_000.png", "frame_075.png", "frame_150.png"]
