@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import translation
-from photonpano.photometry import Likeness
+from photonpano.photometry import Similarity
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.layers import Layer
 from photonpano_direct.pyramid import Pyramid, pyramid_of
@@ -76,7 +76,7 @@ class DirectLocator:
         return self._judged(homography, quality, scale, alike, contrast)
 
     def _judged(
-        self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: Likeness, contrast: float
+        self, homography: NDArray[np.float64], quality: Quality, scale: float, alike: Similarity, contrast: float
     ) -> Located | NotLocated:
         """Say what is to be said of an alignment, whose quality and contrast are those of a layer of this scale."""
         config, std_px = self._config, quality.std_px / scale
@@ -87,7 +87,7 @@ class DirectLocator:
             "overlap": quality.overlap,
             "pixel": 1 / scale,
         }
-        if reason := alike.objection(config.min_agreement):
+        if reason := alike.why_different(config.min_agreement):
             return NotLocated(reason, evidence)
         if quality.noise_ratio > max_noise_ratio:
             reason = f"after alignment the images differ by {quality.noise_ratio:.0f} times the photon noise, " + (

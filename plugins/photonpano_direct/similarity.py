@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, sample, seen_part
-from photonpano.photometry import Likeness, autocorrelation, likeness_of
+from photonpano.photometry import Similarity, autocorrelation, similarity_of
 from photonpano.values import FloatArray
 from photonpano_direct.layers import Layer
 
@@ -48,7 +48,7 @@ def details_of(layer: Layer) -> Details:
     return Details(image, layer.weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image))
 
 
-def agreement(moving: Details, fixed: Details, homography: NDArray[np.float64]) -> Likeness:
+def agreement(moving: Details, fixed: Details, homography: NDArray[np.float64]) -> Similarity:
     """Return how alike two images are under a motion.
 
     Args:
@@ -60,12 +60,12 @@ def agreement(moving: Details, fixed: Details, homography: NDArray[np.float64]) 
     _sum_up(moving, fixed, homography, sums)
     pixels, first, second, squares, products, others, weight, other_weight = sums
     if not pixels:
-        return Likeness(0.0, 0.0, 0.0)
+        return Similarity(0.0, 0.0, 0.0)
     covariance = np.array([[squares, products], [products, others]]) - np.outer([first, second], [first, second]) / pixels
     # Interpolation leaves 4/9 of the variance of white noise, on average over where between pixels it looks.
     noise = moving.gain * pixels / weight, 4 / 9 * fixed.gain * pixels / other_weight
     autocorrelations = moving.autocorrelation, fixed.autocorrelation
-    return likeness_of(covariance / max(1.0, pixels - 1), noise, pixels, pixels * min(1.0, moving.gain), autocorrelations)
+    return similarity_of(covariance / max(1.0, pixels - 1), noise, pixels, pixels * min(1.0, moving.gain), autocorrelations)
 
 
 @compiled

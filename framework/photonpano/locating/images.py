@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
 from photonpano.locating.configs import ImageLimits
 from photonpano.locating.viewing import View
-from photonpano.photometry import Likeness, autocorrelation, likeness_of
+from photonpano.photometry import Similarity, autocorrelation, similarity_of
 from photonpano.values import FloatArray, Homography, Located, NotLocated
 
 ALL = (0, 1, 2, 3, 4, 5, 6, 7)
@@ -76,7 +76,7 @@ def motion_from_images(
         )
     alike = _likeness(moving, there)
     found |= alike.evidence
-    if reason := alike.objection(limits.min_agreement):
+    if reason := alike.why_different(limits.min_agreement):
         return NotLocated(reason, found)
     weight = np.asarray(1 / (1 / moving.weight[both] + 1 / there.weight[both]), np.float32)
     squares = weight * np.square(moving.image[both] - there.image[both])
@@ -100,14 +100,14 @@ def motion_from_images(
     return Located(homography, to_step.T @ information @ to_step, std_px, found)
 
 
-def _likeness(moving: View, there: View) -> Likeness:
+def _likeness(moving: View, there: View) -> Similarity:
     """Return how alike two images on one grid are, in large px."""
     while moving.pixel < _JUDGED_PIXEL and min(moving.shape) >= 2 * _SMALLEST_SIDE:
         moving, there = moving.halved(), there.halved()
     both = moving.seen & there.seen
     pixels = int(np.count_nonzero(both))
     if not pixels:
-        return Likeness(0.0, 0.0, 0.0)
+        return Similarity(0.0, 0.0, 0.0)
     # Shadows and slopes that fill the image look alike wherever one looks.
     mask = both.astype(np.float32)
     norm = np.maximum(_surroundings(mask), np.float32(1e-6))
@@ -115,7 +115,7 @@ def _likeness(moving: View, there: View) -> Likeness:
         np.asarray((view.image - _surroundings(view.image * mask) / norm) * mask, np.float32) for view in (moving, there)
     ]
     noise = [view.noise_left * float(np.mean(1 / view.weight[both])) for view in (moving, there)]
-    return likeness_of(
+    return similarity_of(
         np.cov(details[0][both], details[1][both]),
         (noise[0], noise[1]),
         pixels,

@@ -94,7 +94,7 @@ def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homog
     if not both.any():
         return 0.0
     noise = float(first_variance[both].mean()), float(second_variance[both].mean())
-    return noise_free_correlation(first[both], second[both].astype(np.float32), noise, float(both.sum()))
+    return noise_free_correlation(np.cov(first[both], second[both].astype(np.float32)), noise, float(both.sum()))
 
 
 def _averages(exposure: VirtualExposure) -> tuple[FluxImage, FluxImage]:

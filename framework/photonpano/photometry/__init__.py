@@ -3,7 +3,13 @@
 from photonpano.photometry.contrast import signal_to_noise
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
 from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, IntensityResponse
-from photonpano.photometry.similarity import Likeness, autocorrelation, likeness_of, noise_free_correlation
+from photonpano.photometry.similarity import (
+    Similarity,
+    autocorrelation,
+    noise_free_correlation,
+    similarity_of,
+    without_local_mean,
+)
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
@@ -11,15 +17,16 @@ __all__ = [
     "BinarySumResponse",
     "BitOrder",
     "IntensityResponse",
-    "Likeness",
+    "Similarity",
     "autocorrelation",
-    "likeness_of",
     "linear_to_srgb",
     "noise_free_correlation",
     "packed_along_width",
     "packed_counts",
     "reversed_bits",
     "signal_to_noise",
+    "similarity_of",
     "srgb_to_linear",
     "tone_mapped",
+    "without_local_mean",
 ]

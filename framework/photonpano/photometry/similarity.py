@@ -1,4 +1,4 @@
-"""How alike two noisy images are, and whether chance would make them so."""
+"""Similarity of two aligned images: their correlation without photon noise, and whether chance explains it."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values import FloatArray
+from photonpano.values import BoolArray, FloatArray
 
-_FEWEST = 50
-"""Fewer independent pixels than this correlate by chance."""
-_STANDS_OUT = 5.0
-"""The variance of a scene exceeds that of the noise by at least so many of its standard errors."""
+_LOCAL_PX = 13
+"""Side of the square whose mean is subtracted from each pixel before images are compared, px."""
+_MIN_INDEPENDENT = 50
+"""With fewer independent pixels, a correlation is not estimated."""
+_MIN_SIGMA = 5.0
+"""Least variance of a scene, in standard errors of the variance of its noise."""
 _LAGS = 4
-"""Autocorrelations are known up to lags of the sides of an image over this."""
-_CHANCE = 5.5
-"""What an alignment finds is to agree by so many standard deviations of chance, since it looks for what agrees. Of 576 pairs of
-one place at flux 0.02 and 0.1, among them pale and blurred ones, those that `direct` aligned scored 6.6 and more; of 370 smears
-and pairs of different places none reached 5.2, and up to 0.77 in correlation. What repeats itself, as windows do, may pass."""
+"""The largest lag of an autocorrelation is the side of the image over this."""
+_MIN_SCORE = 5.5
+"""Least score of an accepted pair; high, because an alignment searches for the best correlation. Of 576 pairs of one place
+at flux 0.02 and 0.1, pale and blurred ones among them, those that `direct` aligned scored 6.6 and more; of 370 pairs of smears
+or of different places none reached 5.2, at correlations of up to 0.77. Repeated texture, such as windows, may pass."""
 
 
-class Likeness(NamedTuple):
-    """How alike two images are.
+class Similarity(NamedTuple):
+    """Similarity of two aligned images.
 
     Attributes:
-        correlation: what it would be without noise: 1 where they show the same, around 0 where they do not, and 0 where
-            nothing stands out from the noise.
-        structures: how many independent samples their pixels are worth; structures, where there is little noise.
-        score: the correlation that is seen, in standard deviations of what chance gives with so many.
+        correlation: correlation without noise: 1 for the same scene, around 0 for different ones, 0 where the variance of the
+            scene cannot be distinguished from that of the noise.
+        structures: effective number of independent samples.
+        score: significance of the observed correlation, in standard deviations of that of unrelated images.
     """
 
     correlation: float
@@ -39,72 +41,83 @@ class Likeness(NamedTuple):
     @property
     def evidence(self) -> dict[str, float]:
         """The numbers that decide, for the record."""
-        return {"agreement": self.correlation, "structures": self.structures}
+        return {"similarity": self.correlation, "structures": self.structures}
 
-    def objection(self, least: float) -> str | None:
-        """Return why images that were aligned do not show the same place; None if they do.
+    def why_different(self, min_correlation: float) -> str | None:
+        """Return why the images are not accepted as views of one place; None if they are.
 
         Args:
-            least: the correlation that is asked for.
+            min_correlation: the value of the option `min_agreement`.
         """
-        if self.correlation < least:
+        if self.correlation < min_correlation:
             if not self.correlation:
                 return "where the images overlap after alignment, nothing stands out from photon noise"
-            return f"after alignment the images agree by {self.correlation:.2f}, less than min_agreement = {least:g}"
-        if self.score < _CHANCE:
             return (
-                f"after alignment the images agree by {self.correlation:.2f}, but what they show amounts to "
-                f"{self.structures:.0f} independent structures, and so few may agree by chance"
+                f"after alignment the similarity of the images is {self.correlation:.2f}, "
+                f"less than min_agreement = {min_correlation:g}"
+            )
+        if self.score < _MIN_SCORE:
+            return (
+                f"after alignment the similarity of the images is {self.correlation:.2f}, but with {self.structures:.0f} "
+                "independent structures in them this may be chance"
             )
         return None
 
 
-def noise_free_correlation(
-    first: NDArray[np.float32], second: NDArray[np.float32], noise: tuple[float, float], independent: float
-) -> float:
+def without_local_mean(image: NDArray[np.float32], seen: BoolArray) -> NDArray[np.float32]:
+    """Subtract from each pixel the mean of the 13 px square around it.
+
+    Large shadows and gradients look alike in any two images; what remains is what distinguishes one place from another.
+
+    Args:
+        image: (H, W) float32.
+        seen: (H, W) False for pixels that count in no mean.
+
+    Returns:
+        (H, W) float32, 0 where not seen.
+    """
+    import cv2
+
+    def local_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(cv2.blur(values, (_LOCAL_PX, _LOCAL_PX)), np.float32)
+
+    mask = seen.astype(np.float32)
+    seen_share = np.maximum(local_mean(mask), np.float32(1e-6))
+    return np.asarray((image - local_mean(image * mask) / seen_share) * mask, np.float32)
+
+
+def noise_free_correlation(covariance: FloatArray, noise: tuple[float, float], independent: float) -> float:
     """Return the correlation that two images would have without their noise.
 
     Args:
-        first: (N,) pixels of one image.
-        second: (N,) what the other one shows there.
-        noise: the variance of the noise of a pixel of each.
-        independent: how many of the N pixels have noise of their own; fewer where images were blurred.
+        covariance: (2, 2) covariance of the pixels of both images.
+        noise: variance of the noise of a pixel of each image.
+        independent: number of pixels with independent noise; less than the number of pixels where images are blurred.
 
     Returns:
-        1 where they show the same; around 0 where they do not, and 0 where there are hardly any pixels, or nothing stands out
-        from the noise, so that any two places look alike.
+        1 for the same scene and around 0 for different ones; 0 where there are fewer than 50 independent pixels, or where the
+        scene does not stand out from the noise.
     """
-    return correlation_without_noise(np.cov(first, second), noise, independent)
-
-
-def correlation_without_noise(covariance: FloatArray, noise: tuple[float, float], independent: float) -> float:
-    """Return the correlation that two images would have without their noise; see `noise_free_correlation`.
-
-    Args:
-        covariance: (2, 2) that of the pixels of both images.
-        noise: the variance of the noise of a pixel of each.
-        independent: how many pixels have noise of their own.
-    """
-    if independent < _FEWEST:
+    if independent < _MIN_INDEPENDENT:
         return 0.0
     (first, both), (_, second) = np.asarray(covariance).tolist()
     scene = first - noise[0], second - noise[1]
-    if any(left < _STANDS_OUT * math.sqrt(2 / independent) * of for left, of in zip(scene, noise, strict=True)):
+    if any(signal < _MIN_SIGMA * math.sqrt(2 / independent) * variance for signal, variance in zip(scene, noise, strict=True)):
         return 0.0
     return float(both / math.sqrt(scene[0] * scene[1]))
 
 
 def autocorrelation(image: NDArray[np.float32]) -> FloatArray:
-    """Return the autocorrelation of an image at lags of up to a quarter of its sides, 1 at lag 0; all 0 for one that is flat.
+    """Return the autocorrelation of an image at lags of up to a quarter of its sides: 1 at lag 0, all 0 for a flat image.
 
     Args:
-        image: (H, W), of mean 0; 0 where it is not known.
+        image: (H, W), of mean 0; 0 where nothing was seen.
 
     Returns:
         (2 H // 4 + 1, W // 4 + 1): lags along y from the most negative to the largest, lags along x from 0.
     """
     down, across = (side // _LAGS for side in image.shape)
-    # So wide that what leaves at one side does not come back at the other, and of factors that are quick to transform.
+    # Padded against wrap-around, to a length whose transform is fast.
     shape = _rounded_up(image.shape[0] + down), _rounded_up(image.shape[1] + across)
     spectrum = np.fft.rfft2(image, shape)
     products = np.fft.irfft2(spectrum.real**2 + spectrum.imag**2, shape)
@@ -116,31 +129,30 @@ def _rounded_up(length: int) -> int:
     return -(-length // 32) * 32
 
 
-def likeness_of(
+def similarity_of(
     covariance: FloatArray,
     noise: tuple[float, float],
     pixels: float,
     independent: float,
     autocorrelations: tuple[FloatArray, FloatArray],
-) -> Likeness:
-    """Return how alike two aligned images are.
+) -> Similarity:
+    """Return the similarity of two aligned images.
 
-    Pixels that depend on each other tell less than their number: a correlation of two images with the autocorrelations a and b
-    has the variance of one between N / sum(a b) independent samples (Bartlett 1946), whose `arctanh` is normal with a standard
-    deviation of 1 / sqrt(samples - 3) (Fisher 1921).
+    With N pixels and the autocorrelations a and b, the correlation of unrelated images has the variance of N / sum(a b)
+    independent samples (Bartlett 1946); its `arctanh` is normal with standard deviation 1 / sqrt(samples - 3) (Fisher 1921).
 
     Args:
-        covariance: (2, 2) that of the pixels of both images.
-        noise: the variance of the noise of a pixel of each.
-        pixels: how many there are.
-        independent: how many of them have noise of their own; fewer where images were blurred.
+        covariance: (2, 2) covariance of the pixels of both images.
+        noise: variance of the noise of a pixel of each image.
+        pixels: number of pixels that both images show.
+        independent: number of pixels with independent noise; less than `pixels` where images are blurred.
         autocorrelations: those of both images, from `autocorrelation`.
     """
     first, second = autocorrelations
-    # Lags across are given from 0: all others count for their opposites, too.
+    # Lags along x start at 0: all others stand for their opposites, too.
     products = first * second
     area = 2 * products.sum() - products[:, 0].sum()
     structures = pixels / max(1.0, float(area))
-    seen = covariance[0, 1] / math.sqrt(max(covariance[0, 0] * covariance[1, 1], np.finfo(float).tiny))
-    score = math.atanh(min(float(seen), 1 - 1e-9)) * math.sqrt(max(0.0, structures - 3))
-    return Likeness(correlation_without_noise(covariance, noise, independent), structures, score)
+    observed = covariance[0, 1] / math.sqrt(max(covariance[0, 0] * covariance[1, 1], np.finfo(float).tiny))
+    score = math.atanh(min(float(observed), 1 - 1e-9)) * math.sqrt(max(0.0, structures - 3))
+    return Similarity(noise_free_correlation(covariance, noise, independent), structures, score)

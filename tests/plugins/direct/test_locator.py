@@ -141,7 +141,7 @@ def test_images_that_correlate_but_differ_by_more_than_noise_are_not_located(see
     """As when lamps flicker: the same scene, half as bright."""
     failure = register(seen_from(STILL, seed=1), seen_from(STILL, seed=2, brightness=0.5), STILL)
     assert isinstance(failure, NotLocated)
-    assert failure.evidence["agreement"] > 0.9
+    assert failure.evidence["similarity"] > 0.9
     assert "times the photon noise, more than max_noise_ratio = 100" in failure.reason
 
 

@@ -38,7 +38,7 @@ def test_the_right_motion_is_believed(seen_from: Callable, brightness: float) ->
     motion = located(judged(moving, fixed, SHIFT, evidence={"steps": 7.0}))
     assert motion.homography is SHIFT
     assert motion.evidence["steps"] == 7
-    assert motion.evidence["agreement"] > 0.9
+    assert motion.evidence["similarity"] > 0.9
     assert motion.evidence["noise_ratio"] == pytest.approx(1, abs=0.15)
     assert motion.evidence["overlap"] == pytest.approx((1 - 15 / 240) * (1 - 10 / 160), abs=0.02)
     assert motion.residual_px == pytest.approx(corner_std_px(motion))
@@ -91,8 +91,8 @@ def test_a_misalignment_costs_information(seen_from: Callable) -> None:
 def test_another_place_does_not_agree(seen_from: Callable, brightness: float) -> None:
     failure = judged(seen_from(translation(0, 330), 1, brightness), seen_from(STILL, 2, brightness), STILL)
     assert isinstance(failure, NotLocated)
-    alike = failure.evidence["agreement"]
-    assert failure.reason == f"after alignment the images agree by {alike:.2f}, less than min_agreement = 0.5"
+    alike = failure.evidence["similarity"]
+    assert failure.reason == f"after alignment the similarity of the images is {alike:.2f}, less than min_agreement = 0.5"
 
 
 def test_noise_does_not_agree(photograph: Callable) -> None:
