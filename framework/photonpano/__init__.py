@@ -1,8 +1,8 @@
 """photonpano: sharp panoramas from single-photon cameras.
 
-The names here are public: plugins and notebooks import them from `photonpano` and nowhere else, except for what
-`photonpano.geometry`, `photonpano.photometry`, `photonpano.merging`, `photonpano.locating` and `photonpano.reading` offer.
-Each is imported when it is first used, so that the help of the command line needs no numpy.
+These names are public, and so are those of `photonpano.geometry`, `photonpano.photometry`, `photonpano.merging`,
+`photonpano.locating`, `photonpano.reading` and `photonpano.compiling`. Plugins and notebooks import nothing else.
+A name is imported when it is first used, so that the help of the command line needs no numpy.
 """
 
 from typing import TYPE_CHECKING
@@ -49,9 +49,15 @@ if TYPE_CHECKING:
     from photonpano.registry import Catalog, discover
     from photonpano.specs import Plan, load_spec, parse_spec
     from photonpano.values import (
+        BoolArray,
         CaptureSummary,
+        Counts,
+        FloatArray,
+        FluxImage,
+        Frames,
         FrameSpan,
         Group,
+        Homography,
         Located,
         NotLocated,
         Panorama,
@@ -63,13 +69,19 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "BoolArray",
     "CanvasTooLargeError",
     "CaptureSummary",
     "CaptureUnreadError",
     "Catalog",
     "Config",
+    "Counts",
+    "FloatArray",
+    "FluxImage",
     "FrameSpan",
+    "Frames",
     "Group",
+    "Homography",
     "InputError",
     "Interpolator",
     "InterpolatorContribution",
@@ -113,6 +125,6 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
-    __getattr__ = imported_on_use(
+    __getattr__, __dir__ = imported_on_use(
         __name__, __all__, ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "specs")
     )

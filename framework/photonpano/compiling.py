@@ -1,36 +1,42 @@
-"""Loops over pixels and bits, compiled when they first run and kept on disk for the next process."""
+"""Compile loops over pixels and bits with numba; the machine code is kept on disk for the next process.
+
+Plugins may use `compiled` for their own loops. Modules that use it import numba: import them from `build`, not from hooks.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TypeVar, cast
 
 import numba
 from numba.core import event
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+__all__ = ["compiled", "notify_on_first_compile"]
 
-Function = TypeVar("Function", bound="Callable[..., object]")
+Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function that takes arrays and numbers. It lets other threads run meanwhile.
+    """Compile a function of arrays, numbers and named tuples of these, on its first call. It releases the GIL.
 
-    Inside, give pixels of a row by slices (`row = image[y]`, `part = row[start:stop]`) and count from 0, or by indices without
-    a sign: one that may be negative keeps a loop from being vectorised. What is smaller than a machine word grows to one in
-    every operation, unless it is cast back.
+    Loops are vectorised if pixels are read from slices of a row (`row = image[y]`, `part = row[start:stop]`) and the index
+    counts from 0: an index that may be negative prevents it. numba widens small integers to a machine word in every operation;
+    cast the result back.
+
+    The compiler may reorder sums and fuse multiplications with additions. NaN and infinity keep their meaning, and dividing by
+    zero gives one of them.
     """
     try:
         return cast("Function", _jit(True)(function))
-    except RuntimeError:  # nowhere to keep it: neither beside the module nor in a home
+    except RuntimeError:  # no folder can be written to: neither beside the module nor in a home
         return cast("Function", _jit(False)(function))
 
 
 @contextmanager
-def told_once(tell: Callable[[], None]) -> Iterator[None]:
-    """Call `tell` if something is compiled within the block that is not on the disk yet, before the first of it."""
-    listener = _Once(tell)
+def notify_on_first_compile(notify: Callable[[], None]) -> Iterator[None]:
+    """Call `notify` once, before the first function that must be compiled within the block; not for code kept on disk."""
+    listener = _Once(notify)
     register: Callable[[str, object], None] = event.register
     unregister: Callable[[str, object], None] = event.unregister
     register("numba:compile", listener)
@@ -41,19 +47,19 @@ def told_once(tell: Callable[[], None]) -> Iterator[None]:
 
 
 class _Once(event.Listener):
-    def __init__(self, tell: Callable[[], None]) -> None:
-        self._tell: Callable[[], None] | None = tell
+    def __init__(self, notify: Callable[[], None]) -> None:
+        self._notify: Callable[[], None] | None = notify
 
     def on_start(self, event: object) -> None:
         del event
-        if self._tell is not None:
-            tell, self._tell = self._tell, None
-            tell()
+        if self._notify is not None:
+            notify, self._notify = self._notify, None
+            notify()
 
     def on_end(self, event: object) -> None:
         del event
 
 
 def _jit(cache: bool) -> Callable[[Function], object]:
-    # Sums may be taken in another order, which vectors need; what is not a number stays that.
+    # No "nnan" and "ninf": NaN stands for pixels without a value.
     return numba.njit(cache=cache, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})

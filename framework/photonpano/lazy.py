@@ -1,4 +1,4 @@
-"""Packages whose names are imported when they are first used: what only lists plugins needs no heavy library."""
+"""Lazy attribute import for packages (PEP 562)."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -7,13 +7,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 
-def imported_on_use(package: str, names: "Sequence[str]", modules: "Sequence[str]") -> "Callable[[str], object]":
-    """Return what a package calls `__getattr__`.
+def imported_on_use(
+    package: str, names: "Sequence[str]", modules: "Sequence[str]"
+) -> "tuple[Callable[[str], object], Callable[[], list[str]]]":
+    """Return the `__getattr__` and `__dir__` of a package that imports names when they are first used.
 
     Args:
-        package: its name.
-        names: what it offers, its `__all__`.
-        modules: those of its modules that define the names, light ones first: they are asked in this order.
+        package: the name of the package.
+        names: its public names, for `dir`.
+        modules: its modules that define names, searched in this order: light ones first.
     """
 
     def attribute(name: str) -> object:
@@ -24,4 +26,4 @@ def imported_on_use(package: str, names: "Sequence[str]", modules: "Sequence[str
                     return getattr(module, name)
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
-    return attribute
+    return attribute, lambda: list(names)

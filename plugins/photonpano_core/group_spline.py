@@ -6,13 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from photonpano import LocationError
+from photonpano import FloatArray, LocationError
 from photonpano.geometry import normalised
 from photonpano_core.extrapolation import HeldTrajectory
 from photonpano_core.lucas_kanade import interpolating_spline
 from photonpano_core.sl3 import exponential, logarithm, unimodular
-
-FloatArray = NDArray[np.float64]
 
 
 class GroupTrajectory(HeldTrajectory):

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import splu
 
-from photonpano import LocationError
+from photonpano import FloatArray, LocationError
 from photonpano.geometry import apply, corners, inverse
 from photonpano_core.configs import LieConfig
 from photonpano_core.group_spline import GroupTrajectory
 from photonpano_core.lucas_kanade import interpolating_spline
 from photonpano_core.sl3 import exponential, logarithm, unimodular
-
-FloatArray = NDArray[np.float64]
 
 DEGREE = 3
 MAX_ITERATIONS = 50

@@ -7,9 +7,8 @@ one of the algebra sl(3). Nothing here depends on the unit of a pixel, or on whe
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from photonpano import FloatArray
 
 _TERMS = 19
 """Of the exponential series where eigenvalues are below 1: what is left out is below 1 / 19!, a rounding error."""

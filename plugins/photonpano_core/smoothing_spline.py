@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_banded
 
+from photonpano import FloatArray
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
 from photonpano_core.configs import SmoothingSplineConfig
 from photonpano_core.lucas_kanade import ParameterTrajectory, interpolating_spline
-
-FloatArray = NDArray[np.float64]
 
 ORDER = 3
 """Of the derivative that is penalised. A parabola, which fits any three knots, goes free."""

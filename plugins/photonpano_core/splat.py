@@ -7,13 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FrameSpan, Group, InputError, LinearlyCorrectedSource, Source, Trajectory, VirtualExposure
+from photonpano import FloatArray, FrameSpan, Group, InputError, LinearlyCorrectedSource, Source, Trajectory, VirtualExposure
 from photonpano.geometry import apply, corners, inverse
 from photonpano.merging import PhotonSum
 from photonpano_core.exposures import scaled_shape, summed_as_they_lie, to_exposure
 from photonpano_core.splatting import add_coverage, splat
-
-FloatArray = NDArray[np.float64]
 
 _READ_BYTES = 1024**2
 """So much of unpacked frames is held at a time: about what a core's cache holds."""

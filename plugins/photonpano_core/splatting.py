@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import seen_part
+from photonpano.geometry import visible_columns
 
 Frames = NDArray[np.unsignedinteger[Any]]
 
@@ -103,8 +103,8 @@ def add_coverage(
     rows, columns = total.shape
     for h in to_frame:
         for y in range(rows):
-            first, last = seen_part(h, y, -1.0, width, -1.0, height, columns)
-            inside, outside = seen_part(h, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
+            first, last = visible_columns(h, y, -1.0, width, -1.0, height, columns)
+            inside, outside = visible_columns(h, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
             if inside >= outside:
                 inside = outside = last
             steps[y, inside] += 1

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry.shapes import fault
+from photonpano.geometry import violation
 from photonpano_direct.curvature import ALONG_X, ALONG_Y, by_chance, curvatures, expected_px
 from photonpano_direct.layers import Layer
 from photonpano_direct.moments import Buffers, look
@@ -103,7 +103,7 @@ def descend(
         before, least, damping = homography, differs, damping / 2
         homography = scaled_to_one(product(homography, inverse_homography(step)))
         # A descent that leaves what a camera can do may come back to it, but not to the truth.
-        if fault(homography, height, width)[0]:
+        if violation(homography, height, width)[0]:
             return DIVERGED, homography, pixels, squares, weights
         # Steps shrink by about the same share each time: the next one is told from this one and the last.
         if size_px * (min(1.0, size_px / last_px) if last_px > 0 else 1.0) < max(tolerance_px, _NEGLIGIBLE * std_px):

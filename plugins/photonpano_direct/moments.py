@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import run_from, sample, seen_part
+from photonpano.geometry import run_from, sample_run, visible_columns
 from photonpano_direct.layers import Layer
 
 
@@ -96,7 +96,7 @@ def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: in
     height, width = fixed.image.shape
     image, weight, residual, combined = moving.image[y], moving.weight[y], buffers.residual[y], buffers.weight[y]
     zero, tiny = np.float32(0), np.float32(1e-20)
-    first, last = seen_part(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
+    first, last = visible_columns(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
     for x in range(first):
         residual[x], combined[x] = zero, zero
     for x in range(last, width):
@@ -104,9 +104,9 @@ def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: in
     x = first
     while x < last:
         run = run_from(homography, x, y, last - x, height, width)
-        sample(fixed.image, run, residual[x : x + run.size])
+        sample_run(fixed.image, run, residual[x : x + run.size])
         # Interpolated too: from the nearest pixel, the border would jump.
-        sample(fixed.weight, run, combined[x : x + run.size])
+        sample_run(fixed.weight, run, combined[x : x + run.size])
         x += run.size
     # One loop for each image that is written to, since only such loops are vectorised.
     image, weight, residual, combined = image[first:last], weight[first:last], residual[first:last], combined[first:last]

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano import FloatArray
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import run_from, sample, seen_part
+from photonpano.geometry import run_from, sample_run, visible_columns
 from photonpano.photometry import Similarity, autocorrelation, similarity_of
-from photonpano.values import FloatArray
 from photonpano_direct.layers import Layer
 
 _SURROUNDINGS_PX = 13
@@ -75,12 +75,12 @@ def _sum_up(moving: Details, fixed: Details, homography: NDArray[np.float64], su
     there, there_weight = np.empty(width, np.float32), np.empty(width, np.float32)
     sums[:] = 0
     for y in range(height):
-        first, last = seen_part(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
+        first, last = visible_columns(homography, y, 0.0, width - 1.0, 0.0, height - 1.0, width)
         x = first
         while x < last:
             run = run_from(homography, x, y, last - x, height, width)
-            sample(fixed.image, run, there[x : x + run.size])
-            sample(fixed.weight, run, there_weight[x : x + run.size])
+            sample_run(fixed.image, run, there[x : x + run.size])
+            sample_run(fixed.weight, run, there_weight[x : x + run.size])
             x += run.size
         here, here_weight = moving.image[y], moving.weight[y]
         for x in range(first, last):

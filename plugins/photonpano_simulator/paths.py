@@ -9,9 +9,8 @@ Convention:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano import InputError
+from photonpano import FloatArray, InputError
 from photonpano.geometry import apply, corners, normalised
 from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.config import (
@@ -25,8 +24,6 @@ from photonpano_simulator.config import (
     SplinePath,
 )
 from photonpano_simulator.files import read_homographies
-
-FloatArray = NDArray[np.float64]
 
 _DENSE = 100_000
 """Points of a curve before it is sampled at constant speed: the error is far below a thousandth of a pixel."""

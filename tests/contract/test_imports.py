@@ -6,9 +6,14 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
+
+import photonpano
+import photonpano.geometry
+import photonpano.locating
 
 HEAVY = ("cv2", "h5py", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia", "pycolmap")
 COMMANDS = ["--help", "plugins list", "plugins show direct", "schema", "check scan.yaml"]
@@ -39,15 +44,24 @@ def test_the_package_imports_nothing_at_all() -> None:
     assert imported_by("import photonpano") & {*HEAVY, "numpy", "pydantic", "pluggy", "rich", "typer"} == set()
 
 
+@pytest.mark.parametrize("package", [photonpano, photonpano.geometry, photonpano.locating], ids=lambda each: each.__name__)
+def test_dir_of_lazy_package_lists_public_names(package: ModuleType) -> None:
+    assert dir(package) == sorted(package.__all__)
+    assert all(getattr(package, name) is not None for name in package.__all__)
+
+
 @pytest.mark.parametrize(
     "statement",
     [
         "import photonpano_colmap.hooks",
         "import photonpano_core.hooks",
+        "import photonpano_direct.hooks",
         "import photonpano_kornia.hooks",
         "import photonpano_opencv.hooks",
         "import photonpano_sensors.hooks",
         "import photonpano_simulator.hooks",
+        "import photonpano.geometry",
+        "import photonpano.photometry",
         "from photonpano.registry import discover; discover()",
         "import photonpano.cli",
     ],

@@ -60,9 +60,10 @@ def test_every_extra_is_what_a_component_asks_for() -> None:
         set(TOOLS["importlinter"]["root_packages"]) - {"photonpano"},
         set(CONTRACTS["the framework never imports a plugin"]["forbidden_modules"]),
         set(CONTRACTS["plugins do not know each other"]["modules"]),
+        set(CONTRACTS["plugins import public names only"]["source_modules"]),
         {module.partition(".")[0] for module in PROJECT["project"]["entry-points"]["photonpano"].values()} - {"photonpano"},
     ],
-    ids=["wheel", "mypy", "import-linter", "forbidden to the framework", "independent", "entry points"],
+    ids=["wheel", "mypy", "import-linter", "forbidden to the framework", "independent", "public names only", "entry points"],
 )
 def test_every_plugin_is_shipped_and_checked(listed: set[str]) -> None:
     assert listed == PLUGINS

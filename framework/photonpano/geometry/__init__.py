@@ -1,5 +1,7 @@
 """Pure functions on homographies and canvases: points are (x, y), integers are pixel centres, maps are float64."""
 
+from typing import TYPE_CHECKING
+
 from photonpano.geometry.alignment import align_planes
 from photonpano.geometry.canvas import Canvas, canvas_of
 from photonpano.geometry.homographies import (
@@ -17,9 +19,15 @@ from photonpano.geometry.homographies import (
 )
 from photonpano.geometry.plausibility import implausibility
 from photonpano.geometry.steps import generators, slopes, unit_coordinates
+from photonpano.lazy import imported_on_use
+
+if TYPE_CHECKING:
+    from photonpano.geometry.sampling import Run, run_from, sample_run, visible_columns
+    from photonpano.geometry.shapes import violation
 
 __all__ = [
     "Canvas",
+    "Run",
     "align_planes",
     "apply",
     "canvas_of",
@@ -34,7 +42,14 @@ __all__ = [
     "parameters",
     "rescaled",
     "rescaling",
+    "run_from",
+    "sample_run",
     "slopes",
     "translation",
     "unit_coordinates",
+    "violation",
+    "visible_columns",
 ]
+
+if not TYPE_CHECKING:  # the compiled functions: numba is imported when one of them is used
+    __getattr__, __dir__ = imported_on_use(__name__, __all__, ("sampling", "shapes"))

@@ -21,7 +21,7 @@ def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: 
     from photonpano.geometry import shapes  # compiled
 
     homography = np.ascontiguousarray(homography, dtype=np.float64)
-    kind, number = shapes.fault(homography, *shape)
+    kind, number = shapes.violation(homography, *shape)
     if kind != shapes.PLAUSIBLE:
         return {
             shapes.INFINITE: "the homography is not finite",

@@ -40,7 +40,7 @@ class Run(NamedTuple):
 
 
 @compiled
-def seen_part(
+def visible_columns(
     to_image: NDArray[np.float64], y: int, left: float, right: float, top: float, bottom: float, width: int
 ) -> tuple[int, int]:
     """Return the pixels of a row, half-open, that see a rectangle of the image, border included."""
@@ -107,7 +107,7 @@ def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: i
 
 
 @compiled
-def sample(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
+def sample_run(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
     """Interpolate an image linearly along a run.
 
     Args:

@@ -17,7 +17,7 @@ ratio of opposite sides."""
 
 
 @compiled
-def fault(homography: NDArray[np.float64], height: int, width: int) -> tuple[int, float]:
+def violation(homography: NDArray[np.float64], height: int, width: int) -> tuple[int, float]:
     """Tell why a homography cannot be that between two images of one camera, and the number that tells it.
 
     Args:

@@ -46,4 +46,4 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
-    __getattr__ = imported_on_use(__name__, __all__, ("configs", "fitting", "images", "points", "viewing"))
+    __getattr__, __dir__ = imported_on_use(__name__, __all__, ("configs", "fitting", "images", "points", "viewing"))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import Pixels, run_from, sample, seen_part
+from photonpano.geometry.sampling import Pixels, run_from, sample_run, visible_columns
 
 
 @compiled
@@ -29,7 +29,7 @@ def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.f
         x = inside
         while x < outside:
             run = run_from(to_image, x, y, outside - x, image.shape[0], image.shape[1])
-            sample(image, run, seen[x : x + run.size])
+            sample_run(image, run, seen[x : x + run.size])
             x += run.size
         between, found = row[inside:outside], seen[inside:outside]
         for t in range(len(between)):
@@ -100,8 +100,8 @@ def _parts(shape: tuple[int, int], to_image: NDArray[np.float64], y: int, column
         it ceases to matter.
     """
     height, width = shape
-    first, last = seen_part(to_image, y, -1.0, width, -1.0, height, columns)
-    inside, outside = seen_part(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
+    first, last = visible_columns(to_image, y, -1.0, width, -1.0, height, columns)
+    inside, outside = visible_columns(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
     if inside >= outside:
         return first, last, last, last
     return first, inside, outside, last

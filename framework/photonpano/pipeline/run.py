@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.captures.summary import require_photons
-from photonpano.compiling import told_once
+from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress
 from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
@@ -114,7 +114,7 @@ def execute(
         raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
     decisions = [*plan.decisions, *(corrected.decisions if corrected else ())]
     levels = build_levels(plan, source, decisions)
-    with one_thread_inside(), told_once(partial(progress.note, COMPILING)):
+    with one_thread_inside(), notify_on_first_compile(partial(progress.note, COMPILING)):
         results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged)
     if plan.until_converged:
         decisions.append(levels_decision(results))

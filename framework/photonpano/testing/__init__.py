@@ -44,4 +44,4 @@ _MODULES = ("scenes", "captures", "sources", "resamplers", "mergers", "locators"
 """Where the public names are defined."""
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
-    __getattr__ = imported_on_use(__name__, __all__, _MODULES)
+    __getattr__, __dir__ = imported_on_use(__name__, __all__, _MODULES)
