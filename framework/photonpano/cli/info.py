@@ -36,13 +36,11 @@ def info(
     from photonpano.cli.capture import opened
     from photonpano.cli.outcome import warn
     from photonpano.cli.wording import columns
-    from photonpano.motion.attribution import AttributedSource
-    from photonpano.pipeline.components import origin_of
 
     # Whatever a spec says of groups, what the capture asks for is told.
     overrides = ["resample={use: midpoint}", "levels=1"]
     with opened(path, source, keys, corrections, overrides) as (plan, capture):
-        facts = _facts(plan, AttributedSource(capture, origin_of(plan.source)))
+        facts = _facts(plan, capture)
     if as_json:
         typer.echo(json.dumps(facts, indent=2))
         return

@@ -58,12 +58,10 @@ def preview(
     from photonpano.cli.capture import opened
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.wording import capture_words
-    from photonpano.motion.attribution import AttributedSource
-    from photonpano.pipeline.components import origin_of
     from photonpano.threads import one_thread_inside, thread_count
 
-    with opened(path, source, keys, corrections) as (plan, read), one_thread_inside():
-        threads, capture = thread_count(plan.run.threads), AttributedSource(read, origin_of(plan.source))
+    with opened(path, source, keys, corrections) as (plan, capture), one_thread_inside():
+        threads = thread_count(plan.run.threads)
         spans = preview_spans(capture.info, group_size, step or group_size)
         require_writable(output, len(spans))
         look = Look(white_flux(capture, spans, quantile, threads) if white is None else white, srgb, label)

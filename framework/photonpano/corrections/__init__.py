@@ -17,7 +17,7 @@ from photonpano.corrections.geometry import (
 from photonpano.corrections.hot_pixels import HotPixels, hot_in_the_dark
 from photonpano.corrections.masks import ColourFilter, Mask
 from photonpano.corrections.pixels import Correction
-from photonpano.corrections.source import CorrectedSource
+from photonpano.corrections.source import CorrectedSource, corrected_source
 
 CORRECTIONS: dict[str, type[Correction]] = {
     correction.name: correction
@@ -37,6 +37,7 @@ __all__ = [
     "DarkCounts",
     "DarkFrames",
     "HotPixels",
+    "corrected_source",
     "hot_in_the_dark",
     "measure_dark",
     "read_dark",

@@ -5,21 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.contributions import Config
 from photonpano.errors import InputError
+from photonpano.protocols import Source
+from photonpano.values import BoolArray, FluxImage
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano.protocols import Source
-    from photonpano.values import BoolArray, FluxImage
-
-    Index: TypeAlias = NDArray[np.intp]
-
+Index: TypeAlias = NDArray[np.intp]
 Decide: TypeAlias = Callable[[str, int, str], None]
 """Is told what was chosen, its value, and the reason."""
 MISSING = -1

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from photonpano.corrections.pixels import MISSING, Pixels, numbered
+from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pixels, numbered
 from photonpano.errors import InputError
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource
-from photonpano.values import Decision
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from photonpano.corrections.pixels import Correction, Decide, Index
-    from photonpano.protocols import Source
-    from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
+from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source
+from photonpano.source_wrapper import ArrayT, SourceWrapper, with_capabilities
+from photonpano.values import BoolArray, Counts, Decision, FluxImage, FrameSpan, StreamInfo
 
 _TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
 _CORNER_WEIGHT = 0.5
@@ -60,81 +53,92 @@ def apply_corrections(
     return pixels
 
 
-class CorrectedSource:
-    """A source whose frames are rearranged, and whose mask and sums are those of the corrected sensor.
+def corrected_source(
+    source: Source, corrections: Sequence[Correction], blame: Callable[[int, str], Exception] | None = None
+) -> CorrectedSource:
+    """Return a source with corrections.
 
-    Frames and counts stay whole numbers, as they were recorded. What has to be taken out of sums `corrected` takes out; where
-    there is nothing, it does not have that method, as it has `packed` only if the source has.
+    It has `packed` if the source has, and `corrected` if a correction changes sums of frames.
 
-    Attributes:
-        decisions: what was chosen because of what the capture shows; complete once `valid` has been asked for.
+    Args:
+        source: the capture as it is read; closing the corrected source closes it.
+        corrections: in the order in which they are applied.
+        blame: see `apply_corrections`.
 
     Raises:
-        InputError: see `apply_corrections`. What depends on frames is found out when `valid` is first asked for.
+        InputError: see `apply_corrections`. What depends on frames is checked when `valid` is first read.
     """
+    capabilities: list[type[SourceWrapper]] = [_PackedFrames] if isinstance(source, PackedSource) else []
+    if any(correction.changes_sums for correction in corrections):
+        capabilities.append(_CorrectedSums)
+    return with_capabilities(CorrectedSource, capabilities)(source, corrections, blame)
 
-    packed: Callable[[FrameSpan], NDArray[np.uint8]]
-    corrected: Callable[[Counts, int], FluxImage]
+
+class CorrectedSource(SourceWrapper):
+    """A source whose frames are rearranged and whose bad pixels are masked: made by `corrected_source`.
+
+    Frames and counts stay whole numbers, as they were recorded.
+
+    Attributes:
+        decisions: what was chosen because of what the capture shows; complete once `valid` has been read.
+    """
 
     def __init__(
         self, source: Source, corrections: Sequence[Correction], blame: Callable[[int, str], Exception] | None = None
     ) -> None:
-        """Correct a source.
-
-        Args:
-            source: the capture as it is read; it is closed with this one.
-            corrections: in the order in which they are applied.
-            blame: see `apply_corrections`.
-        """
-        self._source, self._corrections, self._blame = source, tuple(corrections), blame
+        super().__init__(source)
+        self._corrections, self._blame = tuple(corrections), blame
         index = apply_corrections(source, corrections, blame=blame).index
-        self._gather = _Gather(index, source.info.frame_shape)
+        self.gather = _Gather(index, source.info.frame_shape)
         self._estimate: _Estimate | None = None
         self._lock = Lock()
         self.decisions: list[Decision] = []
-        self.info: StreamInfo = replace(source.info, height=index.shape[0], width=index.shape[1])
-        self.response: Response = source.response
-        if isinstance(source, PackedSource):
-            self.packed = lambda span: self._packed(source, span)
-        if any(correction.changes_sums for correction in corrections):
-            self.corrected = lambda counts, n_frames: self._estimated().corrected(counts, n_frames)
+        self._info = replace(source.info, height=index.shape[0], width=index.shape[1])
+
+    @property
+    def info(self) -> StreamInfo:
+        """Frames, size, rate."""
+        return self._info
 
     @property
     def valid(self) -> BoolArray:
         """(H, W) mask."""
-        return self._estimated().valid
+        return self.estimate().valid
 
-    def counts(self, span: FrameSpan) -> Counts:
-        """Sum the frames of a span: (H, W) uint32."""
-        return self._gather(self._source.counts(span))
+    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+        """See `SourceWrapper`."""
+        del shape
+        gathered: ArrayT = self.gather(method(span))
+        return gathered
 
-    def frames(self, span: FrameSpan) -> Frames:
-        """Return the frames of a span one by one: (n, H, W)."""
-        return self._gather(self._source.frames(span))
-
-    def close(self) -> None:
-        """Let go of the capture."""
-        self._source.close()
-
-    def __enter__(self) -> CorrectedSource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
-    def _packed(self, source: PackedSource, span: FrameSpan) -> NDArray[np.uint8]:
-        return source.packed(span) if self._gather.identity else np.packbits(self.frames(span), axis=-1)
-
-    def _estimated(self) -> _Estimate:
-        """Return what is known of the pixels, after a look at the capture if a correction asks for it."""
+    def estimate(self) -> _Estimate:
+        """Return what is estimated of the pixels; the first call reads frames if a correction needs them."""
         with self._lock:
             if self._estimate is None:
-                pixels = apply_corrections(self._source, self._corrections, self._decide, self._blame)
+                pixels = apply_corrections(self.wrapped, self._corrections, self._decide, self._blame)
                 self._estimate = _Estimate.of(pixels, self.info.kind == "binary")
             return self._estimate
 
     def _decide(self, what: str, value: int, reason: str) -> None:
         self.decisions.append(Decision(what, value, reason))
+
+
+class _PackedFrames(CorrectedSource):
+    """What a corrected source offers if the capture is packed."""
+
+    wrapped: PackedSource
+
+    def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span, eight pixels to a byte: see `PackedSource`."""
+        return self.wrapped.packed(span) if self.gather.identity else np.packbits(self.frames(span), axis=-1)
+
+
+class _CorrectedSums(CorrectedSource):
+    """What a corrected source offers if a correction changes sums of frames."""
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """Take everything but the flux out of a sum of frames: see `LinearlyCorrectedSource`."""
+        return self.estimate().corrected(counts, n_frames)
 
 
 class _Gather:
@@ -146,7 +150,7 @@ class _Gather:
         self._slices = _slices(index, frame_shape)
         self.identity = bool(np.array_equal(index, numbered(frame_shape)))
 
-    def __call__(self, frames: NDArray[Any]) -> NDArray[Any]:
+    def __call__(self, frames: Any) -> Any:
         """Gather the pixels of (..., h, w) frames: (..., H, W), 0 where the sensor has none."""
         if self._slices is not None:
             return np.ascontiguousarray(frames[..., self._slices[0], self._slices[1]])

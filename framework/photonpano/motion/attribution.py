@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from photonpano.errors import PhotonpanoError, PluginError
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source, Trajectory
-from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Response, StreamInfo
-
-ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
+from photonpano.protocols import Source, Trajectory
+from photonpano.source_wrapper import ArrayT, SourceWrapper, capabilities_of, with_capabilities
+from photonpano.values import FloatArray, FrameSpan
 
 
 @contextmanager
@@ -36,75 +33,32 @@ def attributing(origin: str, level: int) -> Iterator[None]:
         raise PluginError(f"{origin} failed at level {level}: {type(error).__name__}: {error}") from error
 
 
-class AttributedSource:
-    """A source that is named in what it raises by mistake, whoever reads it: a merger, the renderer, a look at the capture.
+def attributed(source: Source, origin: str) -> AttributedSource:
+    """Return a source whose errors name the plugin, whether a merger, the renderer or a preview reads it.
 
-    It has `packed` and `corrected` if the source has them.
+    It has the methods `packed`, `corrected` and `truth` if the source has them.
 
     Args:
         source: the source.
         origin: who provides it, such as "source 'packed-npy' of photonpano 0.1.0".
     """
+    return with_capabilities(AttributedSource, capabilities_of(source))(source, origin)
 
-    packed: Callable[[FrameSpan], NDArray[np.uint8]]
-    corrected: Callable[[Counts, int], FluxImage]
+
+class AttributedSource(SourceWrapper):
+    """A source that names its plugin in errors: made by `attributed`.
+
+    Reading a span raises a `PluginError` if the source failed with an exception that is not for users, or broke its contract.
+    """
 
     def __init__(self, source: Source, origin: str) -> None:
-        self._source = source
+        super().__init__(source)
         self._origin = origin
-        if isinstance(source, PackedSource):
-            self.packed = lambda span: self._packed(source, span)
-        if isinstance(source, LinearlyCorrectedSource):
-            self.corrected = source.corrected
 
-    @property
-    def info(self) -> StreamInfo:
-        """Frames, size, rate."""
-        return self._source.info
-
-    @property
-    def response(self) -> Response:
-        """How flux becomes counts."""
-        return self._source.response
-
-    @property
-    def valid(self) -> BoolArray:
-        """(H, W) mask."""
-        return self._source.valid
-
-    def counts(self, span: FrameSpan) -> Counts:
-        """Sum the frames of a span.
-
-        Raises:
-            PluginError: the source failed in its own way, or broke its contract.
-        """
-        return self._checked(self._source.counts, span, self.info.frame_shape)
-
-    def frames(self, span: FrameSpan) -> Frames:
-        """Return the frames of a span.
-
-        Raises:
-            PluginError: the source failed in its own way, or broke its contract.
-        """
-        return self._checked(self._source.frames, span, (len(span), *self.info.frame_shape))
-
-    def close(self) -> None:
-        """Let go of files."""
-        self._source.close()
-
-    def __enter__(self) -> AttributedSource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
-    def _packed(self, source: PackedSource, span: FrameSpan) -> NDArray[np.uint8]:
-        height, width = self.info.frame_shape
-        return self._checked(source.packed, span, (len(span), height, -(-width // 8)))
-
-    def _checked(self, read: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+        """See `SourceWrapper`."""
         try:
-            found = read(span)
+            found = method(span)
         except PhotonpanoError:
             raise
         except Exception as error:

@@ -9,9 +9,9 @@ from functools import cache
 from typing import Any, TypeVar, cast
 
 from photonpano.contributions import Contribution, SourceContext, StageContext
-from photonpano.corrections import CorrectedSource
+from photonpano.corrections import corrected_source
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
-from photonpano.motion.attribution import AttributedSource, attributing
+from photonpano.motion.attribution import attributed, attributing
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.protocols import Resampler, Source
 from photonpano.specs.plan import Choice, Plan
@@ -36,7 +36,8 @@ def build_source(plan: Plan) -> Source:
         SpecError: a correction does not suit the capture, or its file is not what it should be.
     """
     try:
-        source: Source = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
+        built = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
+        source = attributed(built, origin_of(plan.source))
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
@@ -51,7 +52,7 @@ def build_source(plan: Plan) -> Source:
         return SpecError([plan.places.get(where, Place(where)).problem(message)])
 
     try:
-        return CorrectedSource(AttributedSource(source, origin_of(plan.source)), plan.corrections, blame)
+        return corrected_source(source, plan.corrections, blame)
     except BaseException:
         source.close()
         raise

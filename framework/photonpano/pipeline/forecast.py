@@ -5,20 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano.context import Context
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.record import peak_memory_bytes
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source
+from photonpano.protocols import Source
+from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
-from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
+from photonpano.values import FrameSpan, StreamInfo
 
 TRIAL_GROUPS = 12
 """So many groups of the first level, from the middle of the capture, are run through all levels."""
@@ -47,42 +46,33 @@ class Forecast:
     canvas: tuple[int, int]
 
 
-class PartOfSource:
-    """Some frames of a capture, numbered from 0. It has `packed` and `corrected` if the capture has them."""
+def part_of(source: Source, span: FrameSpan) -> PartOfSource:
+    """Return some frames of a capture as a source, with `packed` and `corrected` if the capture has them."""
+    capabilities = [each for each in capabilities_of(source) if each is not TruthWrapper]
+    return with_capabilities(PartOfSource, capabilities)(source, span)
 
-    packed: Callable[[FrameSpan], NDArray[np.uint8]]
-    corrected: Callable[[Counts, int], FluxImage]
+
+class PartOfSource(SourceWrapper):
+    """Some frames of a capture, numbered from 0: made by `part_of`. Closing it leaves the capture open."""
 
     def __init__(self, source: Source, span: FrameSpan) -> None:
-        self._source, self._start = source, span.start
-        self.info: StreamInfo = replace(source.info, n_frames=len(span))
-        self.response: Response = source.response
-        self.valid: BoolArray = source.valid
-        if isinstance(source, PackedSource):
-            self.packed = lambda span: source.packed(self._there(span))
-        if isinstance(source, LinearlyCorrectedSource):
-            self.corrected = source.corrected
+        super().__init__(source)
+        self._start = span.start
+        self._info = replace(source.info, n_frames=len(span))
 
-    def counts(self, span: FrameSpan) -> Counts:
-        """Sum the frames of a span: (H, W) uint32."""
-        return self._source.counts(self._there(span))
+    @property
+    def info(self) -> StreamInfo:
+        """Frames, size, rate."""
+        return self._info
 
-    def frames(self, span: FrameSpan) -> Frames:
-        """Return the frames of a span one by one: (n, H, W)."""
-        return self._source.frames(self._there(span))
+    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+        """See `SourceWrapper`."""
+        del shape
+        self.info.require(span)
+        return method(FrameSpan(span.start + self._start, span.stop + self._start))
 
     def close(self) -> None:
-        """Do nothing: the capture belongs to somebody else."""
-
-    def __enter__(self) -> PartOfSource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
-    def _there(self, span: FrameSpan) -> FrameSpan:
-        self.info.require(span)
-        return FrameSpan(span.start + self._start, span.stop + self._start)
+        """Do nothing: the capture stays open."""
 
 
 def forecast(plan: Plan, source: Source) -> Forecast:
@@ -94,9 +84,9 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
     groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch(threads))
     length = float(np.median([len(group.span) for group in groups]))
-    _tried(plan, PartOfSource(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), threads)
+    _tried(plan, part_of(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), threads)
     span = _middle(n_frames, round(TRIAL_GROUPS * length))
-    part, more = PartOfSource(source, span), n_frames / len(span)
+    part, more = part_of(source, span), n_frames / len(span)
     results = _tried(plan, part, threads)
     seconds = {f"level {result.level.number}": sum(result.seconds.values()) * more for result in results}
     start = time.perf_counter()

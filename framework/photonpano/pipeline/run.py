@@ -19,10 +19,9 @@ from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas
 from photonpano.merging.panorama import Overview, Tile, plan_canvas, render_tiles, tiles_of
-from photonpano.motion.attribution import AttributedSource
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.components import build_levels, origin_of
+from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.observers import NOBODY, Observers
 from photonpano.pipeline.record import (
     level_record,
@@ -103,7 +102,6 @@ def execute(
     """
     start = time.perf_counter()
     corrected = source if isinstance(source, CorrectedSource) else None
-    source = AttributedSource(source, origin_of(plan.source))
     context = Context(thread_count(plan.run.threads), progress, observers.level_finished)
     stream = source.info
     reference = _reference_frame(plan, stream.n_frames)

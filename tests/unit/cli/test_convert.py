@@ -70,10 +70,7 @@ class Grey:
     info = StreamInfo(5, 6, 19, None, "intensity", 8)
     valid = np.ones((6, 19), bool)
 
-    def __enter__(self) -> Grey:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         pass
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.corrections import CorrectedSource, DarkFrames, measure_dark, read_dark, write_dark
+from photonpano.corrections import DarkFrames, corrected_source, measure_dark, read_dark, write_dark
 from photonpano.testing import MemorySource
 from photonpano.values import Decision
 
@@ -30,7 +30,7 @@ def test_dark_counts_are_taken_out_without_bias(rate: float, corrections: Callab
     flux = 0.2
     np.save(tmp_path / "dark.npy", np.full(SHAPE, rate))
     keys = {"dark": "dark.npy", "limit": 2}
-    with CorrectedSource(MemorySource(frames_of(flux + rate)), corrections({"dark-counts": keys})) as source:
+    with corrected_source(MemorySource(frames_of(flux + rate)), corrections({"dark-counts": keys})) as source:
         found = source.corrected(source.counts(SPAN), N) / N
     p, n_all = -np.expm1(-flux - rate), N * found.size
     error = np.exp(rate) * np.sqrt(p * (1 - p) / n_all)
@@ -40,7 +40,7 @@ def test_dark_counts_are_taken_out_without_bias(rate: float, corrections: Callab
 def test_it_is_the_same_whatever_is_summed_with_what(corrections: Callable, tmp_path: Path) -> None:
     rates = np.random.default_rng(0).uniform(0, 0.1, SHAPE)
     np.save(tmp_path / "dark.npy", rates)
-    with CorrectedSource(MemorySource(frames_of(0.3 + rates)), corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
+    with corrected_source(MemorySource(frames_of(0.3 + rates)), corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
         parts = [FrameSpan(0, 3), FrameSpan(3, N)]
         together = sum(source.corrected(source.counts(part), len(part)) for part in parts)
         np.testing.assert_allclose(source.corrected(source.counts(SPAN), N), together, atol=1e-3)
@@ -51,7 +51,7 @@ def test_dark_counts_of_intensities_are_subtracted(corrections: Callable, tmp_pa
     grey = MemorySource(values)
     grey.info = replace(grey.info, kind="intensity", bit_depth=8)
     np.save(tmp_path / "dark.npy", np.full(SHAPE, 12.5))
-    with CorrectedSource(grey, corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
+    with corrected_source(grey, corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
         counts = source.counts(FrameSpan(0, 5))
         np.testing.assert_allclose(source.corrected(counts, 5), counts - 62.5)
         assert source.valid.all()
@@ -61,7 +61,7 @@ def test_pixels_with_more_than_the_limit_are_masked_and_counted(corrections: Cal
     rates = np.zeros(SHAPE)
     rates[3, 4], rates[5, 6], rates[7, 8] = 200, 0.11, 0.09
     np.save(tmp_path / "dark.npy", rates)
-    with CorrectedSource(MemorySource(frames_of(0.1)), corrections("rot180", {"dark-counts": {"dark": "dark.npy"}})) as source:
+    with corrected_source(MemorySource(frames_of(0.1)), corrections("rot180", {"dark-counts": {"dark": "dark.npy"}})) as source:
         assert np.argwhere(~source.valid).tolist() == [[3, 4], [5, 6]]
         assert np.isfinite(source.corrected(source.counts(SPAN), N)).all()
         reason = "pixels with more than limit = 0.1 dark counts a frame are masked"

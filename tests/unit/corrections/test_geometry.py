@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.corrections import CorrectedSource
+from photonpano.corrections import corrected_source
 from photonpano.testing import MemorySource
 
 
@@ -19,7 +19,7 @@ def bits(shape: tuple[int, int], n: int = 3) -> np.ndarray:
 
 
 def moved(frames: np.ndarray, corrections: Any) -> np.ndarray:
-    with CorrectedSource(MemorySource(frames), corrections) as source:
+    with corrected_source(MemorySource(frames), corrections) as source:
         return source.frames(source.info.span)
 
 
@@ -96,7 +96,7 @@ def test_columns_are_swapped_both_ways(corrections: Callable) -> None:
 @pytest.mark.parametrize(("settings", "row"), [({}, 3), ({"before": 1}, 1), ({"before": 6}, 6)])
 def test_a_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, corrections: Callable) -> None:
     frames = bits((6, 5))
-    with CorrectedSource(MemorySource(frames), corrections({"missing-row": settings})) as source:
+    with corrected_source(MemorySource(frames), corrections({"missing-row": settings})) as source:
         np.testing.assert_array_equal(source.frames(source.info.span), np.insert(frames, row, 0, axis=1))
         np.testing.assert_array_equal(source.valid, np.arange(7)[:, None] != np.full((1, 5), row))
         assert not source.counts(FrameSpan(0, 3))[row].any()
@@ -130,5 +130,5 @@ def test_a_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, co
 )
 def test_what_does_not_fit_the_frame_is_refused(written: Any, message: str, corrections: Callable) -> None:
     with pytest.raises(InputError) as caught:
-        CorrectedSource(MemorySource(bits((6, 10))), corrections(written))
+        corrected_source(MemorySource(bits((6, 10))), corrections(written))
     assert str(caught.value) == message

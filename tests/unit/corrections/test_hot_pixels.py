@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.corrections import CorrectedSource, DarkFrames, hot_in_the_dark, write_dark
+from photonpano.corrections import DarkFrames, corrected_source, hot_in_the_dark, write_dark
 from photonpano.testing import MemorySource
 
 SHAPE = (60, 80)
@@ -39,7 +39,7 @@ def test_dark_frames_tell_which_pixels_are_hot(corrections: Callable, tmp_path: 
     hot = hot_ones()
     rates = np.where(hot, 0.3, np.random.default_rng(0).lognormal(np.log(0.0013), 0.3, SHAPE)).astype(np.float32)
     write_dark(tmp_path / "dark.npz", DarkFrames(rates, 10**7))
-    source = CorrectedSource(MemorySource(np.zeros((4, *SHAPE))), corrections({"hot-pixels": {"dark": "dark.npz"}}))
+    source = corrected_source(MemorySource(np.zeros((4, *SHAPE))), corrections({"hot-pixels": {"dark": "dark.npz"}}))
     np.testing.assert_array_equal(source.valid, ~hot)
     (decision,) = source.decisions
     assert (decision.what, decision.value) == ("hot_pixels", hot.sum())
@@ -53,7 +53,7 @@ def test_the_capture_itself_tells_hot_and_dead_pixels(corrections: Callable) -> 
     hot[0, 0] = hot[30, 40] = hot[30, 41] = True
     dead &= ~hot
     flux = np.linspace(0.1, 0.6, SHAPE[1]) * np.ones(SHAPE)
-    source = CorrectedSource(MemorySource(exposed(np.where(dead, 0, flux + hot))), corrections("hot-pixels"))
+    source = corrected_source(MemorySource(exposed(np.where(dead, 0, flux + hot))), corrections("hot-pixels"))
     np.testing.assert_array_equal(source.valid, ~(hot | dead))
     assert source.decisions[0].value == (hot | dead).sum()
     assert "stand out from their neighbours in 2000 frames looked at all over the capture" in source.decisions[0].reason
@@ -65,7 +65,7 @@ def test_edges_and_lines_of_the_scene_are_no_hot_pixels(corrections: Callable) -
     flux[20] = 0.8
     flux[40:] = 0.6
     flux[:, 70] = 0.01
-    source = CorrectedSource(MemorySource(exposed(flux)), corrections("hot-pixels"))
+    source = corrected_source(MemorySource(exposed(flux)), corrections("hot-pixels"))
     assert source.valid.mean() > 0.999
 
 
@@ -75,7 +75,7 @@ def test_masked_pixels_are_no_neighbours(every: int, corrections: Callable, tmp_
     bad, hot = np.broadcast_to(np.arange(SHAPE[1]) % every != 0, SHAPE), hot_ones()
     np.save(tmp_path / "bad.npy", bad)
     frames = exposed(np.where(bad, 3.0, 0.1) + 0.4 * hot)
-    source = CorrectedSource(MemorySource(frames), corrections({"mask": {"file": "bad.npy"}}, "hot-pixels"))
+    source = corrected_source(MemorySource(frames), corrections({"mask": {"file": "bad.npy"}}, "hot-pixels"))
     assert source.valid[~bad & ~hot].all()
     assert (source.valid[~bad & hot].mean() < 0.2) == (every == 2)
 
@@ -85,7 +85,7 @@ def test_no_frame_is_read_before_the_mask_is_asked_for(corrections: Callable, mo
     read: list[FrameSpan] = []
     counts = MemorySource.counts
     monkeypatch.setattr(MemorySource, "counts", lambda self, span: read.append(span) or counts(self, span))
-    source = CorrectedSource(MemorySource(frames), corrections("hot-pixels"))
+    source = corrected_source(MemorySource(frames), corrections("hot-pixels"))
     assert source.info.frame_shape == SHAPE
     assert read == []
     assert [source.valid.all() for _ in range(3)] == [True] * 3

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.corrections import CorrectedSource
+from photonpano.corrections import corrected_source
 from photonpano.testing import MemorySource
 
 SHAPE = (6, 10)
@@ -28,7 +28,7 @@ def source() -> MemorySource:
 def refused(source: MemorySource, corrections: Callable) -> Callable[..., str]:
     def refused(*written: Any) -> str:
         with pytest.raises(InputError) as caught:
-            CorrectedSource(source, corrections(*written))
+            corrected_source(source, corrections(*written))
         return str(caught.value)
 
     return refused
@@ -39,7 +39,7 @@ def test_a_picture_is_as_good_a_mask_as_an_array(source: MemorySource, correctio
     np.save(tmp_path / "bad.npy", bad)
     cv2.imwrite(str(tmp_path / "bad.png"), bad * np.uint8(255))
     for name in ("bad.npy", "bad.png"):
-        np.testing.assert_array_equal(CorrectedSource(source, corrections({"mask": {"file": name}})).valid, ~bad)
+        np.testing.assert_array_equal(corrected_source(source, corrections({"mask": {"file": name}})).valid, ~bad)
 
 
 def test_a_mask_is_of_the_size_at_its_place_of_the_list(refused: Callable, tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_the_pixels_of_other_colours_are_masked(source: MemorySource, correction
     cv2.imwrite(str(tmp_path / "pattern.png"), pattern_of(red)[..., ::-1])
     for name in ("pattern.npy", "pattern.png"):
         clear, only_red, both = (
-            CorrectedSource(source, corrections({"colour-filter": {"pattern": name} | keep})).valid
+            corrected_source(source, corrections({"colour-filter": {"pattern": name} | keep})).valid
             for keep in ({}, {"keep": ["red"]}, {"keep": ["red", "clear"]})
         )
         np.testing.assert_array_equal(clear, ~red)
@@ -102,7 +102,7 @@ def test_filtered_pixels_are_the_mean_of_clear_ones_that_touch_them(
     np.save(tmp_path / "pattern.npy", pattern_of(red))
     np.save(tmp_path / "bad.npy", bad)
     keys = {"pattern": "pattern.npy", "others": "interpolate"}
-    corrected = CorrectedSource(source, corrections({"colour-filter": keys}, {"mask": {"file": "bad.npy"}}))
+    corrected = corrected_source(source, corrections({"colour-filter": keys}, {"mask": {"file": "bad.npy"}}))
     np.testing.assert_array_equal(corrected.valid, ~bad)
     counts = corrected.counts(SPAN)
     np.testing.assert_array_equal(counts, source.counts(SPAN))
@@ -123,7 +123,7 @@ def test_filtered_pixels_without_a_clear_neighbour_are_masked(
     keys = {"pattern": "pattern.npy", "others": "interpolate"}
     lonely = np.zeros(SHAPE, bool)
     lonely[:2, :2] = True
-    np.testing.assert_array_equal(CorrectedSource(source, corrections({"colour-filter": keys})).valid, ~lonely)
+    np.testing.assert_array_equal(corrected_source(source, corrections({"colour-filter": keys})).valid, ~lonely)
 
 
 def test_unknown_colours_and_other_arrays_are_refused(refused: Callable, tmp_path: Path) -> None:

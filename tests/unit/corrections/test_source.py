@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import Config, FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, SourceContribution
-from photonpano.corrections import CorrectedSource
+from photonpano.corrections import corrected_source
 from photonpano.corrections.geometry import Crop, MissingRow, Rot90
 from photonpano.testing import MemorySource, SourceConformance
 
@@ -31,7 +31,7 @@ class TestCorrectedSource(SourceConformance):
     """Turned, cropped and with a row that is missing: what the kit asks of any source."""
 
     def opened(self) -> Any:
-        return CorrectedSource(MemorySource(self.known_frames()), (Rot90(), Crop(rows=(1, -2)), MissingRow()))
+        return corrected_source(MemorySource(self.known_frames()), (Rot90(), Crop(rows=(1, -2)), MissingRow()))
 
     contribution = SourceContribution(name="moved", summary="Toy", config=MovedConfig, build=lambda *_: None)
 
@@ -44,18 +44,18 @@ class TestCorrectedSource(SourceConformance):
 def test_packed_frames_are_those_that_frames_gives(
     written: list[Any], frames: np.ndarray, packed_source: type, corrections: Callable
 ) -> None:
-    source = CorrectedSource(packed_source(frames), corrections(*written))
+    source = corrected_source(packed_source(frames), corrections(*written))
     assert isinstance(source, PackedSource)
     np.testing.assert_array_equal(source.packed(FrameSpan(3, 9)), np.packbits(source.frames(FrameSpan(3, 9)), axis=-1))
     np.testing.assert_array_equal(source.counts(SPAN), source.frames(SPAN).sum(axis=0))
 
 
 def test_it_has_what_the_source_has(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
-    plain = CorrectedSource(MemorySource(frames), corrections("rot180"))
+    plain = corrected_source(MemorySource(frames), corrections("rot180"))
     assert not isinstance(plain, PackedSource)
     assert not isinstance(plain, LinearlyCorrectedSource)
     np.save(tmp_path / "dark.npy", np.zeros(SHAPE))
-    dark = CorrectedSource(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
+    dark = corrected_source(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
     assert isinstance(dark, LinearlyCorrectedSource)
 
 
@@ -65,7 +65,7 @@ def test_masks_of_the_source_and_of_the_list_add_up_where_they_are_moved_to(
     valid, bad = np.ones(SHAPE, bool), np.zeros(SHAPE, bool)
     valid[2, 3], bad[5, 7] = False, True
     np.save(tmp_path / "bad.npy", bad)
-    source = CorrectedSource(MemorySource(frames, valid), corrections({"mask": {"file": "bad.npy"}}, "rot90"))
+    source = corrected_source(MemorySource(frames, valid), corrections({"mask": {"file": "bad.npy"}}, "rot90"))
     np.testing.assert_array_equal(source.valid, np.rot90(valid & ~bad, -1))
     with pytest.raises(ValueError, match="read-only"):
         source.valid[0, 0] = False
@@ -78,21 +78,21 @@ def test_what_leaves_no_pixel_is_refused(frames: np.ndarray, corrections: Callab
     np.save(tmp_path / "lower.npy", ~half)
     written = [{"mask": {"file": "upper.npy"}}, {"mask": {"file": "lower.npy"}}]
     with pytest.raises(InputError) as caught:
-        CorrectedSource(MemorySource(frames), corrections(*written))
+        corrected_source(MemorySource(frames), corrections(*written))
     assert str(caught.value) == "mask leaves no pixel that may be used"
 
 
 def test_a_source_that_corrects_its_sums_is_refused(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
     """What it takes out would be lost, as it is of the size of its own frames."""
     np.save(tmp_path / "dark.npy", np.zeros(SHAPE))
-    once = CorrectedSource(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
+    once = corrected_source(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
     with pytest.raises(InputError, match="takes things out of its sums itself, and cannot be corrected further"):
-        CorrectedSource(once, corrections("rot90"))
+        corrected_source(once, corrections("rot90"))
 
 
 def test_close_closes_the_capture(frames: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
     monkeypatch.setattr(MemorySource, "close", lambda self: closed.append(self))
-    with CorrectedSource(MemorySource(frames), ()):
+    with corrected_source(MemorySource(frames), ()):
         pass
     assert len(closed) == 1

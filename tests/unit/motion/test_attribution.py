@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, PluginError
-from photonpano.motion.attribution import AttributedSource, AttributedTrajectory
+from photonpano.motion.attribution import AttributedTrajectory, attributed
 
 ORIGIN = "source 'toy' of toys 1.0"
 SPAN = FrameSpan(2, 5)
@@ -28,7 +28,7 @@ def raising(error: BaseException) -> Callable[..., Any]:
 
 
 def test_a_source_is_what_it_was(source: Any) -> None:
-    named = AttributedSource(source, ORIGIN)
+    named = attributed(source, ORIGIN)
     assert (named.info, named.response) == (source.info, source.response)
     assert named.valid is source.valid
     np.testing.assert_array_equal(named.counts(SPAN), source.counts(SPAN))
@@ -36,30 +36,30 @@ def test_a_source_is_what_it_was(source: Any) -> None:
 
 
 def test_it_has_what_the_source_has(source: Any) -> None:
-    assert not isinstance(AttributedSource(source, ORIGIN), PackedSource | LinearlyCorrectedSource)
+    assert not isinstance(attributed(source, ORIGIN), PackedSource | LinearlyCorrectedSource)
     source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
     source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
-    named = AttributedSource(source, ORIGIN)
+    named = attributed(source, ORIGIN)
     assert isinstance(named, PackedSource)
     assert isinstance(named, LinearlyCorrectedSource)
     np.testing.assert_array_equal(named.packed(SPAN), source.packed(SPAN))
     np.testing.assert_array_equal(named.corrected(source.counts(SPAN), 3), source.counts(SPAN) - np.float32(3))
     source.packed = raising(OSError("gone"))
     with pytest.raises(PluginError, match=r"failed at frames 2 to 4: OSError: gone"):
-        AttributedSource(source, ORIGIN).packed(SPAN)
+        attributed(source, ORIGIN).packed(SPAN)
 
 
 def test_it_closes_what_it_names(source: Any) -> None:
     closed: list[bool] = []
     source.close = lambda: closed.append(True)
-    with AttributedSource(source, ORIGIN):
+    with attributed(source, ORIGIN):
         assert not closed
     assert closed
 
 
 @pytest.mark.parametrize("method", ["counts", "frames"])
 def test_a_source_that_raises_or_gives_another_shape_is_named(source: Any, method: str) -> None:
-    named = AttributedSource(source, ORIGIN)
+    named = attributed(source, ORIGIN)
     setattr(source, method, raising(OSError("gone")))
     with pytest.raises(PluginError) as caught:
         getattr(named, method)(SPAN)
@@ -75,7 +75,7 @@ def test_what_is_meant_for_users_passes(source: Any) -> None:
     error = InputError("the disk was pulled out")
     source.counts = raising(error)
     with pytest.raises(InputError) as caught:
-        AttributedSource(source, ORIGIN).counts(SPAN)
+        attributed(source, ORIGIN).counts(SPAN)
     assert caught.value is error
 
 

@@ -64,7 +64,7 @@ def plan(levels: Any = 1, **changes: Any) -> Plan:
 def test_components_are_told_what_they_may_know() -> None:
     made = plan()
     source = build_source(made)
-    assert source.context == SourceContext(seed=7, threads=3)
+    assert source.wrapped.context == SourceContext(seed=7, threads=3)
     (level,) = build_levels(made, source, [])
     assert level.locators[0].component.context == StageContext(source.info, source.response, seed=7, threads=3)
     assert level.locators[0].origin == "locator 'toy' of toys 1.0"

@@ -7,14 +7,14 @@ import pytest
 
 from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource
 from photonpano.pipeline.components import build_source
-from photonpano.pipeline.forecast import TRIAL_GROUPS, PartOfSource, forecast
+from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast, part_of
 from photonpano.specs import parse_spec
 from photonpano.testing import MemorySource
 
 
 def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[MemorySource]) -> None:
     frames = np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8)
-    part = PartOfSource(memory_source(frames), FrameSpan(2, 7))
+    part = part_of(memory_source(frames), FrameSpan(2, 7))
     assert part.info.n_frames == 5
     np.testing.assert_array_equal(part.counts(FrameSpan(1, 4)), frames[3:6].sum(axis=0))
     np.testing.assert_array_equal(part.frames(FrameSpan(0, 5)), frames[2:7])
@@ -24,10 +24,10 @@ def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[Me
 
 def test_a_part_has_what_the_capture_has(memory_source: type[MemorySource]) -> None:
     whole: Any = memory_source(np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8))
-    assert not isinstance(PartOfSource(whole, FrameSpan(2, 7)), PackedSource | LinearlyCorrectedSource)
+    assert not isinstance(part_of(whole, FrameSpan(2, 7)), PackedSource | LinearlyCorrectedSource)
     whole.packed = lambda span: np.packbits(whole.frames(span), axis=-1)
     whole.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
-    part = PartOfSource(whole, FrameSpan(2, 7))
+    part = part_of(whole, FrameSpan(2, 7))
     assert isinstance(part, PackedSource)
     assert isinstance(part, LinearlyCorrectedSource)
     np.testing.assert_array_equal(part.packed(FrameSpan(1, 4)), whole.packed(FrameSpan(3, 6)))

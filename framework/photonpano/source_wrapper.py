@@ -1,0 +1,118 @@
+"""Base classes of sources: one that closes itself, and one around another source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Self, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
+from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
+
+ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
+WrapperT = TypeVar("WrapperT", bound="SourceWrapper")
+
+
+class Closing:
+    """Closes itself at the end of a `with` block."""
+
+    def close(self) -> None:
+        """Release files; by default there are none."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class SourceWrapper(Closing):
+    """A source around another source, to which it passes every call. Subclasses override what they change.
+
+    The optional methods `packed`, `corrected` and `truth` come from the classes `PackedWrapper`, `LinearlyCorrectedWrapper` and
+    `TruthWrapper`: see `with_capabilities`.
+
+    Attributes:
+        wrapped: the other source.
+    """
+
+    def __init__(self, wrapped: Source) -> None:
+        self.wrapped = wrapped
+
+    @property
+    def info(self) -> StreamInfo:
+        """Frames, size, rate."""
+        return self.wrapped.info
+
+    @property
+    def response(self) -> Response:
+        """How flux becomes counts."""
+        return self.wrapped.response
+
+    @property
+    def valid(self) -> BoolArray:
+        """(H, W) mask."""
+        return self.wrapped.valid
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        return self.read(self.wrapped.counts, span, self.info.frame_shape)
+
+    def frames(self, span: FrameSpan) -> Frames:
+        """Return the frames of a span one by one: (n, H, W)."""
+        return self.read(self.wrapped.frames, span, (len(span), *self.info.frame_shape))
+
+    def close(self) -> None:
+        """Close the wrapped source."""
+        self.wrapped.close()
+
+    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+        """Read a span with a method of the wrapped source, which promises an array of this shape."""
+        del shape
+        return method(span)
+
+
+class PackedWrapper(SourceWrapper):
+    """A wrapper of a `PackedSource`."""
+
+    wrapped: PackedSource
+
+    def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span, eight pixels to a byte: see `PackedSource`."""
+        height, width = self.info.frame_shape
+        return self.read(self.wrapped.packed, span, (len(span), height, -(-width // 8)))
+
+
+class LinearlyCorrectedWrapper(SourceWrapper):
+    """A wrapper of a `LinearlyCorrectedSource`."""
+
+    wrapped: LinearlyCorrectedSource
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """Take everything but the flux out of a sum of frames: see `LinearlyCorrectedSource`."""
+        return self.wrapped.corrected(counts, n_frames)
+
+
+class TruthWrapper(SourceWrapper):
+    """A wrapper of a source that `KnowsTruth`."""
+
+    def truth(self) -> Mapping[str, NDArray[np.generic]]:
+        """Return what the frames show: see `KnowsTruth`."""
+        return cast("KnowsTruth", self.wrapped).truth()
+
+
+def capabilities_of(source: Source) -> list[type[SourceWrapper]]:
+    """Return the classes with which a wrapper gets the optional methods that a source has."""
+    known: Any = source
+    wrappers = {PackedSource: PackedWrapper, LinearlyCorrectedSource: LinearlyCorrectedWrapper, KnowsTruth: TruthWrapper}
+    return [wrapper for protocol, wrapper in wrappers.items() if isinstance(known, protocol)]
+
+
+def with_capabilities(wrapper: type[WrapperT], capabilities: list[type[SourceWrapper]]) -> type[WrapperT]:
+    """Return a subclass of a wrapper that inherits from these classes too.
+
+    `isinstance` with `PackedSource`, `LinearlyCorrectedSource` or `KnowsTruth` is then decided by the class of an object.
+    """
+    return type(wrapper.__name__, (*capabilities, wrapper), {})
