@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano import Group, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, rescaling
-from photonpano.merging import Chunk, SharedCounts, accumulate, chunks_of, clipped
+from photonpano.merging import Chunk, CountsCache, accumulate, chunks_of, clipped
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.exposures import scaled_shape
 
@@ -67,7 +67,7 @@ class PhotonMleMerger:
                     f"so many frames, on average, move less than tolerance_px = {tolerance_px:g} along the motion, "
                     "and are summed before they are warped",
                 )
-            self._along = _Along(source, trajectory, chunks, SharedCounts(source, _SHARED_BYTES))
+            self._along = _Along(source, trajectory, chunks, CountsCache(source, _SHARED_BYTES))
             return self._along
 
 
@@ -78,4 +78,4 @@ class _Along:
     source: Source
     trajectory: Trajectory
     chunks: tuple[Chunk, ...]
-    counts: SharedCounts
+    counts: CountsCache

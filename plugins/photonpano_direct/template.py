@@ -9,7 +9,7 @@ from threading import local
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import corners, generators, implausibility, slopes, unit_coordinates
+from photonpano.geometry import corners, generators, slopes, unit_coordinates, why_implausible
 from photonpano_direct.curvature import told
 from photonpano_direct.descent import DIVERGED, LOST, SETTLED, descend
 from photonpano_direct.layers import Layer
@@ -132,7 +132,7 @@ class Template:
         if ended == SETTLED:
             return Aligned(homography, pixels, pixels / self._layer.image.size, squares, weights)
         if ended == DIVERGED:
-            return f"the alignment diverges: {implausibility(homography, self._shape, 0.0)}"
+            return f"the alignment diverges: {why_implausible(homography, self._shape, 0.0)}"
         if ended == LOST:
             return "where the images overlap, if they do, there is no texture"
         return f"the alignment has not settled after {max_steps} steps"

@@ -21,12 +21,12 @@ from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import (
     corner_displacements,
     corners,
-    implausibility,
     inverse,
     jacobian,
     normalised,
     rescaled,
     translation,
+    why_implausible,
 )
 from photonpano.locating import View, blur_against_noise, motion_from_images, view_pyramid
 from photonpano_kornia.configs import KorniaRegistratorConfig
@@ -120,7 +120,7 @@ class _Descent:
             if root is None:
                 return "where the images overlap, if they do, there is no texture"
             before, homography = homography, self._round(homography, weights, root, tolerance_px, config.max_iterations)
-            if reason := implausibility(homography, self._moving.shape, config.min_overlap):
+            if reason := why_implausible(homography, self._moving.shape, config.min_overlap):
                 return f"the alignment diverges: {reason}"
             if corner_displacements(homography, before, self._moving.shape).max() < tolerance_px:
                 break

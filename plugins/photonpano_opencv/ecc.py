@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated, VirtualExposure
-from photonpano.geometry import implausibility, normalised, rescaled, translation
+from photonpano.geometry import normalised, rescaled, translation, why_implausible
 from photonpano.locating import View, blur_against_noise, motion_from_images, view_pyramid
 from photonpano_opencv.configs import OpencvEccConfig
 from photonpano_opencv.phase import NOTHING_TO_HOLD, shift_between
@@ -72,7 +72,7 @@ class EccLocator:
             # What OpenCV does where it does not converge, in the midst of images that are right.
             return f"the correlation cannot be maximised: {_sentence_of(error)}"
         homography = np.asarray(found, np.float64)
-        reason = implausibility(homography, moving.shape, config.min_overlap)
+        reason = why_implausible(homography, moving.shape, config.min_overlap)
         return f"the alignment diverges: {reason}" if reason else normalised(homography)
 
 

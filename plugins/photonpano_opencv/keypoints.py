@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import apply, implausibility, normalised
+from photonpano.geometry import apply, normalised, why_implausible
 from photonpano.locating import KeypointConfig, least_agreeing, motion_from_points
 from photonpano_opencv.matching import match_everywhere, match_nearby
 
@@ -134,7 +134,7 @@ class KeypointMatcher:
                 f"(more than {least_agreeing(len(pairs), guided=False):.0f} must)",
                 evidence,
             )
-        if reason := implausibility(homography, moving.shape):
+        if reason := why_implausible(homography, moving.shape):
             return NotLocated(f"{reason}, from {len(pairs)} matches", evidence)
         motion: Located | NotLocated
         for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):

@@ -17,7 +17,7 @@ from photonpano.geometry.homographies import (
     rescaling,
     translation,
 )
-from photonpano.geometry.plausibility import implausibility
+from photonpano.geometry.plausibility import why_implausible
 from photonpano.geometry.steps import generators, slopes, unit_coordinates
 from photonpano.lazy import imported_on_use
 
@@ -35,7 +35,6 @@ __all__ = [
     "corners",
     "from_parameters",
     "generators",
-    "implausibility",
     "inverse",
     "jacobian",
     "normalised",
@@ -49,6 +48,7 @@ __all__ = [
     "unit_coordinates",
     "violation",
     "visible_columns",
+    "why_implausible",
 ]
 
 if not TYPE_CHECKING:  # the compiled functions: numba is imported when one of them is used

@@ -8,16 +8,17 @@ from photonpano.geometry.homographies import apply, corners, from_parameters, no
 from photonpano.values import FloatArray, Homography
 
 FIT_FRAMES = 300
-"""The alignment is fitted to so many frames, evenly spaced: it has eight parameters, and every frame gives eight numbers."""
+"""Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
+gives eight equations."""
 
 _FAR_PX = 1e6
-"""What counts for a corner that a map sends to infinity."""
+"""Residual of points mapped to infinity."""
 
 
 def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int, int]) -> Homography:
     """Return the map G from the estimated reference plane to the true plane that fits both trajectories best.
 
-    A trajectory is known up to the choice of its reference plane. G minimises the sum over frames t and corners c of
+    A trajectory is determined up to the choice of its reference plane. G minimises the sum over frames t and corners c of
 
         | inv(true_t) G estimated_t c - c |^2
 
@@ -40,7 +41,9 @@ def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int
     from scipy.optimize import least_squares
 
     if len(estimated) != len(true) or not len(true):
-        raise ValueError(f"two trajectories of the same length are aligned, got {len(estimated)} and {len(true)} homographies")
+        raise ValueError(
+            f"only trajectories of the same length can be aligned, got {len(estimated)} and {len(true)} homographies"
+        )
     chosen = np.unique(np.linspace(0, len(true) - 1, FIT_FRAMES).round().astype(int))
     frame = corners(frame_shape)
     from_points, to_points = apply(estimated[chosen], frame), apply(true[chosen], frame)
@@ -50,12 +53,12 @@ def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int
     left = np.linalg.inv(target_condition) @ start
 
     def plane(p: FloatArray) -> Homography:
-        # Steps from the linear solution in conditioned coordinates: all eight have the same scale.
+        # Steps from the linear solution, in conditioned coordinates in which all eight parameters have the same scale.
         return left @ from_parameters(p) @ condition
 
     def residuals(p: FloatArray) -> FloatArray:
-        missed = apply(to_frame @ plane(p), from_points) - frame
-        return np.nan_to_num(missed, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
+        residual = apply(to_frame @ plane(p), from_points) - frame
+        return np.nan_to_num(residual, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
 
     fit = least_squares(residuals, np.zeros(8), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     return normalised(plane(fit.x))
@@ -77,7 +80,7 @@ def _direct_linear(source: FloatArray, target: FloatArray) -> Homography:
     equations = [
         np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
         np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
-        np.zeros((1, 9)),  # so that the eight equations of a single frame have nine singular vectors, too
+        np.zeros((1, 9)),  # a single frame gives eight equations: padded to nine
     ]
     solution: FloatArray = np.linalg.svd(np.concatenate(equations), full_matrices=False)[2][-1].reshape(3, 3)
     return solution

@@ -1,4 +1,4 @@
-"""The canvas of a panorama: where frames land, and how large the image is."""
+"""The canvas of a panorama: its size, and the map from the reference plane to its pixels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from photonpano.geometry.homographies import apply, corners, rescaling, translation
 from photonpano.values import FloatArray, Homography
 
-_AT_ONCE = 8192
-"""So many frames are looked at together, which bounds the memory that it takes."""
+BLOCK_FRAMES = 8192
+"""The corners of this many frames are mapped at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +50,8 @@ def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: flo
         index = int(np.argmin(depth))
         raise ValueError(f"homography {index} of {len(homographies)} sends part of its frame behind the reference plane")
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for start in range(0, len(homographies), _AT_ONCE):
-        points = apply(homographies[start : start + _AT_ONCE], frame).reshape(-1, 2)
+    for start in range(0, len(homographies), BLOCK_FRAMES):
+        points = apply(homographies[start : start + BLOCK_FRAMES], frame).reshape(-1, 2)
         low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     # Whole reference pixels, so that the canvas of scale 1 samples the reference frame without interpolation.
     low, high = np.floor(low + 1e-6), np.ceil(high - 1e-6)

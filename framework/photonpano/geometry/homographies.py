@@ -1,4 +1,4 @@
-"""Homographies: building, applying, composing, rescaling, and the eight parameters of the paper.
+"""Build, apply, compose and rescale homographies; convert them to and from the eight parameters of the paper.
 
 Convention:
     Points are (x, y), x right, y down; integer coordinates are pixel centres; sizes are (height, width). A homography is
@@ -19,7 +19,7 @@ def normalised(matrices: ArrayLike) -> Homography:
     """Scale (..., 3, 3) matrices so that h33 = 1.
 
     Raises:
-        ValueError: an h33 is zero or not finite, so that the matrix has no such form.
+        ValueError: an h33 is zero or not finite, so that the matrix cannot be scaled.
     """
     matrices = np.asarray(matrices, dtype=np.float64)
     h33 = matrices[..., 2, 2]
@@ -102,7 +102,7 @@ def corners(shape: tuple[int, int]) -> FloatArray:
 
 
 def corner_displacements(first: Homography, second: Homography, shape: tuple[int, int]) -> FloatArray:
-    """Return the distances in pixels between where two maps send the four corners of an image: (..., 4)."""
+    """Return the distances, in pixels, between the four corners of an image under one map and under another: (..., 4)."""
     frame = corners(shape)
     return np.asarray(np.linalg.norm(apply(first, frame) - apply(second, frame), axis=-1))
 

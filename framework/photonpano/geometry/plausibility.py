@@ -1,4 +1,4 @@
-"""Which pairwise motions a camera can make: what is refused, and why."""
+"""Plausibility of pairwise motions: reasons to reject a homography between two images of one camera."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from photonpano.geometry.homographies import apply, corners
 from photonpano.values import Homography
 
 
-def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: float = 0.1) -> str | None:
-    """Tell why a map between two images of one camera cannot be true; None if it can.
+def why_implausible(homography: Homography, shape: tuple[int, int], min_overlap: float = 0.1) -> str | None:
+    """Return why a map between two images of one camera is implausible; None if it is plausible.
 
     Args:
         homography: (3, 3), pixels of the moving image to pixels of the fixed one.
         shape: (height, width) of both images.
-        min_overlap: the least share of the fixed image that the moving one must cover.
+        min_overlap: share of the fixed image that the moving one must cover at least.
     """
     from photonpano.geometry import shapes  # compiled
 
@@ -27,9 +27,9 @@ def implausibility(homography: Homography, shape: tuple[int, int], min_overlap: 
             shapes.INFINITE: "the homography is not finite",
             shapes.BEHIND: "the homography sends part of the image behind the camera",
             shapes.FOLDED: "the homography mirrors or folds the image",
-            shapes.AREA: f"the homography changes the area of the image {number:.2g} times "
+            shapes.AREA: f"the homography changes the area of the image by a factor of {number:.2g} "
             f"(at most {shapes.MAX_AREA_CHANGE:g} is plausible)",
-            shapes.SIDES: f"the homography makes opposite sides of the image differ {number:.2g} times "
+            shapes.SIDES: f"the homography makes opposite sides of the image differ by a factor of {number:.2g} "
             f"(at most {shapes.MAX_SIDE_CHANGE:g} is plausible)",
         }[kind]
     quad = apply(homography, corners(shape)).tolist()

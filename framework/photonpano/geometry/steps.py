@@ -1,4 +1,4 @@
-"""Small changes of a homography, in coordinates in which all eight parameters mean about as much."""
+"""Derivatives of homographies by their eight parameters, in coordinates in which all parameters have about the same effect."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def unit_coordinates(shape: tuple[int, int]) -> Homography:
 
 @cache
 def generators(shape: tuple[int, int]) -> FloatArray:
-    """Return what small changes of p1..p8 in unit coordinates are in pixels: (8, 3, 3).
+    """Return the derivatives of a homography of pixels by p1..p8 of `unit_coordinates`, at the identity: (8, 3, 3).
 
-    To first order the change by p is the homography I + p1 G1 + ... + p8 G8 of pixels.
+    To first order, a change by p in unit coordinates is the homography I + p1 G1 + ... + p8 G8 of pixels.
     """
     unit = unit_coordinates(shape)
     changes = np.asarray(np.linalg.inv(unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ unit)
@@ -33,7 +33,7 @@ def generators(shape: tuple[int, int]) -> FloatArray:
 
 
 def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:
-    """Return the derivatives of mapped points: (..., 2 N, 8), coordinates of a point next to each other.
+    """Return the derivatives of mapped points by eight parameters: (..., 2 N, 8), x and y of a point in adjacent rows.
 
     Args:
         mapped: (..., 3, N) points in homogeneous coordinates.

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import corners, generators, implausibility, jacobian, slopes, unit_coordinates
+from photonpano.geometry import corners, generators, jacobian, slopes, unit_coordinates, why_implausible
 from photonpano.locating.configs import ImageLimits
 from photonpano.locating.viewing import View
 from photonpano.photometry import Similarity, autocorrelation, similarity_of
@@ -63,7 +63,7 @@ def motion_from_images(
         images do not look alike, or where they tell too little about the corners.
     """
     found = dict(evidence or {})
-    if reason := implausibility(homography, moving.shape, limits.min_overlap):
+    if reason := why_implausible(homography, moving.shape, limits.min_overlap):
         return NotLocated(reason, found)
     there = fixed.seen_from(homography)
     both = moving.seen & there.seen

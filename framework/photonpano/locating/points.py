@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import apply, implausibility
+from photonpano.geometry import apply, why_implausible
 from photonpano.locating.configs import PointLimits
 from photonpano.locating.fitting import fit_homography
 from photonpano.values import Homography, Located, NotLocated
@@ -58,7 +58,7 @@ def motion_from_points(
     """
     found = dict(evidence or {})
     found.setdefault("matches", float(len(moving)))
-    if reason := implausibility(start, shape):
+    if reason := why_implausible(start, shape):
         return NotLocated(f"{reason}, from {len(moving)} matches", found)
     sizes = np.ones(len(moving)) if sizes is None else sizes
     homography = start
@@ -80,6 +80,6 @@ def motion_from_points(
             f"more than max_std_px = {limits.max_std_px:g}",
             found,
         )
-    if reason := implausibility(homography, shape):
+    if reason := why_implausible(homography, shape):
         return NotLocated(f"{reason}, from {found['inliers']:.0f} inliers", found)
     return Located(homography, fit.information, fit.residual_px, found)

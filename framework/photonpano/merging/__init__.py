@@ -1,7 +1,6 @@
-"""Sums of frames along a motion: chunks of frames that stand still, one warp a chunk, one estimate of all counts."""
+"""Sums of frames along a motion: frames are summed in chunks, and each chunk is warped once."""
 
-from photonpano.merging.accumulate import PhotonSum, accumulate
-from photonpano.merging.chunks import Chunk, chunks_of, clipped
-from photonpano.merging.sharing import SharedCounts
+from photonpano.merging.accumulate import PhotonSum, accumulate, divided
+from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
 
-__all__ = ["Chunk", "PhotonSum", "SharedCounts", "accumulate", "chunks_of", "clipped"]
+__all__ = ["Chunk", "CountsCache", "PhotonSum", "accumulate", "chunks_of", "clipped", "divided"]

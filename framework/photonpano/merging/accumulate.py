@@ -1,4 +1,4 @@
-"""Warp sums of frames onto a grid and add them up: what both virtual exposures and panoramas are made of."""
+"""Warp sums of frames onto a grid and add them up, for virtual exposures and panoramas."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ import numpy as np
 
 from photonpano.geometry import translation
 from photonpano.merging.chunks import Chunk
-from photonpano.merging.footprints import Landing, landings
+from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
 from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
-"""So many chunks are summed before they are added to the grid."""
+"""Chunks that are summed before they are added to the grid."""
 _PART_ROWS = 128
-"""A thread adds to about so many rows of the grid at a time."""
+"""Rows of the grid, about, that a thread adds to at a time."""
 MIN_WEIGHT = 1.0
-"""A pixel that was seen in less than one whole frame is unknown."""
+"""Pixels with less weight than this, in frames, are unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotonSum:
-    """Warped counts, and how many frames each pixel was seen in.
+    """Warped counts, and the number of frames in which each pixel was seen.
 
     Attributes:
         counts: (H, W) float32.
@@ -40,14 +40,14 @@ class PhotonSum:
     weight: FluxImage
 
     def estimate(self, response: Response) -> tuple[FluxImage, FluxImage]:
-        """Return the flux of all counts together, one estimate a pixel (paper, equation 3), and its weight.
+        """Return the maximum-likelihood flux of each pixel (paper, equation 3) and its weight.
 
         Returns:
-            Flux, (H, W) float32, NaN where less than one frame was seen; weight, (H, W) float32, 0 there.
+            Flux, (H, W) float32, NaN where the weight is below one frame; weight, (H, W) float32, 0 there.
         """
         unknown = self.weight < MIN_WEIGHT
         seen = np.asarray(np.maximum(self.weight, MIN_WEIGHT), dtype=np.float32)
-        # Where dark counts were taken out, chance may leave less than nothing.
+        # Subtraction of dark counts can leave a negative sum by chance.
         mean = np.asarray(np.maximum(self.counts, 0) / seen, dtype=np.float32)
         flux, weight = response.flux(mean, seen), self.weight.copy()
         flux[unknown], weight[unknown] = np.nan, 0
@@ -67,35 +67,35 @@ def accumulate(
     """Sum the frames of chunks on a grid, each chunk warped once.
 
     Convention:
-        Points are (x, y), integers are pixel centres. Bilinear weights spread every count over the grid pixels whose centres
-        see it; counts and weights are spread alike, so that their quotient is not biased at masks and borders.
+        Points are (x, y), integers are pixel centres. Counts and weights are interpolated bilinearly, both in the same way, so
+        that their quotient is not biased at masks and borders.
 
     Args:
-        source: the capture; masked pixels do not count, and what a `LinearlyCorrectedSource` takes out of sums is taken out.
+        source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected.
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
-        advance: is told the number of frames of each chunk; first of all chunks together that miss the grid.
+        advance: called with the number of frames of each chunk that is done; first with that of all chunks off the grid.
         pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
-        threads: how many.
-        counts_of: sums the frames of a span, if not the source itself; nothing is taken out of them yet.
+        threads: number of threads of the pool.
+        counts_of: returns the uncorrected sum of the frames of a span, such as a `CountsCache`; `source.counts` by default.
     """
     total = _Total.zeros(shape)
-    # Narrow enough that several threads find work wherever frames lie on the grid.
+    # Parts are narrow, so that every thread has work wherever frames lie on the grid.
     n_parts = 1 if threads == 1 else max(threads, shape[0] // _PART_ROWS)
-    parts = [total.rows(range(start, stop)) for start, stop in _divided(shape[0], n_parts)]
+    parts = [total.rows(part) for part in divided(shape[0], n_parts)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
     corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-    placed = landings(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
-    landed = [(chunk, landing) for chunk, landing in zip(chunks, placed, strict=True) if landing.rows and landing.columns]
-    advance = advance or _no_one
-    if missing := sum(len(chunk.span) for chunk in chunks) - sum(len(chunk.span) for chunk, _ in landed):
-        advance(missing)
-    # What is started is worked on while the next is started, if there is a pool; results are taken in order.
+    footprints = footprints_of(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
+    visible = [(chunk, at) for chunk, at in zip(chunks, footprints, strict=True) if at.rows and at.columns]
+    advance = advance or (lambda _: None)
+    if off_grid := sum(len(chunk.span) for chunk in chunks) - sum(len(chunk.span) for chunk, _ in visible):
+        advance(off_grid)
+    # With a pool, one batch is added while the next is summed; batches are added in order.
     start = pool.map if pool else map
     adding: Iterable[None] = ()
-    for first in range(0, len(landed), _BATCH):
-        batch = landed[first : first + _BATCH]
+    for first in range(0, len(visible), _BATCH):
+        batch = visible[first : first + _BATCH]
         summed = list(start(partial(_summed, counts_of or source.counts, corrected, masked), *zip(*batch, strict=True)))
         deque(adding, maxlen=0)
         adding = start(partial(_Total.add, summed=summed), parts)
@@ -107,16 +107,16 @@ def accumulate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Summed:
-    """The sum of the frames of a chunk, and where it goes.
+    """The sum of the frames of a chunk, with its footprint.
 
     Attributes:
-        landing: how it is brought onto the grid.
-        n_frames: how many frames it is made of.
+        footprint: where it lies on the grid.
+        n_frames: number of frames.
         counts: (h, w) float32 or uint32.
-        seen: (h, w) float32, in how many frames each pixel was seen; None if in all.
+        seen: (h, w) float32, the number of frames in which each pixel was seen; None if it is `n_frames` for all.
     """
 
-    landing: Landing
+    footprint: Footprint
     n_frames: int
     counts: FluxImage | Counts
     seen: FluxImage | None
@@ -127,21 +127,21 @@ def _summed(
     corrected: Callable[[Counts, int], FluxImage] | None,
     masked: FluxImage | None,
     chunk: Chunk,
-    landing: Landing,
+    footprint: Footprint,
 ) -> _Summed:
-    n_frames, shrink = len(chunk.span), landing.shrink
+    n_frames, shrink = len(chunk.span), footprint.shrink
     raw = counts_of(chunk.span)
     counts: FluxImage | Counts = np.ascontiguousarray(raw)
     if corrected is not None:
         counts = np.ascontiguousarray(corrected(raw, n_frames))
     if masked is not None:
         lit, seen = counts.astype(np.float32) * masked, masked * np.float32(n_frames)
-        return _Summed(landing, n_frames, average_squares(lit, shrink), average_squares(seen, shrink))
+        return _Summed(footprint, n_frames, average_squares(lit, shrink), average_squares(seen, shrink))
     if shrink == 1:
-        return _Summed(landing, n_frames, counts if landing.straight else counts.astype(np.float32), None)
+        return _Summed(footprint, n_frames, counts if footprint.straight else counts.astype(np.float32), None)
     whole = not any(side % shrink for side in counts.shape)
     everywhere = None if whole else average_squares(np.full(counts.shape, n_frames, np.float32), shrink)
-    return _Summed(landing, n_frames, average_squares(counts, shrink), everywhere)
+    return _Summed(footprint, n_frames, average_squares(counts, shrink), everywhere)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,10 +149,11 @@ class _Total:
     """Some rows of the grid.
 
     Attributes:
-        first: the number of the first row.
+        first: index of the first row.
         counts: (H, W) float32.
-        weight: (H, W) float32, but for
-        steps: (H, W + 1) float32 whose sums along rows belong to it: frames that saw everything change it at their ends only.
+        weight: (H, W) float32, coverage from the borders of frames and from masked frames.
+        steps: (H, W + 1) float32, row-wise differences of the coverage inside of frames; `result` adds their cumulative sum to
+            the weight.
     """
 
     first: int
@@ -166,32 +167,32 @@ class _Total:
         return cls(0, *(np.zeros((height, columns), np.float32) for columns in (width, width, width + 1)))
 
     def rows(self, rows: range) -> _Total:
-        """Return the part that holds some of the rows; what is added to it is added here."""
+        """Return a view of some of the rows."""
         part = slice(rows.start, rows.stop)
         return _Total(rows.start, self.counts[part], self.weight[part], self.steps[part])
 
     def add(self, summed: Sequence[_Summed]) -> None:
         """Add sums of chunks, in order."""
         for each in summed:
-            if each.landing.rows.start >= self.first + len(self.counts) or each.landing.rows.stop <= self.first:
+            if each.footprint.rows.start >= self.first + len(self.counts) or each.footprint.rows.stop <= self.first:
                 continue
-            to_image = each.landing.to_image @ translation(0, self.first)
+            to_image = each.footprint.to_image @ translation(0, self.first)
             if each.seen is None:
                 add_footprint(each.counts.shape, to_image, float(each.n_frames), self.steps, self.weight)
             else:
-                self._warp(each.seen, each.landing, to_image, self.weight)
-            self._warp(each.counts, each.landing, to_image, self.counts)
+                self._warp(each.seen, each.footprint, to_image, self.weight)
+            self._warp(each.counts, each.footprint, to_image, self.counts)
 
-    def _warp(self, image: FluxImage | Counts, landing: Landing, to_image: Homography, total: FluxImage) -> None:
-        if landing.straight:
+    def _warp(self, image: FluxImage | Counts, footprint: Footprint, to_image: Homography, total: FluxImage) -> None:
+        if footprint.straight:
             add_warped(image, to_image, total)
             return
-        rows = range(max(landing.rows.start - self.first, 0), min(landing.rows.stop - self.first, len(total)))
-        if rows and landing.columns:
-            size = len(landing.columns), len(rows)
-            to_image = to_image @ translation(landing.columns.start, rows.start)
+        rows = range(max(footprint.rows.start - self.first, 0), min(footprint.rows.stop - self.first, len(total)))
+        if rows and footprint.columns:
+            size = len(footprint.columns), len(rows)
+            to_image = to_image @ translation(footprint.columns.start, rows.start)
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            box = slice(rows.start, rows.stop), slice(landing.columns.start, landing.columns.stop)
+            box = slice(rows.start, rows.stop), slice(footprint.columns.start, footprint.columns.stop)
             total[box] += cv2.warpPerspective(image, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
 
     def result(self) -> PhotonSum:
@@ -199,11 +200,7 @@ class _Total:
         return PhotonSum(self.counts, self.weight)
 
 
-def _no_one(_: int) -> None:
-    """Listen to no progress."""
-
-
-def _divided(length: int, parts: int) -> list[tuple[int, int]]:
-    """Divide a length into parts that are about equal."""
+def divided(length: int, parts: int) -> list[range]:
+    """Divide `range(length)` into parts of about equal length, each of 1 or more."""
     bounds = [length * part // parts for part in range(parts + 1)]
-    return [(start, stop) for start, stop in pairwise(bounds) if start < stop]
+    return [range(start, stop) for start, stop in pairwise(bounds) if start < stop]

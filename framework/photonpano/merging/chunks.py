@@ -1,19 +1,20 @@
-"""Chunks: runs of frames within which the motion stays under a fraction of a pixel, so that one warp serves them all."""
+"""Chunks: runs of frames within which the motion stays below a tolerance, so that one warp serves the whole run."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import OrderedDict
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
 from photonpano.geometry import corner_displacements, inverse
-from photonpano.protocols import Trajectory
-from photonpano.values import FloatArray, FrameSpan, Homography
-
-_AT_ONCE = 8192
-"""So many frames are looked at together, which bounds the memory that it takes."""
+from photonpano.geometry.canvas import BLOCK_FRAMES
+from photonpano.protocols import Source, Trajectory
+from photonpano.values import Counts, FloatArray, FrameSpan, Homography
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +23,8 @@ class Chunk:
 
     Attributes:
         span: the frames.
-        homography: (3, 3), pixels of the frame at the centre of the span to pixels of the reference plane.
+        homography: (3, 3), pixels of the frame at the centre of the span to pixels of the reference plane: that instant of
+            the trajectory. The identity where no motion is known.
     """
 
     span: FrameSpan
@@ -36,13 +38,13 @@ def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, i
         span: the frames to split.
         trajectory: the motion along which they are summed.
         frame_shape: (height, width) of a frame.
-        tolerance_px: length of the way of a corner, in pixels of a frame, that one warp may ignore. A chunk is warped at its
-            centre instant, so that no photon is misplaced by more than about half of it.
+        tolerance_px: length of a corner's path, in pixels of a frame, that one warp may ignore. A chunk is warped at its
+            centre instant, so that a photon is misplaced by about half of it at most.
     """
-    parts = range(span.start, span.stop - 1, _AT_ONCE)
-    steps = [_steps_px(trajectory, start, min(start + _AT_ONCE, span.stop - 1), frame_shape) for start in parts]
-    way = np.cumsum(np.concatenate([[0.0], *steps]))
-    starts = span.start + np.flatnonzero(np.diff(np.floor(way / tolerance_px), prepend=-1.0))
+    blocks = range(span.start, span.stop - 1, BLOCK_FRAMES)
+    steps = [_steps_px(trajectory, start, min(start + BLOCK_FRAMES, span.stop - 1), frame_shape) for start in blocks]
+    path_px = np.cumsum(np.concatenate([[0.0], *steps]))
+    starts = span.start + np.flatnonzero(np.diff(np.floor(path_px / tolerance_px), prepend=-1.0))
     stops = np.append(starts[1:], span.stop)
     spans = [FrameSpan(start, stop) for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
     centres = trajectory.at([chunk.centre for chunk in spans])
@@ -50,19 +52,21 @@ def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, i
 
 
 def _steps_px(trajectory: Trajectory, start: int, stop: int, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return how far the corners of the frames from start to stop move to the next frame, at most: (stop - start,)."""
+    """Return the largest corner displacement from each frame to the next, from `start` to `stop`: (stop - start,)."""
     homographies = trajectory.at(np.arange(start, stop + 1))
-    # Seen from frame t, in its own pixels: how far frame t + 1 has moved.
+    # The motion of frame t + 1 in pixels of frame t.
     steps = inverse(homographies[:-1]) @ homographies[1:]
     return np.asarray(corner_displacements(steps, np.eye(3), frame_shape).max(axis=-1))
 
 
 def clipped(chunks: Sequence[Chunk], span: FrameSpan, trajectory: Trajectory) -> tuple[Chunk, ...]:
-    """Return the parts of chunks that lie in a span. Those inside are the same for every span, so that sums can be shared.
+    """Return the parts of chunks that lie in a span.
+
+    Chunks inside the span are returned as they are, so that overlapping spans share their sums: see `CountsCache`.
 
     Args:
-        chunks: in order, as `chunks_of` gives them.
-        span: the frames that are wanted.
+        chunks: in order, as `chunks_of` returns them.
+        span: the frames to keep.
         trajectory: the motion along which they are summed.
     """
     first = bisect_right(chunks, span.start, key=lambda chunk: chunk.span.stop)
@@ -74,3 +78,38 @@ def clipped(chunks: Sequence[Chunk], span: FrameSpan, trajectory: Trajectory) ->
         if part != whole:
             inside[end] = Chunk(part, trajectory.at([part.centre])[0])
     return tuple(inside)
+
+
+class CountsCache:
+    """Caches the sums of frames that overlapping groups share; drops the least recently used. Safe from several threads."""
+
+    def __init__(self, source: Source, capacity_bytes: int) -> None:
+        self._source = source
+        height, width = source.info.frame_shape
+        self._max_sums = max(1, capacity_bytes // (4 * height * width))
+        self._sums: OrderedDict[FrameSpan, Future[Counts]] = OrderedDict()
+        self._lock = Lock()
+
+    def __call__(self, span: FrameSpan) -> Counts:
+        """Return the sum of the frames of a span: (H, W) uint32, read-only.
+
+        If several threads ask for one span at once, the first computes it and the others wait.
+        """
+        with self._lock:
+            cached = self._sums.get(span)
+            if cached is not None:
+                self._sums.move_to_end(span)
+            else:
+                future = self._sums[span] = Future()
+                while len(self._sums) > self._max_sums:
+                    self._sums.popitem(last=False)
+        if cached is not None:
+            return cached.result()
+        try:
+            counts = self._source.counts(span)
+            counts.flags.writeable = False
+        except BaseException as error:
+            future.set_exception(error)
+            raise
+        future.set_result(counts)
+        return counts

@@ -1,4 +1,4 @@
-"""Where frames land on a grid: told for all chunks at once, before any of them is summed."""
+"""Footprints of frames on a grid: which pixels each frame covers and how it is warped, for all chunks at once."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from photonpano.geometry import apply, corners, inverse, rescaling
 from photonpano.values import FloatArray, Homography
 
 _LONG_RUN_PX = 96
-"""Shorter runs of neighbours are warped faster pixel by pixel."""
+"""From this length of runs on, the compiled warp along runs is faster than OpenCV's warp, pixel by pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Landing:
-    """How a frame is brought onto a grid.
+class Footprint:
+    """Where a frame lies on a grid, and how it is warped there.
 
     Attributes:
-        shrink: so many pixels squared are averaged first.
-        to_image: (3, 3), pixels of the grid to pixels of the frame, averaged.
-        rows: those of the grid that it can touch; empty if it lies outside.
-        columns: the same for columns.
-        straight: it is hardly turned or enlarged, so that neighbours on a row of the grid see neighbours.
+        shrink: squares of this many pixels a side are averaged before the warp.
+        to_image: (3, 3), pixels of the grid to pixels of the averaged frame.
+        rows: rows of the grid that the frame may touch; empty if it lies outside.
+        columns: columns of the grid that the frame may touch; empty if it lies outside.
+        straight: the frame is hardly rotated or scaled, so that neighbours on a row of the grid lie at neighbours of the frame.
     """
 
     shrink: int
@@ -32,8 +32,8 @@ class Landing:
     straight: bool
 
 
-def landings(to_grid: FloatArray, frame_shape: tuple[int, int], grid_shape: tuple[int, int]) -> list[Landing]:
-    """Tell how frames are brought onto a grid.
+def footprints_of(to_grid: FloatArray, frame_shape: tuple[int, int], grid_shape: tuple[int, int]) -> list[Footprint]:
+    """Return the footprint of each frame on a grid.
 
     Args:
         to_grid: (N, 3, 3), pixels of each frame to pixels of the grid.
@@ -46,7 +46,7 @@ def landings(to_grid: FloatArray, frame_shape: tuple[int, int], grid_shape: tupl
     to_image = inverse(to_grid)
     straight = _run_px(to_image, low, high) >= _LONG_RUN_PX
     return [
-        Landing(int(factor), back, range(y0, y1), range(x0, x1), bool(flag))
+        Footprint(int(factor), back, range(y0, y1), range(x0, x1), bool(flag))
         for factor, back, (x0, y0), (x1, y1), flag in zip(shrink, to_image, low.tolist(), high.tolist(), straight, strict=True)
     ]
 
@@ -64,7 +64,7 @@ def _shrink_factors(to_grid: FloatArray, frame_shape: tuple[int, int]) -> list[i
 
 
 def _touched(outline: FloatArray, grid_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first (x, y) of the grid that each frame of (N, 4, 2) corners can touch, and the one after the last."""
+    """Return the first (x, y) of the grid that each frame of (N, 4, 2) corners may touch, and the one after the last."""
     size = np.array([grid_shape[1], grid_shape[0]])
     low = np.clip(np.floor(outline.min(axis=1)) - 1, 0, size)
     high = np.clip(np.ceil(outline.max(axis=1)) + 2, low, size)
@@ -72,7 +72,7 @@ def _touched(outline: FloatArray, grid_shape: tuple[int, int]) -> tuple[np.ndarr
 
 
 def _run_px(to_image: FloatArray, low: np.ndarray, high: np.ndarray) -> FloatArray:
-    """Return for how many pixels of a row, at the worst corner that a frame touches, each sees one pixel further right."""
+    """Return the length of runs along a row on which each step of a pixel is one of the frame, at each frame's worst corner."""
     x, y = np.stack([low, high], axis=-1).transpose(1, 0, 2)
     places = np.stack([x[:, [0, 0, 1, 1]], y[:, [0, 1, 0, 1]], np.ones((len(x), 4))], axis=1)
     u, v, depth = (to_image @ places).transpose(1, 0, 2)

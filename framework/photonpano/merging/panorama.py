@@ -1,4 +1,4 @@
-"""The panorama: every frame whose motion is known, warped onto one canvas and estimated once."""
+"""Render the panorama: choose its canvas, divide it into tiles that fit into memory, merge all located frames on each."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from photonpano.protocols import Source, Trajectory
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
 BYTES_PER_PIXEL = 40
-"""Peak memory for each pixel that is rendered at a time: sums, estimate and what is written, as measured in the tests."""
-LARGEST = 16
-"""A panorama that is so many times as large as what fits into the memory is refused: it mostly comes of a wrong motion."""
+"""Peak memory of rendering, per pixel of a tile: sums, estimate and output, as measured in the tests."""
+MAX_EXCESS = 16
+"""A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,9 +27,9 @@ class Tile:
     """A part of a canvas.
 
     Attributes:
-        left: columns of the canvas to the left of it.
-        top: rows of the canvas above it.
-        canvas: its own pixel grid.
+        left: first column, on the canvas.
+        top: first row, on the canvas.
+        canvas: pixel grid of the tile.
     """
 
     left: int
@@ -42,13 +42,14 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
 
     Args:
         trajectory: the motion, frame pixels to reference pixels.
-        span: the frames that are to be seen.
+        span: the frames to show.
         frame_shape: (height, width) of a frame.
         scale: pixels of the canvas per pixel of the reference frame.
         memory: bytes that rendering may take.
 
     Raises:
-        CanvasTooLargeError: it is `LARGEST` times as large as what fits, or more; the message says how large.
+        CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
+            a scale that fits.
         LocationError: frames reach the horizon of the reference plane.
     """
     homographies = trajectory.at(np.arange(span.start, span.stop))
@@ -60,23 +61,23 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
             "choose a render.reference in the middle of the motion, or fewer frames"
         ) from error
     excess = canvas.height * canvas.width * BYTES_PER_PIXEL / memory
-    if excess > LARGEST:
-        fitting = scale * np.sqrt(LARGEST / excess)
+    if excess > MAX_EXCESS:
+        fitting = scale * np.sqrt(MAX_EXCESS / excess)
         raise CanvasTooLargeError(
-            f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what the {_gib(memory)} of "
-            f"run.memory hold. Up to {LARGEST} times is rendered in parts; more is often a sign of a wrong motion. "
-            f"Raise run.memory, lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
+            f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
+            f"{_gib(memory)} of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
+            f"More often means that the motion is wrong. Raise run.memory, lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
             "or choose a render.reference nearer to the middle of the motion"
         )
     return canvas
 
 
 def tiles_of(canvas: Canvas, memory: int) -> tuple[tuple[Tile, ...], int]:
-    """Divide a canvas across its longer side into tiles that are rendered one by one within the memory.
+    """Divide the longer side of a canvas into tiles that are rendered one by one within the memory.
 
     Returns:
-        The tiles, one if the canvas fits as it is; and by what factor an overview of it is smaller that fits beside them.
-        Tiles begin at multiples of that factor.
+        The tiles, one if the whole canvas fits; and the factor by which a `Thumbnail` that fits beside a tile is smaller than
+        the canvas. Tiles begin at multiples of that factor.
     """
     fits = memory // BYTES_PER_PIXEL
     n_pixels = canvas.height * canvas.width
@@ -102,12 +103,12 @@ def render(
     tolerance_px: float,
     context: Context,
 ) -> Panorama:
-    """Merge the frames of a span on a canvas: warped, summed, and one maximum-likelihood estimate for each pixel.
+    """Merge the frames of a span on a canvas, with one maximum-likelihood estimate for each pixel.
 
     Args:
         source: the capture.
         trajectory: frame pixels to reference pixels.
-        span: the frames that are merged.
+        span: the frames to merge.
         canvas: the pixel grid.
         tolerance_px: frames that move less than this are summed before they are warped.
         context: threads and progress.
@@ -136,45 +137,44 @@ def render_tiles(
             yield Panorama(*photons.estimate(source.response), grid.transform)
 
 
-class Overview:
-    """Gathers tiles into a panorama that is smaller by a whole factor.
+class Thumbnail:
+    """A panorama downscaled by a whole factor, put together tile by tile.
 
     Args:
-        canvas: what the tiles are parts of.
-        reduction: so many pixels squared become one; tiles begin at multiples of it. 1 keeps the only tile as it is.
+        canvas: the canvas that the tiles are parts of.
+        reduction: squares of this many pixels a side are averaged; tiles begin at multiples of it. 1 keeps the only tile.
     """
 
     def __init__(self, canvas: Canvas, reduction: int) -> None:
         self._reduction = reduction
         self._n_pixels, self._n_seen = canvas.height * canvas.width, 0
         shape = -(-canvas.height // reduction), -(-canvas.width // reduction)
-        to_overview = rescaling(1 / reduction) @ canvas.transform
         empty = np.zeros((0, 0) if reduction == 1 else shape, np.float32)
-        self.panorama = Panorama(empty, empty.copy(), to_overview)
+        self.panorama = Panorama(empty, empty.copy(), rescaling(1 / reduction) @ canvas.transform)
 
     def add(self, tile: Tile, rendered: Panorama) -> None:
-        """Enter a tile: the mean flux of the pixels that were seen, and the mean weight of all."""
+        """Add a tile: the mean flux of the seen pixels and the mean weight of all pixels of each square."""
         step = self._reduction
-        known = rendered.weight > 0
-        self._n_seen += int(np.count_nonzero(known))
+        seen = rendered.weight > 0
+        self._n_seen += int(np.count_nonzero(seen))
         if step == 1:
             self.panorama = rendered
             return
-        share = _averaged(known, step)
-        height, width = share.shape
+        seen_share = _averaged(seen, step)
+        height, width = seen_share.shape
         box = np.s_[tile.top // step : tile.top // step + height, tile.left // step : tile.left // step + width]
-        flux = _averaged(np.where(known, rendered.flux, 0), step)
-        self.panorama.flux[box] = np.divide(flux, share, out=np.full_like(flux, np.nan), where=share > 0)
+        flux = _averaged(np.where(seen, rendered.flux, 0), step)
+        self.panorama.flux[box] = np.divide(flux, seen_share, out=np.full_like(flux, np.nan), where=seen_share > 0)
         self.panorama.weight[box] = _averaged(rendered.weight, step)
 
     @property
     def coverage_share(self) -> float:
-        """The share of the canvas that was seen."""
+        """Share of the canvas that was seen."""
         return self._n_seen / self._n_pixels
 
 
 def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:
-    """Average squares of pixels; what a square lacks at the right and at the bottom counts as zero."""
+    """Average squares of pixels; the image is padded with 0 to whole squares at the right and at the bottom."""
     height, width = image.shape
     padded = np.pad(image, ((0, -height % step), (0, -width % step))).astype(np.float32, copy=False)
     blocks = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step)
@@ -186,6 +186,6 @@ def _gib(size: float) -> str:
 
 
 def _rounded_down(scale: float) -> float:
-    """Round down to two digits, so that the suggested scale fits."""
+    """Round down to two significant digits, so that the suggested scale fits."""
     digit = 10.0 ** (np.floor(np.log10(scale)) - 1)
     return float(np.floor(scale / digit) * digit)

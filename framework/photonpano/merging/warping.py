@@ -1,4 +1,4 @@
-"""Warps that add up as they go: bilinear, exact, and vectorised along runs of pixels that look at neighbours."""
+"""Add bilinear warps of images to a grid, vectorised along runs of pixels whose neighbours lie at neighbours of the image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from photonpano.geometry.sampling import Pixels, run_from, sample_run, visible_c
 
 @compiled
 def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.float32]) -> None:
-    """Add an image to a grid: at each pixel, what lies there, interpolated linearly; nothing outside of the image.
+    """Add an image to a grid, interpolated bilinearly; the image is 0 outside of its border.
 
     Args:
         image: (h, w) float32 or uint32.
@@ -40,13 +40,13 @@ def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.f
 def add_footprint(
     shape: tuple[int, int], to_image: NDArray[np.float64], value: float, steps: NDArray[np.float32], total: NDArray[np.float32]
 ) -> None:
-    """Add what `add_warped` would add for an image of one value, at the cost of its border alone.
+    """Add what `add_warped` adds for an image of one value, but compute pixels at its border only.
 
     Args:
         shape: (h, w) of the image.
         to_image: (3, 3), pixels of the grid to pixels of the image.
-        value: that of every pixel.
-        steps: (H, W + 1) whose sums along rows are to be added to `total` in the end.
+        value: value of every pixel.
+        steps: (H, W + 1), row-wise differences; add their cumulative sums to `total` with `add_running_sums` in the end.
         total: (H, W) the grid.
     """
     for y in range(total.shape[0]):
@@ -61,7 +61,7 @@ def add_footprint(
 
 @compiled
 def add_running_sums(steps: NDArray[np.float32], total: NDArray[np.float32]) -> None:
-    """Add the sums of all steps up to each pixel of a row; see `add_footprint`."""
+    """Add the cumulative sums of `steps` along each row; see `add_footprint`."""
     for y in range(total.shape[0]):
         running, row, step = 0.0, total[y], steps[y]
         for x in range(len(row)):
@@ -70,7 +70,7 @@ def add_running_sums(steps: NDArray[np.float32], total: NDArray[np.float32]) -> 
 
 
 def average_squares(image: Pixels, side: int) -> NDArray[np.float32]:
-    """Average squares of pixels, (h, w) to (ceil(h / side), ceil(w / side)); what is missing of the last counts as 0."""
+    """Average squares of pixels, (h, w) to (ceil(h / side), ceil(w / side)); the image is padded with 0 to whole squares."""
     if side == 1:
         return np.asarray(image, dtype=np.float32)
     averages = np.zeros((-(-image.shape[0] // side), -(-image.shape[1] // side)), np.float32)
@@ -96,8 +96,8 @@ def _parts(shape: tuple[int, int], to_image: NDArray[np.float64], y: int, column
     """Divide a row of a grid.
 
     Returns:
-        Where the image begins to matter, where four of its pixels lie around what is seen, where they no longer do, and where
-        it ceases to matter.
+        first, inside, outside, last: the image contributes to pixels from `first` to `last`, half-open, and those from
+        `inside` to `outside` have four neighbours in the image.
     """
     height, width = shape
     first, last = visible_columns(to_image, y, -1.0, width, -1.0, height, columns)
@@ -109,7 +109,7 @@ def _parts(shape: tuple[int, int], to_image: NDArray[np.float64], y: int, column
 
 @compiled
 def _at(image: Pixels, to_image: NDArray[np.float64], x: int, y: int) -> float:
-    """Interpolate at the border, beyond which there is nothing."""
+    """Interpolate at the border, beyond which the image is 0."""
     height, width = image.shape
     u, v = _mapped(to_image, x, y)
     left, top = int(np.floor(u)), int(np.floor(v))

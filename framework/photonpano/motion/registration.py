@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from photonpano.errors import PluginError
-from photonpano.geometry import corner_displacements, implausibility, inverse, rescaled
+from photonpano.geometry import corner_displacements, inverse, rescaled, why_implausible
 from photonpano.motion.closures import agreement
 from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import Level, NamedLocator
@@ -218,7 +218,7 @@ class Registrar:
     def _checked(self, motion: Located, moving: int, fixed: int) -> Located | NotLocated:
         """Convert a motion to px of frames, and refuse what no camera does."""
         homography = rescaled(motion.homography, 1 / self._level.scale)
-        if reason := implausibility(homography, self._exposures.frame_shape):
+        if reason := why_implausible(homography, self._exposures.frame_shape):
             return NotLocated(reason, motion.evidence)
         groups = self._exposures.groups
         new = self._independent * max(1 - shared_share(groups[moving].span, groups[fixed].span), SHARED_PHOTONS)

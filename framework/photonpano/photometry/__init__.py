@@ -1,4 +1,4 @@
-"""The detection model, flux estimation, tone curves and packed-bit sums."""
+"""Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
 from photonpano.photometry.contrast import signal_to_noise
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits

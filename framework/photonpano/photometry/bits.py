@@ -1,4 +1,4 @@
-"""The order of bits in bytes."""
+"""Reorder bits within bytes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def transpose_bits(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> None
 
     Args:
         source: (rows, columns); the bits of a byte are eight pixels of a column, the first the highest.
-        target: (8 rows, ceil(columns / 8)), what is written to.
+        target: (8 rows, ceil(columns / 8)), the output.
     """
     rows, columns = source.shape
     for row in range(rows):

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-MOST_FRAMES = 255
-"""Counts of a block stay below 2^8, so that the bits of a count fit into a byte."""
+MAX_FRAMES = 255
+"""Frames of a block, so that a count fits into a byte."""
 _BYTES = 2048
-"""Bytes of a frame that are summed at a time: with everything that the sum needs they lie in the fastest cache."""
+"""Bytes of a frame that are summed at a time, so that all rows of the sum fit into the level 1 cache."""
 _WORDS = _BYTES // 8
 _ROWS = 12
-"""Rows of a stage: eight that come in, three of counter, and the carry, of eight times the weight."""
+"""Rows of a stage: eight of input, three of counter, and the carry, of eight times the weight."""
 _STAGES = 3
-"""Stages count ones, eights and sixty-fours."""
+"""Stages, which count ones, eights and sixty-fours."""
 
 
 @compiled
@@ -28,9 +28,9 @@ def add_counts(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: N
 
     Args:
         packed: (n B,) bytes of n frames, one after the other.
-        n_frames: n, at most `MOST_FRAMES`.
+        n_frames: n, at most `MAX_FRAMES`.
         little: whether the first pixel of a byte is its lowest bit, and not its highest.
-        counts: (8 B,), what is added to.
+        counts: (8 B,), which is increased.
     """
     frame_bytes = len(packed) // n_frames
     stages = np.empty((_STAGES, _ROWS * _WORDS), np.uint64)
@@ -56,7 +56,7 @@ def _sum_bits(
     packed: NDArray[np.uint8], n_frames: int, frame_bytes: int, start: int, size: int, stages: NDArray[np.uint64]
 ) -> None:
     """Sum some bytes of all frames; the counters are rows 8 to 10 of each stage."""
-    waiting = np.zeros(_STAGES, np.int64)
+    filled = np.zeros(_STAGES, np.int64)
     for stage in range(_STAGES):
         _clear(stages[stage][8 * _WORDS : 11 * _WORDS])
     incoming = stages[0].view(np.uint8)
@@ -71,20 +71,20 @@ def _sum_bits(
         _add_eight(stages[0])
         last = frame + 8 >= n_frames
         for stage in range(1, _STAGES):
-            rows, k = stages[stage], waiting[stage]
+            rows, k = stages[stage], filled[stage]
             _copy(stages[stage - 1][11 * _WORDS :], rows[k * _WORDS : (k + 1) * _WORDS])
-            waiting[stage] = k + 1
+            filled[stage] = k + 1
             if k < 7 and not last:
                 break
             _clear(rows[(k + 1) * _WORDS : 8 * _WORDS])
-            waiting[stage] = 0
+            filled[stage] = 0
             _add_eight(rows)
 
 
 @compiled
 def _add_eight(rows: NDArray[np.uint64]) -> None:
     """Add eight rows of bits to three of counter, and leave the carry."""
-    # All rows lie in one array, at distances known when this is compiled, so that it can be vectorised.
+    # All rows lie in one array, at distances known at compile time, so that the loop is vectorised.
     for word in range(_WORDS):
         one, two, four = rows[8 * _WORDS + word], rows[9 * _WORDS + word], rows[10 * _WORDS + word]
         a, one = _add(one, rows[word], rows[_WORDS + word])
@@ -119,8 +119,8 @@ def _increase(counts: NDArray[np.uint32], by: NDArray[np.uint8]) -> None:
 @compiled
 def _add(a: np.uint64, b: np.uint64, c: np.uint64) -> tuple[np.uint64, np.uint64]:
     """Add three bits of one weight, for 64 pixels: (carry, sum)."""
-    differ = a ^ b
-    return (a & b) | (differ & c), differ ^ c
+    difference = a ^ b
+    return (a & b) | (difference & c), difference ^ c
 
 
 @compiled
@@ -139,7 +139,7 @@ def _transpose(stages: NDArray[np.uint64], n_bits: int, first: int, counts: NDAr
 
     The bits of eight pixels are an 8 x 8 matrix, whose transpose (Hacker's Delight, section 7-3) has a row for each pixel.
     """
-    # Byte 7 - k of a word is to hold the bits of weight 2^k.
+    # Byte 7 - k of a word holds the bits of weight 2^k.
     for k in range(8):
         shift = np.uint64(8 * (7 - k))
         if k >= n_bits:

@@ -1,4 +1,4 @@
-"""How far a scene stands out from photon noise."""
+"""Contrast of a scene relative to photon noise."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import numpy as np
 from photonpano.values import VirtualExposure
 
 _ROWS = 16
+"""Rows of blocks that are sampled."""
 _BLOCK = 4
-"""Averages of so many pixels squared tell scene and noise apart: noise falls with their number, the scene hardly does."""
+"""Side of the blocks, px, whose averages separate scene and noise: averaging reduces the noise and hardly the scene."""
 
 
 def signal_to_noise(exposure: VirtualExposure) -> float:
-    """Return the standard deviation of the scene over that of the noise of a pixel, on the scale where noise is uniform.
+    """Return the standard deviation of the scene over that of a pixel's noise, on the scale where noise is uniform.
 
-    Around 1 and below, single pixels are noise; registration then needs larger structures. 0 if nothing stands out.
+    At 1 and below, single pixels are mostly noise, and registration needs larger structures. 0 if there is no contrast.
     """
     flux, weight = _some_rows(exposure.flux), _some_rows(exposure.weight)
     known = weight > 0
@@ -31,7 +32,7 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
 
 
 def _some_rows(image: np.ndarray) -> np.ndarray:
-    """Return one in a few rows of blocks, which tell enough."""
+    """Return about `_ROWS` evenly spaced rows of blocks."""
     rows = image[: len(image) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, image.shape[1])
     step = max(1, len(rows) // _ROWS)
     return rows[::step].reshape(-1, image.shape[1])

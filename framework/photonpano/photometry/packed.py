@@ -13,39 +13,39 @@ BitOrder: TypeAlias = Literal["big", "little"]
 """Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`."""
 
 _BLOCK_BYTES = 1024**2
-"""Bytes of frames that are summed at a time: about what a core's cache holds."""
+"""Bytes of frames that are summed at a time: about the cache of a core."""
 
 
 def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None = None, bit_order: BitOrder = "big") -> Counts:
-    """Sum bit-packed frames, pixel by pixel, as fast as memory gives them, and in little memory beyond the result.
+    """Sum bit-packed frames, pixel by pixel, in little memory beyond the result.
 
     Args:
         packed: (n, H, ceil(width / 8)) uint8, packed along the width as `numpy.packbits` does. A memory-mapped array is read
             in blocks.
         width: W, columns of a frame; the bits beyond it are ignored.
-        counts: (H, W) uint32, what the sum is added to; None for zeros.
-        bit_order: which bit of a byte its first pixel is.
+        counts: (H, W) uint32 to add the sum to; None for zeros.
+        bit_order: which bit of a byte is its first pixel.
 
     Returns:
-        (H, W) uint32, `counts` where it was given; zeros for no frames.
+        (H, W) uint32: `counts` if it was given.
 
     Raises:
-        ValueError: an array is not of that type or shape.
+        ValueError: an array has another type or shape.
     """
     if packed.dtype != np.uint8 or packed.ndim != 3 or packed.shape[2] != -(-width // 8):
         raise ValueError(
-            f"packed frames of width {width} are uint8 (n, H, {-(-width // 8)}), got {packed.dtype} {packed.shape}"
+            f"packed frames of width {width} must be uint8 (n, H, {-(-width // 8)}), got {packed.dtype} {packed.shape}"
         )
-    from photonpano.photometry.carry_save import MOST_FRAMES, add_counts
+    from photonpano.photometry.carry_save import MAX_FRAMES, add_counts
 
     n_frames, height, row_bytes = packed.shape
     if counts is None:
         counts = np.zeros((height, width), dtype=np.uint32)
     elif counts.dtype != np.uint32 or counts.shape != (height, width) or not counts.flags.c_contiguous:
-        raise ValueError(f"counts to add to are contiguous uint32 {(height, width)}, got {counts.dtype} {counts.shape}")
+        raise ValueError(f"counts must be contiguous uint32 {(height, width)}, got {counts.dtype} {counts.shape}")
     whole = width == 8 * row_bytes
     padded = counts if whole else np.zeros((height, 8 * row_bytes), dtype=np.uint32)
-    step = min(MOST_FRAMES, max(8, _BLOCK_BYTES // max(1, height * row_bytes)))
+    step = min(MAX_FRAMES, max(8, _BLOCK_BYTES // max(1, height * row_bytes)))
     for start in range(0, n_frames, step):
         block = np.ascontiguousarray(packed[start : start + step])
         add_counts(block.reshape(-1), len(block), bit_order == "little", padded.reshape(-1))
@@ -55,7 +55,7 @@ def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None =
 
 
 def reversed_bits(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Turn packed pixels of one bit order into those of the other: an array of the same shape."""
+    """Convert packed pixels from one bit order to the other: an array of the same shape."""
     from photonpano.photometry.bits import reverse_bits
 
     turned = np.empty(packed.shape, np.uint8)
@@ -64,7 +64,7 @@ def reversed_bits(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def packed_along_width(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Pack along the width what is packed along the height: (n, H / 8, W) becomes (n, H, ceil(W / 8))."""
+    """Repack frames from along the height to along the width: (n, H / 8, W) becomes (n, H, ceil(W / 8))."""
     from photonpano.photometry.bits import transpose_bits
 
     n_frames, rows, width = packed.shape

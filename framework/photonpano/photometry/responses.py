@@ -1,4 +1,4 @@
-"""How a camera turns flux into counts, and back."""
+"""Camera responses: flux to counts, and back."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 class BinaryResponse:
     """A pixel is 1 if it detected at least one photon (paper, equations 2 and 3).
 
-    The mean count at flux `f` (detected photons per frame period, dark counts included) is `1 - exp(-f)`.
+    The mean count at flux `f` (detected photons per pixel per frame, dark counts included) is `1 - exp(-f)`.
 
-    A pixel that is lit in all of n frames has no finite estimate. The rule: half a frame is taken to be dark, so its flux is
-    `ln(2 n)`, which is what the next brighter pixel could not exceed by more than a photon's chance.
+    A pixel that is lit in all of n frames has no finite maximum-likelihood estimate. Half a frame is then counted as dark, so
+    that its flux is `ln(2 n)`.
     """
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -23,15 +23,15 @@ class BinaryResponse:
         return -np.expm1(-flux)
 
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the maximum-likelihood flux `-ln(1 - mean_count)` (equation 3), with saturation as the class says."""
+        """Return the maximum-likelihood flux `-ln(1 - mean_count)` (equation 3), at most `ln(2 frames)`."""
         ceiling = 1 - 0.5 / np.maximum(frames, 1)
         return np.asarray(-np.log1p(-np.clip(mean_count, 0, ceiling)), dtype=np.float32)
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `arcsin(sqrt((k + 3/8) / (n + 3/4)))` of k counts in n frames, from 0 to pi/2 (Anscombe 1948).
 
-        It makes binomial noise uniform. Without the two fractions the mean would fall with the number of frames in the
-        dark: the ends of a merged exposure, which few frames saw, would look darker than they are.
+        It makes binomial noise uniform. Without the two fractions the mean of dark pixels would depend on the number of
+        frames, and the ends of a merged exposure, which few frames saw, would look too dark.
         """
         counts = np.clip(self.mean_count(flux), 0, 1) * frames
         return np.asarray(np.arcsin(np.sqrt((counts + 0.375) / (frames + np.float32(0.75)))), dtype=np.float32)
@@ -45,11 +45,11 @@ class BinaryResponse:
 class BinarySumResponse:
     """A frame is the sum of `n` binary frames, taken one after the other, so that a count goes from 0 to n.
 
-    Flux is photons per pixel per period of the *sum*. Each binary frame gets the n-th part of it, so the mean count at flux `f`
-    is `n (1 - exp(-f / n))`. All else follows from `BinaryResponse`, of n times as many frames.
+    Flux is photons per pixel per frame, where a frame is the sum. Each binary frame gets the n-th part of it, so that the mean
+    count at flux `f` is `n (1 - exp(-f / n))`. Noise is that of `BinaryResponse` for n times as many frames.
 
     Attributes:
-        n: how many binary frames are summed.
+        n: number of binary frames in a sum.
     """
 
     n: int
@@ -59,11 +59,11 @@ class BinarySumResponse:
         return np.asarray(self.n * BinaryResponse().mean_count(flux / np.float32(self.n)), dtype=np.float32)
 
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the maximum-likelihood flux `-n ln(1 - mean_count / n)`; a pixel that is always lit has `n ln(2 n frames)`."""
+        """Return the maximum-likelihood flux `-n ln(1 - mean_count / n)`, at most `n ln(2 n frames)`."""
         return np.asarray(self.n * BinaryResponse().flux(mean_count / np.float32(self.n), self.n * frames), dtype=np.float32)
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return what `BinaryResponse` gives for all binary frames, from 0 to pi/2."""
+        """Return the stabilised flux of `BinaryResponse` for all binary frames, from 0 to pi/2."""
         return BinaryResponse().stabilised(flux / np.float32(self.n), self.n * frames)
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
@@ -73,20 +73,19 @@ class BinarySumResponse:
 
 @dataclass(frozen=True, slots=True)
 class IntensityResponse:
-    """A pixel is a grey level that grows with the photons: `black_level + flux / photons_per_level`, until it saturates.
+    """A pixel is a grey level, `black_level + flux / photons_per_level` up to saturation.
 
-    Its noise is that of the photons and of the reading, quantisation included: the variance of a frame is
-    `flux + read_noise^2`, in photons squared.
+    Noise is photon noise and read noise, quantisation included: the variance of a frame is `flux + read_noise^2`, in photons
+    squared.
 
-    A pixel at the saturation level may have seen any number of photons more. The rule: its flux is that of the level, which is
-    the least that it was. What lies below the black level, as noise does in the dark, keeps its sign, so that averages of
-    many frames are right.
+    The flux of a saturated pixel is that of the saturation level, a lower bound. Flux below the black level is negative, so
+    that averages of many frames are unbiased in the dark.
 
     Attributes:
-        photons_per_level: detected photons for one grey level more.
-        black_level: the grey level of no light, which need not be whole.
-        saturation_level: the grey level above which nothing is told.
-        read_noise: standard deviation of what a frame adds to the photons of a pixel, in photons.
+        photons_per_level: detected photons per grey level.
+        black_level: grey level without light; may be a fraction.
+        saturation_level: highest grey level.
+        read_noise: standard deviation of the read noise of a pixel in a frame, in photons.
     """
 
     photons_per_level: float
@@ -95,7 +94,7 @@ class IntensityResponse:
     read_noise: float
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the expected grey level of one frame, the saturation level at most."""
+        """Return the expected grey level of one frame, at most the saturation level."""
         level = flux / self.photons_per_level + self.black_level
         return np.asarray(np.minimum(level, self.saturation_level), dtype=np.float32)
 
@@ -108,8 +107,8 @@ class IntensityResponse:
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `sqrt(flux + read_noise^2 + 3 / (8 n))` of n frames: the generalised Anscombe transform.
 
-        It makes the noise of photons together with that of the reading uniform (Makitalo and Foi 2013), here for a mean of n
-        frames instead of their sum, so that exposures of different lengths look alike.
+        It makes photon noise and read noise together uniform (Makitalo and Foi 2013), here for a mean of n frames instead of
+        their sum, so that exposures of different lengths are comparable.
         """
         shifted = flux + self.read_noise**2 + 0.375 / np.maximum(frames, 1)
         return np.asarray(np.sqrt(np.maximum(shifted, 0)), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Tone curves for looking at flux."""
+"""Tone curves: flux to pictures, and back."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def linear_to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -> NDArray[np.uint8]:
-    """Return 8 bits for looking at: `white` photons per pixel per frame become 255; unknown pixels are black.
+    """Return a picture of 8 bits: `white` photons per pixel per frame become 255, unknown pixels are black.
 
     Args:
         flux: photons per pixel per frame, NaN where unknown.
-        white: the flux from which on everything is white.
-        srgb: whether levels follow the sRGB curve, as screens expect, or are in proportion to the flux.
+        white: flux that becomes white, as does any higher one.
+        srgb: whether levels follow the sRGB curve, for screens, or are proportional to the flux.
     """
     level = linear_to_srgb(flux / white) if srgb else np.clip(flux / white, 0, 1)
     return np.asarray(np.nan_to_num(level) * 255 + 0.5).astype(np.uint8)

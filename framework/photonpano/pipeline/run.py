@@ -18,7 +18,7 @@ from photonpano.context import Context, Progress
 from photonpano.corrections import CorrectedSource
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas
-from photonpano.merging.panorama import Overview, Tile, plan_canvas, render_tiles, tiles_of
+from photonpano.merging.panorama import Thumbnail, Tile, plan_canvas, render_tiles, tiles_of
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_levels
@@ -121,7 +121,7 @@ def execute(
     covered = results[-1].located.covered
     canvas = plan_canvas(trajectory, covered, stream.frame_shape, plan.render.scale, int(plan.run.memory))
     tiles, reduction = tiles_of(canvas, int(plan.run.memory))
-    shown = Overview(canvas, reduction)
+    shown = Thumbnail(canvas, reduction)
     with one_thread_inside():
         rendered = render_tiles(source, trajectory, covered, tiles, plan.render.tolerance_px, context)
         for tile, part in zip(tiles, rendered, strict=True):

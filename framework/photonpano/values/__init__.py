@@ -1,4 +1,4 @@
-"""Frozen values that pass between the stages; they import numpy only."""
+"""Frozen values that stages exchange; this package imports numpy only."""
 
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
 from photonpano.values.capture import CaptureSummary, Decision, DecisionValue

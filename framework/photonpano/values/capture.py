@@ -1,4 +1,4 @@
-"""What the frames of a capture tell before any motion is known, and what was chosen because of it."""
+"""Summary of a capture, and decisions that follow from it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 DecisionValue: TypeAlias = bool | int | float | str
-"""What can be chosen, so that it can be recorded."""
+"""Values of decisions that can be recorded."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureSummary:
-    """How bright a capture is, and how fast its image moves.
+    """Brightness of a capture and speed of its image, measured before any motion is estimated.
 
     Attributes:
-        flux: mean over pixels and places, photons per pixel per frame.
-        speed_px: how fast the image moves where it is fast, in px a frame; None if no place tells.
-        how: a clause that says how the speed was measured, for the reasons of choices.
+        flux: mean of the sampled frames, photons per pixel per frame.
+        speed_px: upper quantile of the speed of the image, in px per frame; None if it could not be measured.
+        how: a clause that says how the speed was measured, for the reasons of decisions.
     """
 
     flux: float
@@ -26,11 +26,11 @@ class CaptureSummary:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Something that a spec leaves open, and that was chosen from what the capture shows.
+    """A value that the spec leaves open and that was chosen from the capture.
 
     Attributes:
-        what: its name, such as "group_size".
-        value: what was chosen: a number, a text, true or false.
+        what: name of the value, such as "group_size".
+        value: the chosen number, text or flag.
         reason: a clause with the numbers that decided.
     """
 

@@ -1,4 +1,4 @@
-"""Flux images with their weights: virtual exposures and panoramas."""
+"""Flux images with weights: virtual exposures and panoramas; and the camera response."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Response(Protocol):
-    """How a camera turns flux into counts. Every method works element by element and keeps NaN.
+    """Camera response: flux to counts, and back. Every method works element by element and keeps NaN.
 
     Flux is photons per pixel per frame; a mean count is the sum of some frames divided by their number.
     """
@@ -24,18 +24,18 @@ class Response(Protocol):
         ...
 
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the maximum-likelihood flux of a mean count over so many frames; finite for finite input."""
+        """Return the maximum-likelihood flux of a mean count over `frames` frames; finite for finite input."""
         ...
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Map flux estimated from so many frames to a scale on which its noise is the same everywhere: see `stabilised_std`.
+        """Map flux estimated from `frames` frames to a scale on which its noise is uniform: see `stabilised_std`.
 
-        The mean does not depend on the number of frames, so that exposures of different lengths look alike.
+        The mean does not depend on the number of frames, so that exposures of different lengths are comparable.
         """
         ...
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the standard deviation, on that scale, of a flux estimated from so many frames."""
+        """Return the standard deviation, on that scale, of flux estimated from `frames` frames."""
         ...
 
 
@@ -48,10 +48,10 @@ class VirtualExposure:
 
     Attributes:
         flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen.
-        weight: (H, W) float32, how many frames each pixel was seen in; 0 exactly where flux is NaN.
+        weight: (H, W) float32, number of frames in which each pixel was seen; 0 exactly where flux is NaN.
         group: the frames and the instant.
         scale: pixels of the exposure per pixel of a frame.
-        response: the camera's response, which tells the noise of the flux.
+        response: the camera's response, from which the noise of the flux follows.
     """
 
     flux: FluxImage
@@ -67,7 +67,7 @@ class Panorama:
 
     Attributes:
         flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen.
-        weight: (H, W) float32, how many frames each pixel was seen in (the coverage).
+        weight: (H, W) float32, number of frames in which each pixel was seen (the coverage).
         canvas: (3, 3) float64, pixels of the reference plane to pixels of the panorama.
     """
 

@@ -1,4 +1,4 @@
-"""Frame spans, groups, and what is known of a capture without reading it."""
+"""Frame spans, groups, and the properties of a capture that are known without reading its frames."""
 
 from __future__ import annotations
 
@@ -29,6 +29,10 @@ class FrameSpan:
 
     def __str__(self) -> str:
         return f"frames {self.start} to {self.stop - 1}"
+
+    def blocks(self, length: int) -> list[FrameSpan]:
+        """Return the span in blocks of `length` frames, of which the last may be shorter."""
+        return [FrameSpan(start, min(start + length, self.stop)) for start in range(self.start, self.stop, length)]
 
     @property
     def centre(self) -> float:
@@ -65,13 +69,13 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class StreamInfo:
-    """What is known of a capture before any frame is read.
+    """Properties of a capture that are known before any frame is read.
 
     Attributes:
         n_frames: number of frames.
         height: rows of a frame.
         width: columns of a frame.
-        frame_rate_hz: frames a second; None if the capture does not say.
+        frame_rate_hz: frames per second; None if the capture does not give it.
         kind: "binary" if a pixel is 0 or 1, "intensity" if it is a grey value or a sum of binary frames.
         bit_depth: bits of a pixel.
     """
@@ -94,17 +98,17 @@ class StreamInfo:
         return FrameSpan(0, self.n_frames)
 
     def spread(self, places: int, frames: int) -> list[FrameSpan]:
-        """Return spans of so many frames at so many places all over the capture; all of it at once where it is no longer."""
+        """Return `places` evenly spaced spans of `frames` frames; the whole capture in one span if it is shorter than that."""
         if self.n_frames <= places * frames:
             return [self.span]
         starts = np.linspace(0, self.n_frames - frames, places).astype(int).tolist()
         return [FrameSpan(start, start + frames) for start in starts]
 
     def require(self, span: FrameSpan) -> None:
-        """Refuse a span that the capture does not hold.
+        """Raise if a span reaches beyond the capture.
 
         Raises:
             InputError: the span reaches beyond the last frame.
         """
         if span.stop > self.n_frames:
-            raise InputError(f"{span} were asked for, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")
+            raise InputError(f"{span} were requested, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")

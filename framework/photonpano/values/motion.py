@@ -22,8 +22,8 @@ class Located:
         homography: (3, 3) float64, h33 = 1.
         information: (8, 8) inverse covariance of the eight parameters p1..p8 of `homography` in the order of the paper
             (section 4, "Interpolate"), None if the locator has none.
-        residual_px: root mean square of what remains after the fit, in pixels of the fixed image; None if unknown.
-        evidence: what the locator counted, by name (keypoints, matches, inliers, ...), for records and messages.
+        residual_px: root mean square of the residuals after the fit, in pixels of the fixed image; None if unknown.
+        evidence: counts of the locator by name (keypoints, matches, inliers, ...), for records and messages.
     """
 
     homography: Homography
@@ -38,7 +38,7 @@ class NotLocated:
 
     Attributes:
         reason: a clause that completes "not located: ...", with the numbers that decided.
-        evidence: what the locator counted, by name.
+        evidence: counts of the locator by name.
     """
 
     reason: str
@@ -47,11 +47,11 @@ class NotLocated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """One pair of virtual exposures of the motion graph, and what was found of it.
+    """A pair of virtual exposures in the motion graph, with its motion.
 
     Attributes:
-        moving: number of the exposure that is mapped.
-        fixed: number of the exposure that it is mapped to.
+        moving: index of the exposure that is mapped.
+        fixed: index of the exposure that it is mapped to.
         motion: the map in pixels of frames (not of rescaled exposures), or the reason why there is none.
         locator: the name of the locator that found the motion; empty where none did.
     """

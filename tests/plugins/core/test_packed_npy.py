@@ -159,7 +159,7 @@ def test_a_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
         for read in (source.counts, source.frames):
             with pytest.raises(InputError) as caught:
                 read(FrameSpan(30, 41))
-            assert str(caught.value) == "frames 30 to 40 were asked for, but the capture has 40 frames (0 to 39)"
+            assert str(caught.value) == "frames 30 to 40 were requested, but the capture has 40 frames (0 to 39)"
 
 
 PACKED = np.packbits(cube(), axis=-1)

@@ -171,7 +171,7 @@ def test_what_no_camera_does_is_refused() -> None:
     """Keypoints at half their distances from the middle."""
     points = np.random.default_rng(0).uniform((0, 0), (239, 159), (60, 2))
     assert few(locator().register(features(points), features(0.5 * points + [60, 40]), None))[0] == (
-        "the homography changes the area of the image 0.25 times (at most 2 is plausible), from 60 matches"
+        "the homography changes the area of the image by a factor of 0.25 (at most 2 is plausible), from 60 matches"
     )
 
 

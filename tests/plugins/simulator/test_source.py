@@ -134,4 +134,4 @@ def test_a_span_beyond_the_end_is_refused(simulated: Simulated) -> None:
         for read in (source.counts, source.frames):
             with pytest.raises(InputError) as caught:
                 read(FrameSpan(40, 51))
-            assert str(caught.value) == "frames 40 to 50 were asked for, but the capture has 50 frames (0 to 49)"
+            assert str(caught.value) == "frames 40 to 50 were requested, but the capture has 50 frames (0 to 49)"

@@ -27,12 +27,12 @@ homographies = st.builds(lambda *p: from_parameters(p), small, small, small, sma
 points = st.lists(st.tuples(st.floats(-10, 600), st.floats(-10, 300)), min_size=1, max_size=5).map(np.array)
 
 
-def test_a_homography_divides_by_the_depth() -> None:
+def test_apply_divides_by_depth() -> None:
     tilted = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.001, 0.0, 1.0]])
     np.testing.assert_allclose(apply(tilted, [[100, 50], [0, 0]]), [[105 / 1.1, 50 / 1.1], [5, 0]])
 
 
-def test_x_is_the_column_and_y_the_row() -> None:
+def test_apply_takes_x_as_column_and_y_as_row() -> None:
     image = np.zeros((5, 7), np.float32)
     image[1, 2] = 1
     moved = cv2.warpPerspective(image, translation(3, 1), (7, 5))
@@ -41,31 +41,31 @@ def test_x_is_the_column_and_y_the_row() -> None:
     assert moved[int(y), int(x)] == 1
 
 
-def test_a_point_on_the_horizon_goes_to_infinity_without_a_warning() -> None:
+def test_apply_returns_infinity_on_the_horizon_without_warning() -> None:
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
     assert np.isinf(apply(horizon, [[100, 50]])).all()
 
 
-def test_stacks_map_one_set_of_points_or_one_each() -> None:
+def test_apply_maps_stacks_with_shared_or_own_points() -> None:
     stack = np.stack([translation(1, 0), translation(0, 2)])
     np.testing.assert_array_equal(apply(stack, [[5, 5]]), [[[6, 5]], [[5, 7]]])
     np.testing.assert_array_equal(apply(stack, [[[5, 5]], [[0, 0]]]), [[[6, 5]], [[0, 2]]])
 
 
 @given(homographies, points)
-def test_the_inverse_undoes(homography: np.ndarray, where: np.ndarray) -> None:
+def test_inverse_maps_points_back(homography: np.ndarray, where: np.ndarray) -> None:
     np.testing.assert_allclose(apply(inverse(homography), apply(homography, where)), where, atol=1e-6)
     assert inverse(homography)[2, 2] == 1
 
 
 @given(homographies, homographies, points)
-def test_products_apply_the_right_factor_first(first: np.ndarray, second: np.ndarray, where: np.ndarray) -> None:
+def test_products_apply_right_factor_first(first: np.ndarray, second: np.ndarray, where: np.ndarray) -> None:
     together = normalised(second @ first)
     np.testing.assert_allclose(apply(together, where), apply(second, apply(first, where)), atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)])
-def test_what_has_no_h33_of_one_is_refused(bad: np.ndarray) -> None:
+def test_normalised_refuses_matrix_without_h33(bad: np.ndarray) -> None:
     with pytest.raises(ValueError, match="a homography must be finite and have h33 other than 0"):
         normalised(bad)
 
@@ -87,17 +87,17 @@ def test_rescaling_agrees_with_opencv(scale: float) -> None:
 
 
 @given(homographies, points, st.sampled_from([0.25, 0.5, 2.0, 3.0]))
-def test_a_rescaled_motion_is_the_same_motion(homography: np.ndarray, where: np.ndarray, scale: float) -> None:
+def test_rescaled_is_the_same_motion_of_rescaled_points(homography: np.ndarray, where: np.ndarray, scale: float) -> None:
     to_scaled = rescaling(scale)
     expected = apply(to_scaled, apply(homography, where))
     np.testing.assert_allclose(apply(rescaled(homography, scale), apply(to_scaled, where)), expected, atol=1e-6)
 
 
-def test_rescaling_doubles_a_translation() -> None:
+def test_rescaled_doubles_translation_at_scale_2() -> None:
     np.testing.assert_allclose(rescaled(translation(3, -1), 2), translation(6, -2), atol=1e-12)
 
 
-def test_the_parameters_stand_as_in_the_paper() -> None:
+def test_parameters_are_ordered_as_in_the_paper() -> None:
     p = np.arange(1, 9) / 10
     expected = [[1 + p[0], p[2], p[4]], [p[1], 1 + p[3], p[5]], [p[6], p[7], 1]]
     np.testing.assert_allclose(from_parameters(p), expected)
@@ -105,13 +105,13 @@ def test_the_parameters_stand_as_in_the_paper() -> None:
 
 
 @given(st.lists(homographies, min_size=1, max_size=4).map(np.stack))
-def test_parameters_round_trip(stack: np.ndarray) -> None:
+def test_from_parameters_inverts_parameters(stack: np.ndarray) -> None:
     assert parameters(stack).shape == (len(stack), 8)
     np.testing.assert_allclose(from_parameters(parameters(stack)), stack, rtol=0, atol=1e-12)
 
 
 @given(homographies, points)
-def test_the_jacobian_agrees_with_finite_differences(homography: np.ndarray, where: np.ndarray) -> None:
+def test_jacobian_agrees_with_finite_differences(homography: np.ndarray, where: np.ndarray) -> None:
     p = parameters(homography)
     steps = np.diag([1e-6] * 4 + [1e-4] * 2 + [1e-9] * 2)
     differences = [

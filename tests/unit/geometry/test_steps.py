@@ -14,14 +14,14 @@ def test_unit_coordinates_span_the_longer_side():
     assert apply(unit_coordinates(SHAPE), edges) == pytest.approx(np.array([[-1, 0], [1, 0], [0, 0]]))
 
 
-def test_generators_are_the_changes_of_a_homography_of_pixels():
+def test_generators_are_derivatives_of_pixel_homographies():
     unit = unit_coordinates(SHAPE)
     step = 1e-6 * np.arange(1, 9)
     changed = np.linalg.inv(unit) @ from_parameters(step) @ unit
     assert np.eye(3) + np.tensordot(step, generators(SHAPE), 1) == pytest.approx(changed, rel=1e-12, abs=1e-12)
 
 
-def test_slopes_are_the_derivatives_of_mapped_points():
+def test_slopes_agree_with_finite_differences():
     points = corners(SHAPE)
     rows = np.concatenate([points, np.ones((4, 1))], axis=1).T
     found = slopes(HOMOGRAPHY @ rows, HOMOGRAPHY @ generators(SHAPE) @ rows)
@@ -34,7 +34,7 @@ def test_slopes_are_the_derivatives_of_mapped_points():
         assert found[:, parameter] == pytest.approx(((ahead - behind) / 2e-6).ravel(), rel=1e-6, abs=1e-4)
 
 
-def test_slopes_of_several_homographies_are_those_of_each():
+def test_slopes_of_stack_equal_slopes_of_each():
     rows = np.concatenate([corners(SHAPE), np.ones((4, 1))], axis=1).T
     both = np.stack([HOMOGRAPHY, np.eye(3)])
     found = slopes(both @ rows, both[:, None] @ generators(SHAPE) @ rows)

@@ -72,7 +72,7 @@ def test_a_cluster_leaves_the_corners_uncertain() -> None:
 @pytest.mark.parametrize(
     ("start", "reason"),
     [
-        (np.diag([0.5, 0.5, 1]), "the homography changes the area of the image 0.25 times (at most 2 is plausible)"),
+        (np.diag([0.5, 0.5, 1]), "the homography changes the area of the image by a factor of 0.25 (at most 2 is plausible)"),
         (np.full((3, 3), np.nan), "the homography is not finite"),
     ],
     ids=["shrinks", "nan"],

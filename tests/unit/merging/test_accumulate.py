@@ -25,14 +25,14 @@ def still(n: int, homography: np.ndarray | None = None) -> list[Chunk]:
     return [Chunk(FrameSpan(0, n), np.eye(3) if homography is None else homography)]
 
 
-def test_a_still_capture_gives_its_counts(memory_source: type) -> None:
+def test_accumulate_returns_source_counts_of_still_capture(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 50))
     photons = accumulate(source, still(50), np.eye(3), SHAPE)
     np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
     np.testing.assert_array_equal(photons.weight, np.full(SHAPE, 50))
 
 
-def test_chunks_of_a_still_capture_add_up(memory_source: type) -> None:
+def test_accumulate_adds_chunks_of_still_capture(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 50))
     halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
     told: list[int] = []
@@ -41,7 +41,7 @@ def test_chunks_of_a_still_capture_add_up(memory_source: type) -> None:
     assert told == [20, 30]
 
 
-def test_a_whole_pixel_shift_moves_counts_and_weight_without_loss(memory_source: type) -> None:
+def test_accumulate_moves_counts_and_weight_by_whole_pixels_without_loss(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 50))
     photons = accumulate(source, still(50, translation(3, -2)), translation(10, 10), (60, 70))
     there = (slice(8, 38), slice(13, 53))
@@ -50,20 +50,20 @@ def test_a_whole_pixel_shift_moves_counts_and_weight_without_loss(memory_source:
     assert np.count_nonzero(photons.weight) == 30 * 40
 
 
-def test_a_frame_off_the_grid_leaves_nothing(memory_source: type) -> None:
+def test_accumulate_ignores_frame_off_the_grid(memory_source: type) -> None:
     photons = accumulate(memory_source(frames_of(FLUX, 5)), still(5, translation(500, 0)), np.eye(3), SHAPE)
     assert not photons.counts.any()
     assert not photons.weight.any()
 
 
-def test_a_frame_half_off_the_grid_keeps_its_half(memory_source: type) -> None:
+def test_accumulate_keeps_visible_half_of_frame(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 5))
     photons = accumulate(source, still(5, translation(-15, 0)), np.eye(3), SHAPE)
     np.testing.assert_allclose(photons.counts[:, :25], source.counts(FrameSpan(0, 5))[:, 15:], rtol=1e-6)
     assert not photons.weight[:, 25:].any()
 
 
-def test_counts_and_weight_are_spread_alike(memory_source: type) -> None:
+def test_accumulate_interpolates_counts_and_weight_alike(memory_source: type) -> None:
     """Half a pixel on, every pixel is the mean of two; at the border half a frame is missing."""
     source = memory_source(frames_of(FLUX, 50))
     photons = accumulate(source, still(50, translation(0.5, 0)), np.eye(3), SHAPE)
@@ -73,7 +73,7 @@ def test_counts_and_weight_are_spread_alike(memory_source: type) -> None:
     np.testing.assert_allclose(photons.weight[:, :2], [[25, 50]] * 30, rtol=1e-5)
 
 
-def test_chunks_come_within_their_tolerance_of_warping_every_frame(memory_source: type, known_motion: type) -> None:
+def test_accumulate_misplaces_chunks_by_less_than_tolerance(memory_source: type, known_motion: type) -> None:
     """Frames of a scene that is smooth: misplaced by at most d px, a count errs by d times its slope."""
     n, tolerance_px = 80, 0.5
     motion = known_motion(lambda frame: from_parameters(np.array([1e-4, 5e-4, -5e-4, 0, 0.11, 0.05, 1e-6, 0]) * frame))
@@ -100,7 +100,7 @@ def test_chunks_come_within_their_tolerance_of_warping_every_frame(memory_source
     assert abs(quick.weight.sum() / weight.sum() - 1) < 0.01
 
 
-def test_the_flux_of_bernoulli_frames_is_unbiased(memory_source: type, pan: Callable) -> None:
+def test_estimate_of_panned_bernoulli_frames_is_unbiased(memory_source: type, pan: Callable) -> None:
     """The mean over P pixels of n frames errs by sqrt((exp(f) - 1) / (n P)), wherever the camera looks."""
     n = 200
     source = memory_source(frames_of(FLUX, n))
@@ -113,7 +113,7 @@ def test_the_flux_of_bernoulli_frames_is_unbiased(memory_source: type, pan: Call
     assert abs(known.mean() - FLUX) < 0.01
 
 
-def test_the_noise_of_a_still_flux_is_that_of_its_photons(memory_source: type) -> None:
+def test_estimate_of_still_capture_has_photon_noise(memory_source: type) -> None:
     n = 200
     source = memory_source(frames_of(FLUX, n))
     flux, _ = accumulate(source, still(n), np.eye(3), SHAPE).estimate(source.response)
@@ -131,14 +131,14 @@ def masked(memory_source: type) -> object:
     return memory_source(frames, valid)
 
 
-def test_a_masked_pixel_of_a_still_camera_is_unknown(masked) -> None:
+def test_estimate_is_nan_at_masked_pixel_of_still_camera(masked) -> None:
     flux, weight = accumulate(masked, still(200), np.eye(3), SHAPE).estimate(masked.response)
     assert weight[10, 20] == 0
     assert np.isnan(flux[10, 20])
     assert np.isnan(flux).sum() == 1
 
 
-def test_motion_fills_a_masked_pixel_without_its_light(masked, pan: Callable) -> None:
+def test_accumulate_fills_masked_pixel_from_moved_frames(masked, pan: Callable) -> None:
     chunks = chunks_of(FrameSpan(0, 200), pan(0.02), SHAPE, 0.25)
     flux, weight = accumulate(masked, chunks, np.eye(3), SHAPE).estimate(masked.response)
     seen = weight[10, 20:25]
@@ -148,7 +148,7 @@ def test_motion_fills_a_masked_pixel_without_its_light(masked, pan: Callable) ->
 
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
-def test_shrinking_keeps_the_photons(memory_source: type, factor: int) -> None:
+def test_accumulate_preserves_photons_on_coarser_grid(memory_source: type, factor: int) -> None:
     """Of 30x40 px, 3 and 5 do not divide all sides: what is missing of the last pixels is unseen, not dark."""
     source = memory_source(frames_of(FLUX, 50))
     grid = (-(-SHAPE[0] // factor), -(-SHAPE[1] // factor))
@@ -159,14 +159,14 @@ def test_shrinking_keeps_the_photons(memory_source: type, factor: int) -> None:
     assert np.nanmean(flux) == pytest.approx(FLUX, abs=0.02)
 
 
-def test_a_pixel_of_a_halved_image_is_the_mean_of_four(memory_source: type) -> None:
+def test_accumulate_averages_four_pixels_at_half_scale(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 50))
     photons = accumulate(source, still(50), rescaling(0.5), (15, 20))
     blocks = source.counts(FrameSpan(0, 50)).reshape(15, 2, 20, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(photons.counts, blocks, rtol=1e-6)
 
 
-def test_the_weight_is_the_number_of_frames(memory_source: type, pan: Callable) -> None:
+def test_accumulate_weight_is_number_of_frames(memory_source: type, pan: Callable) -> None:
     """A pan of one pixel a frame over 40 px: column c of the plane is seen in min(c, 39) + 1 of the first 60 frames."""
     source = memory_source(frames_of(FLUX, 60))
     chunks = chunks_of(FrameSpan(0, 60), pan(1), SHAPE, 0.25)
@@ -174,7 +174,7 @@ def test_the_weight_is_the_number_of_frames(memory_source: type, pan: Callable) 
     np.testing.assert_allclose(photons.weight, np.tile(np.minimum(np.arange(60), 39) + 1, (30, 1)), rtol=1e-5)
 
 
-def test_less_than_one_frame_is_no_estimate() -> None:
+def test_estimate_is_nan_below_one_frame() -> None:
     counts, weight = np.float32([[0.5, 0.5, 3]]), np.float32([[0.99, 1, 4]])
     flux, known = PhotonSum(counts, weight).estimate(BinaryResponse())
     np.testing.assert_array_equal(known, [[0, 1, 4]])
@@ -182,7 +182,7 @@ def test_less_than_one_frame_is_no_estimate() -> None:
 
 
 @pytest.mark.parametrize("shift_px", [0.01, 0.1, 1 / 64])
-def test_warps_are_exact_below_a_thirty_second_of_a_pixel(memory_source: type, shift_px: float) -> None:
+def test_accumulate_is_exact_for_shifts_below_opencv_4_rounding(memory_source: type, shift_px: float) -> None:
     """OpenCV 4 rounds bilinear coordinates to 1/32 px: there, 0.01 px would do nothing at all."""
     ramp = np.arange(100)[:, None, None] < np.arange(SHAPE[1])  # column x is lit in x of 100 frames
     source = memory_source(np.broadcast_to(ramp, (100, *SHAPE)))
@@ -200,7 +200,7 @@ class Halved(MemorySource):
 
 
 @pytest.mark.parametrize("scale", [1, 0.5])
-def test_what_the_source_takes_out_is_taken_out_of_each_chunk_once(scale: float) -> None:
+def test_accumulate_corrects_each_chunk_once(scale: float) -> None:
     """Whether the sums are the source's or are shared, and before pixels are masked and averaged."""
     frames = frames_of(FLUX, 50)
     valid = np.random.default_rng(0).random(SHAPE) > 0.1
@@ -214,7 +214,7 @@ def test_what_the_source_takes_out_is_taken_out_of_each_chunk_once(scale: float)
     np.testing.assert_allclose(halved.counts, plain.counts / 2 - plain.weight, atol=1e-3)
 
 
-def test_flux_is_not_negative_where_more_was_taken_out_than_there_is() -> None:
+def test_estimate_is_zero_where_corrected_counts_are_negative() -> None:
     photons = PhotonSum(np.float32([[-3, 5]]), np.float32([[10, 10]]))
     flux, _ = photons.estimate(BinaryResponse())
     assert flux.tolist() == [[0, pytest.approx(np.log(2))]]

@@ -14,25 +14,25 @@ from photonpano.merging import chunks_of, clipped
 SHAPE = (30, 40)
 
 
-def test_a_still_camera_needs_one_chunk(pan: Callable) -> None:
+def test_chunks_of_still_camera_is_one_chunk(pan: Callable) -> None:
     (chunk,) = chunks_of(FrameSpan(5, 105), pan(0), SHAPE, 0.25)
     assert chunk.span == FrameSpan(5, 105)
     np.testing.assert_array_equal(chunk.homography, np.eye(3))
 
 
-def test_a_pan_is_cut_where_it_has_moved_by_the_tolerance(pan: Callable) -> None:
+def test_chunks_of_splits_pan_where_it_moved_by_tolerance(pan: Callable) -> None:
     chunks = chunks_of(FrameSpan(10, 20), pan(0.125), SHAPE, 0.5)
     assert [chunk.span for chunk in chunks] == [FrameSpan(10, 14), FrameSpan(14, 18), FrameSpan(18, 20)]
     # Each is warped as the camera stood at its centre.
     np.testing.assert_allclose(chunks[0].homography, translation(0.125 * 11.5, 0))
 
 
-def test_a_fast_camera_gets_a_chunk_for_each_frame(pan: Callable) -> None:
+def test_chunks_of_fast_camera_has_one_frame_each(pan: Callable) -> None:
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 7), pan(3), SHAPE, 0.25)] == [1] * 7
 
 
 @pytest.mark.parametrize("zoom", [0.5, 2.0])
-def test_the_tolerance_is_in_pixels_of_the_frame_not_of_the_reference_plane(known_motion: type, zoom: float) -> None:
+def test_chunks_of_measures_tolerance_in_frame_pixels(known_motion: type, zoom: float) -> None:
     """A camera whose pixels look small on the plane moves as many of its own."""
     motion = known_motion(lambda frame: np.diag([zoom, zoom, 1.0]) @ translation(0.125 * frame, 0))
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 8), motion, SHAPE, 0.5)] == [4, 4]
@@ -48,7 +48,7 @@ wobbles = st.tuples(*[st.floats(-2e-3, 2e-3)] * 4, *[st.floats(-1, 1)] * 2, *[st
     drift=wobbles,
     tolerance_px=st.floats(0.05, 8),
 )
-def test_chunks_cover_every_frame_once_and_keep_to_the_tolerance(
+def test_chunks_of_covers_every_frame_once_within_tolerance(
     known_motion: type, start: int, length: int, wobble: tuple, drift: tuple, tolerance_px: float
 ) -> None:
     def at(frame: float) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_chunks_cover_every_frame_once_and_keep_to_the_tolerance(
         assert corner_displacements(moved, np.eye(3), SHAPE).max() <= tolerance_px * 1.01 + 0.01 * (len(chunk.span) > 1)
 
 
-def test_spans_share_the_chunks_inside(pan: Callable) -> None:
+def test_clipped_keeps_chunks_inside_span(pan: Callable) -> None:
     motion = pan(0.125)
     chunks = chunks_of(FrameSpan(0, 40), motion, SHAPE, 0.5)
     found = clipped(chunks, FrameSpan(10, 23), motion)
@@ -77,7 +77,7 @@ def test_spans_share_the_chunks_inside(pan: Callable) -> None:
         np.testing.assert_allclose(each.homography, translation(0.125 * each.span.centre, 0))
 
 
-def test_a_span_within_a_chunk_is_its_part(pan: Callable) -> None:
+def test_clipped_returns_part_of_chunk_around_span(pan: Callable) -> None:
     chunks = chunks_of(FrameSpan(0, 40), pan(0.125), SHAPE, 4)
     (part,) = clipped(chunks, FrameSpan(33, 39), pan(0.125))
     assert part.span == FrameSpan(33, 39)

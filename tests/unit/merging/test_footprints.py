@@ -4,31 +4,31 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.merging.footprints import landings
+from photonpano.merging.footprints import footprints_of
 
 FRAME, GRID = (254, 496), (300, 700)
 
 
-def test_a_shift_touches_what_it_covers_and_is_straight() -> None:
-    (landing,) = landings(translation(10.5, 20.25)[None], FRAME, GRID)
-    assert (landing.shrink, landing.straight) == (1, True)
-    assert (landing.rows, landing.columns) == (range(19, 276), range(9, 508))
-    assert landing.to_image == pytest.approx(translation(-10.5, -20.25))
+def test_footprint_of_shift_is_straight_and_covers_shifted_frame() -> None:
+    (footprint,) = footprints_of(translation(10.5, 20.25)[None], FRAME, GRID)
+    assert (footprint.shrink, footprint.straight) == (1, True)
+    assert (footprint.rows, footprint.columns) == (range(19, 276), range(9, 508))
+    assert footprint.to_image == pytest.approx(translation(-10.5, -20.25))
 
 
-def test_what_lies_outside_touches_nothing() -> None:
+def test_footprint_is_empty_outside_of_grid() -> None:
     for shift in (translation(800, 0), translation(-600, 0), translation(0, 400)):
-        (landing,) = landings(shift[None], FRAME, GRID)
-        assert not (landing.rows and landing.columns)
+        (footprint,) = footprints_of(shift[None], FRAME, GRID)
+        assert not (footprint.rows and footprint.columns)
 
 
-def test_what_is_turned_is_not_straight() -> None:
+def test_footprint_is_not_straight_beyond_small_rotation() -> None:
     turned = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in (0.005, 0.02)]
-    assert [landing.straight for landing in landings(np.array(turned), FRAME, GRID)] == [True, False]
+    assert [footprint.straight for footprint in footprints_of(np.array(turned), FRAME, GRID)] == [True, False]
 
 
-def test_small_grids_average_first() -> None:
-    found = landings(np.array([rescaling(1), rescaling(0.5), rescaling(0.26)]), FRAME, GRID)
-    assert [landing.shrink for landing in found] == [1, 2, 3]
+def test_footprint_shrinks_frame_on_coarse_grid() -> None:
+    found = footprints_of(np.array([rescaling(1), rescaling(0.5), rescaling(0.26)]), FRAME, GRID)
+    assert [footprint.shrink for footprint in found] == [1, 2, 3]
     assert found[1].to_image == pytest.approx(np.eye(3))
     assert found[2].to_image == pytest.approx(inverse(rescaling(0.26) @ rescaling(3)))

@@ -10,7 +10,7 @@ import pytest
 from photonpano import CanvasTooLargeError, FrameSpan, LocationError, Panorama
 from photonpano.context import Context, Quiet
 from photonpano.geometry import Canvas, apply, from_parameters, translation
-from photonpano.merging.panorama import BYTES_PER_PIXEL, Overview, Tile, plan_canvas, render, render_tiles, tiles_of
+from photonpano.merging.panorama import BYTES_PER_PIXEL, Thumbnail, Tile, plan_canvas, render, render_tiles, tiles_of
 from photonpano.photometry import tone_mapped
 
 SHAPE = (30, 40)
@@ -19,27 +19,27 @@ ALL = FrameSpan(0, N)
 GIB = 1024**3
 
 
-def test_the_canvas_holds_the_frames_of_the_span_only(pan: Callable) -> None:
+def test_plan_canvas_holds_frames_of_span_only(pan: Callable) -> None:
     """At 2 px a frame, frames 10 to 19 span 18 px and a frame."""
     canvas = plan_canvas(pan(2), FrameSpan(10, 20), SHAPE, 1.0, GIB)
     assert canvas.shape == (30, 40 + 18)
     np.testing.assert_array_equal(canvas.transform, translation(-20, 0))
 
 
-def test_a_canvas_far_beyond_the_memory_is_refused_before_it_is_made(pan: Callable) -> None:
+def test_plan_canvas_refuses_canvas_far_beyond_memory(pan: Callable) -> None:
     """40,000 px wide and 50,000 high at scale 10."""
     with pytest.raises(CanvasTooLargeError) as caught:
         plan_canvas(pan(3960 / (N - 1), 4970 / (N - 1)), ALL, SHAPE, 10.0, 2 * GIB)
     assert str(caught.value) == (
-        "the panorama would have 40000 x 50000 pixels, 37 times what the 2 GiB of run.memory hold. "
-        "Up to 16 times is rendered in parts; more is often a sign of a wrong motion. "
+        "the panorama would have 40000 x 50000 pixels, 37 times what fits into the 2 GiB of run.memory; "
+        "up to 16 times is rendered in tiles. More often means that the motion is wrong. "
         "Raise run.memory, lower render.scale from 10 to 6.5, "
         "or choose a render.reference nearer to the middle of the motion"
     )
 
 
 @pytest.mark.parametrize(("scale", "memory"), [(8.0, GIB // 8), (1.0, GIB // 256), (0.9, GIB // 256)])
-def test_the_scale_that_it_suggests_fits_and_is_not_much_too_small(pan: Callable, scale: float, memory: int) -> None:
+def test_plan_canvas_suggests_largest_scale_that_fits(pan: Callable, scale: float, memory: int) -> None:
     with pytest.raises(CanvasTooLargeError) as caught:
         plan_canvas(pan(5), ALL, (1000, 2000), scale, memory)
     suggested = float(str(caught.value).split(f"render.scale from {scale:g} to ")[1].split(",")[0])
@@ -48,7 +48,7 @@ def test_the_scale_that_it_suggests_fits_and_is_not_much_too_small(pan: Callable
         plan_canvas(pan(5), ALL, (1000, 2000), 1.1 * suggested, memory)
 
 
-def test_a_turn_to_the_horizon_is_told(known_motion: type) -> None:
+def test_plan_canvas_refuses_turn_to_the_horizon(known_motion: type) -> None:
     motion = known_motion(lambda frame: from_parameters([0, 0, 0, 0, 0, 0, -frame / N / 20, 0]))
     with pytest.raises(LocationError) as caught:
         plan_canvas(motion, ALL, SHAPE, 1.0, GIB)
@@ -76,7 +76,7 @@ def rendered(source: Any, motion: Any, scale: float = 1.0, span: FrameSpan = ALL
     return render(source, motion, span, canvas, 0.25, Context()), canvas
 
 
-def test_the_panorama_shows_the_scene(panning: Any, pan: Callable) -> None:
+def test_render_shows_scene_with_binomial_noise(panning: Any, pan: Callable) -> None:
     panorama, canvas = rendered(panning, pan(1))
     assert canvas.shape == panorama.flux.shape == (30, 40 + N - 1)
     np.testing.assert_allclose(panorama.weight[0], np.minimum(np.arange(99), 98 - np.arange(99)).clip(max=39) + 1, rtol=1e-5)
@@ -88,13 +88,13 @@ def test_the_panorama_shows_the_scene(panning: Any, pan: Callable) -> None:
     assert (error * np.sqrt(weight)).std() == pytest.approx(np.sqrt(0.16), rel=0.1)
 
 
-def test_frames_beyond_the_span_are_left_out(panning: Any, pan: Callable) -> None:
+def test_render_ignores_frames_beyond_span(panning: Any, pan: Callable) -> None:
     panorama, _ = rendered(panning, pan(1), span=FrameSpan(10, 20))
     assert panorama.weight.max() == pytest.approx(10)
     assert panorama.weight.sum() == pytest.approx(10 * 30 * 40)
 
 
-def test_at_twice_the_scale_every_pixel_is_four(panning: Any, pan: Callable) -> None:
+def test_render_at_twice_the_scale_keeps_brightness(panning: Any, pan: Callable) -> None:
     panorama, canvas = rendered(panning, pan(1), scale=2.0)
     assert canvas.shape == panorama.flux.shape == (60, 2 * 99)
     mean_count = panning.response.mean_count(panorama.flux)
@@ -107,7 +107,7 @@ def test_at_twice_the_scale_every_pixel_is_four(panning: Any, pan: Callable) -> 
 
 @pytest.mark.parametrize("motion", [(1, 0.0), (0.2, 1.5)], ids=["wide", "high"])
 @pytest.mark.parametrize("scale", [1.0, 1.7])
-def test_tiles_make_up_the_panorama(panning: Any, known_motion: type, motion: tuple[float, float], scale: float) -> None:
+def test_render_tiles_equals_render(panning: Any, known_motion: type, motion: tuple[float, float], scale: float) -> None:
     right, down = motion
     turning = known_motion(lambda t: from_parameters([1e-4 * t, 2e-4 * t, -2e-4 * t, 0, right * t, down * t, 1e-6 * t, 0]))
     canvas = plan_canvas(turning, ALL, SHAPE, scale, GIB)
@@ -115,23 +115,23 @@ def test_tiles_make_up_the_panorama(panning: Any, known_motion: type, motion: tu
     tiles, reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL // 3)
     assert len(tiles) > 2
     flux, weight = np.zeros(canvas.shape), np.zeros(canvas.shape)
-    shown = Overview(canvas, reduction)
+    shown = Thumbnail(canvas, reduction)
     for tile, part in zip(tiles, render_tiles(panning, turning, ALL, tiles, 0.25, Context(2)), strict=True):
         box = np.s_[tile.top : tile.top + tile.canvas.height, tile.left : tile.left + tile.canvas.width]
         flux[box], weight[box] = part.flux, part.weight
         shown.add(tile, part)
     np.testing.assert_allclose(weight, whole.weight, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(flux, whole.flux, rtol=1e-3, atol=1e-4)
-    single = Overview(canvas, reduction)
+    single = Thumbnail(canvas, reduction)
     single.add(Tile(0, 0, canvas), Panorama(flux.astype(np.float32), weight.astype(np.float32), canvas.transform))
     np.testing.assert_allclose(shown.panorama.flux, single.panorama.flux, rtol=1e-6)
     np.testing.assert_allclose(shown.panorama.weight, single.panorama.weight, rtol=1e-6)
 
 
-def test_an_overview_averages_what_was_seen() -> None:
+def test_thumbnail_averages_seen_pixels() -> None:
     flux = np.array([[1, 3, np.nan], [np.nan, 5, np.nan], [4, 4, 8]], np.float32)
     canvas = Canvas(3, 3, translation(2, 1))
-    shown = Overview(canvas, 2)
+    shown = Thumbnail(canvas, 2)
     shown.add(Tile(0, 0, canvas), Panorama(flux, np.where(np.isnan(flux), 0, 8).astype(np.float32), canvas.transform))
     np.testing.assert_array_equal(shown.panorama.flux, [[3, np.nan], [4, 8]])
     np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
@@ -139,7 +139,7 @@ def test_an_overview_averages_what_was_seen() -> None:
     np.testing.assert_allclose(apply(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
 
 
-def test_what_fits_is_rendered_at_once(pan: Callable) -> None:
+def test_tiles_of_canvas_that_fits_is_one_tile(pan: Callable) -> None:
     canvas = plan_canvas(pan(1), ALL, SHAPE, 1.0, GIB)
     (tile,), reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL)
     assert (tile.left, tile.top, tile.canvas, reduction) == (0, 0, canvas, 1)
@@ -147,7 +147,7 @@ def test_what_fits_is_rendered_at_once(pan: Callable) -> None:
 
 @pytest.mark.parametrize("size", [(3000, 40_000), (50_000, 3000), (3001, 3003)])
 @pytest.mark.parametrize("excess", [1.01, 3, 16])
-def test_tiles_and_their_overview_fit_into_the_memory(size: tuple[int, int], excess: float) -> None:
+def test_tiles_of_fit_into_memory_with_thumbnail(size: tuple[int, int], excess: float) -> None:
     canvas, memory = Canvas(*size, np.eye(3)), int(size[0] * size[1] * BYTES_PER_PIXEL / excess)
     tiles, reduction = tiles_of(canvas, memory)
     assert sum(tile.canvas.height * tile.canvas.width for tile in tiles) == size[0] * size[1]
@@ -157,7 +157,7 @@ def test_tiles_and_their_overview_fit_into_the_memory(size: tuple[int, int], exc
     assert len(tiles) <= 4 * excess
 
 
-def test_it_tells_of_every_frame(panning: Any, pan: Callable) -> None:
+def test_render_reports_progress_of_every_frame(panning: Any, pan: Callable) -> None:
     class Counting(Quiet):
         def __init__(self) -> None:
             self.frames: list[int] = []
@@ -179,7 +179,7 @@ def test_it_tells_of_every_frame(panning: Any, pan: Callable) -> None:
     assert len(progress.frames) == 15
 
 
-def test_the_memory_of_a_pixel_is_no_more_than_is_predicted(memory_source: type, pan: Callable) -> None:
+def test_render_takes_no_more_memory_than_predicted(memory_source: type, pan: Callable) -> None:
     """A still camera at a scale that makes 2.4 megapixels of every frame: what is held at the same time at most."""
     source = memory_source(np.random.default_rng(0).random((4, 60, 100)) < 0.5)
     canvas = plan_canvas(pan(0), source.info.span, source.info.frame_shape, 20.0, GIB)

@@ -33,7 +33,7 @@ def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]
     linear=st.lists(st.floats(-0.15, 0.15), min_size=4, max_size=4),
     perspective=st.lists(st.floats(-1e-3, 1e-3), min_size=2, max_size=2),
 )
-def test_each_pixel_gets_what_lies_there(x: float, y: float, linear: list[float], perspective: list[float]) -> None:
+def test_add_warped_equals_bilinear_interpolation(x: float, y: float, linear: list[float], perspective: list[float]) -> None:
     to_image = np.array([[1 + linear[0], linear[1], x], [linear[2], 1 + linear[3], y], [*perspective, 1]])
     shape = (31, 53)
     total = np.full(shape, 7, np.float32)
@@ -42,7 +42,7 @@ def test_each_pixel_gets_what_lies_there(x: float, y: float, linear: list[float]
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (3, -5), (2.25, 1.5), (-0.5, 0.5), (36.5, 0), (37, 0), (0, -22.5), (200, 0)])
-def test_shifts_are_exact_up_to_the_border(shift: tuple[float, float]) -> None:
+def test_add_warped_is_exact_up_to_the_border(shift: tuple[float, float]) -> None:
     total = np.zeros((40, 60), np.float32)
     add_warped(IMAGE, translation(*shift), total)
     np.testing.assert_allclose(total, interpolated(IMAGE, translation(*shift), total.shape), atol=1e-6)
@@ -58,7 +58,7 @@ def test_shifts_are_exact_up_to_the_border(shift: tuple[float, float]) -> None:
     ],
     ids=["identity", "shift", "perspective", "outside"],
 )
-def test_a_footprint_is_the_warp_of_a_single_value(to_image: np.ndarray) -> None:
+def test_add_footprint_equals_warp_of_uniform_image(to_image: np.ndarray) -> None:
     shape = (40, 60)
     expected, total, steps = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((40, 61), np.float32)
     add_warped(np.full(IMAGE.shape, 3, np.float32), to_image, expected)

@@ -22,18 +22,18 @@ def waves(amplitude: float) -> np.ndarray:
     return -np.log1p(-(np.sin(np.pi / 4 + amplitude * np.sin(x / 20)) ** 2))
 
 
-def test_noise_alone_does_not_stand_out() -> None:
+def test_signal_to_noise_of_noise_is_near_0() -> None:
     assert signal_to_noise(photographed(np.full((200, 300), 0.5), 100)) < 0.1
 
 
 @pytest.mark.parametrize(("amplitude", "frames"), [(0.05, 100), (0.2, 100), (0.05, 400)])
-def test_a_scene_stands_out_by_its_contrast_over_the_noise(amplitude: float, frames: int) -> None:
+def test_signal_to_noise_is_contrast_over_photon_noise(amplitude: float, frames: int) -> None:
     """A wave varies by its amplitude over sqrt(2), the noise of n frames by 1 / (2 sqrt(n))."""
     expected = amplitude / np.sqrt(2) * 2 * np.sqrt(frames)
     assert signal_to_noise(photographed(waves(amplitude), frames)) == pytest.approx(expected, rel=0.05)
 
 
-def test_what_was_not_seen_does_not_count() -> None:
+def test_signal_to_noise_ignores_unseen_pixels() -> None:
     exposure = photographed(np.full((200, 300), 0.5), 100)
     exposure.flux[:, :170], exposure.weight[:, :170] = np.nan, 0
     assert signal_to_noise(exposure) < 0.1

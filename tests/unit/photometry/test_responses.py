@@ -20,26 +20,26 @@ def test_known_values() -> None:
 
 
 @given(st.floats(0, 6, width=32))
-def test_the_estimate_undoes_the_detection(flux: float) -> None:
+def test_flux_inverts_mean_count(flux: float) -> None:
     estimate = RESPONSE.flux(RESPONSE.mean_count(f32(flux)), 1e6)
     assert estimate.dtype == np.float32
     np.testing.assert_allclose(estimate, flux, rtol=1e-4, atol=1e-6)
 
 
 @given(st.integers(1, 100_000))
-def test_a_pixel_that_is_always_lit_gets_the_flux_of_half_a_dark_frame(frames: int) -> None:
+def test_flux_of_saturated_pixel_is_that_of_half_a_dark_frame(frames: int) -> None:
     np.testing.assert_allclose(RESPONSE.flux(f32(1), frames), np.log(2 * frames), rtol=2e-3)
     # It stays the brightest: a pixel with one dark frame is dimmer.
     assert RESPONSE.flux(f32(1 - 1 / frames), frames) < RESPONSE.flux(f32(1), frames)
 
 
-def test_rounding_beyond_one_and_unknown_pixels_do_no_harm() -> None:
+def test_flux_clips_means_above_1_and_keeps_nan() -> None:
     flux = RESPONSE.flux(f32(1.0000001, np.nan, -1e-9), f32(10, 10, 10))
     np.testing.assert_allclose(flux, [np.log(20), np.nan, 0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("frames", [100, 400])
-def test_noise_is_uniform_on_the_stabilised_scale(frames: int) -> None:
+def test_stabilised_noise_is_uniform(frames: int) -> None:
     """Standard deviations of 20,000 draws are known to 0.5 %; what is left is the approximation itself."""
     flux = f32(0.2, 0.5, 1.0, 2.0)[:, None]
     rng = np.random.default_rng(0)
@@ -48,11 +48,11 @@ def test_noise_is_uniform_on_the_stabilised_scale(frames: int) -> None:
     np.testing.assert_allclose(stabilised.std(axis=1), float(RESPONSE.stabilised_std(frames)), rtol=0.03)
 
 
-def test_the_stabilised_scale_runs_from_zero_to_a_right_angle() -> None:
+def test_stabilised_ranges_from_0_to_half_pi() -> None:
     np.testing.assert_allclose(RESPONSE.stabilised(f32(0, np.log(2), 100), 1e6), [0, np.pi / 4, np.pi / 2], atol=2e-3)
 
 
-def test_few_frames_in_the_dark_look_as_bright_as_many() -> None:
+def test_stabilised_mean_does_not_depend_on_number_of_frames() -> None:
     """Four counts in forty frames, on average, and 40 in 400; the means of 200,000 draws are known to 0.0003."""
     rng = np.random.default_rng(0)
     few, many = (
@@ -64,7 +64,7 @@ def test_few_frames_in_the_dark_look_as_bright_as_many() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 15, 255])
-def test_sums_of_binary_frames_follow_the_model_of_binary_frames(n: int) -> None:
+def test_binary_sum_response_follows_binary_response(n: int) -> None:
     response, flux = BinarySumResponse(n), f32(0, 0.02 * n, 0.5 * n, 2 * n)
     rng = np.random.default_rng(n)
     sums = rng.binomial(n, -np.expm1(-flux / n), (200_000 // n, 4))
@@ -74,7 +74,7 @@ def test_sums_of_binary_frames_follow_the_model_of_binary_frames(n: int) -> None
 
 
 @pytest.mark.parametrize("flux", [0.05, 1.0, 20.0])
-def test_sums_of_binary_frames_have_uniform_noise_once_stabilised(flux: float) -> None:
+def test_binary_sum_response_stabilises_noise(flux: float) -> None:
     response, n_frames = BinarySumResponse(15), 40
     sums = np.random.default_rng(0).binomial(15 * n_frames, -np.expm1(-flux / 15), 50_000)
     estimates = response.flux((sums / n_frames).astype(np.float32), n_frames)
@@ -86,18 +86,18 @@ def test_sums_of_binary_frames_have_uniform_noise_once_stabilised(flux: float) -
 GREY = IntensityResponse(photons_per_level=40.0, black_level=16.0, saturation_level=235.0, read_noise=25.0)
 
 
-def test_grey_levels_grow_with_the_flux_until_they_saturate() -> None:
+def test_intensity_response_is_linear_up_to_saturation() -> None:
     np.testing.assert_allclose(GREY.mean_count(f32(0, 400, 1e9, np.inf, np.nan)), [16, 26, 235, 235, np.nan])
     np.testing.assert_allclose(GREY.flux(f32(16, 26, 235, 250, np.nan), 1), [0, 400, 8760, 8760, np.nan])
 
 
-def test_levels_below_black_are_negative_flux_so_that_averages_of_noise_are_right() -> None:
+def test_intensity_response_keeps_negative_flux_below_black_level() -> None:
     np.testing.assert_allclose(GREY.flux(f32(15.5), 1), [-20])
 
 
 @pytest.mark.parametrize("n_frames", [1, 4, 30])
 @pytest.mark.parametrize("flux", [0.0, 100.0, 2000.0])
-def test_the_noise_of_grey_levels_is_what_the_response_says(flux: float, n_frames: int) -> None:
+def test_intensity_response_stabilises_noise(flux: float, n_frames: int) -> None:
     """Photons and reading together; where single frames are read with more noise than light, their distribution is cut off."""
     rng = np.random.default_rng(0)
     photons = rng.poisson(flux, (n_frames, 40_000)) + rng.normal(0, GREY.read_noise, (n_frames, 40_000))
@@ -109,5 +109,5 @@ def test_the_noise_of_grey_levels_is_what_the_response_says(flux: float, n_frame
     np.testing.assert_allclose(stabilised.mean(), GREY.stabilised(f32(flux), 1e6), atol=0.05 * expected + 0.02)
 
 
-def test_pixels_that_were_never_seen_do_no_harm() -> None:
+def test_intensity_response_keeps_nan_of_unseen_pixels() -> None:
     assert np.isnan(GREY.stabilised(f32(np.nan), f32(0))).all()

@@ -18,15 +18,15 @@ def test_known_values() -> None:
 
 
 @given(st.floats(0, 1, width=32))
-def test_the_curves_undo_each_other(value: float) -> None:
+def test_srgb_to_linear_inverts_linear_to_srgb(value: float) -> None:
     np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(f32(value))), value, atol=1e-5)
 
 
-def test_what_is_out_of_range_is_clipped_and_what_is_unknown_stays_so() -> None:
+def test_linear_to_srgb_clips_and_keeps_nan() -> None:
     np.testing.assert_allclose(linear_to_srgb(f32(-1, 2, np.nan)), f32(0, 1, np.nan), rtol=1e-6)
 
 
-def test_a_picture_has_white_where_it_is_told_and_black_where_nothing_is_known() -> None:
+def test_tone_mapped_is_white_at_white_flux_and_black_at_nan() -> None:
     picture = tone_mapped(f32(0, 0.4, 0.2, 5, np.nan), white=0.4)
     assert picture.dtype == np.uint8
     np.testing.assert_array_equal(picture, [0, 255, 188, 255, 0])

@@ -9,25 +9,25 @@ from photonpano import FrameSpan, Group, InputError, StreamInfo
 from photonpano.values import true_spans
 
 
-def test_a_span_counts_its_frames_and_knows_its_middle() -> None:
+def test_frame_span_has_length_and_centre() -> None:
     span = FrameSpan(10, 14)
     assert (len(span), span.centre, str(span)) == (4, 11.5, "frames 10 to 13")
     assert FrameSpan(7, 8).centre == 7
 
 
 @pytest.mark.parametrize(("start", "stop"), [(-1, 3), (3, 3), (4, 3)])
-def test_a_span_is_never_empty(start: int, stop: int) -> None:
+def test_frame_span_refuses_empty_range(start: int, stop: int) -> None:
     with pytest.raises(ValueError, match=rf"0 <= start < stop, got \[{start}, {stop}\)"):
         FrameSpan(start, stop)
 
 
-def test_runs_of_set_flags() -> None:
+def test_true_spans_returns_runs_of_set_flags() -> None:
     flags = np.array([True, False, False, True, True, True, False, True])
     assert true_spans(flags) == [FrameSpan(0, 1), FrameSpan(3, 6), FrameSpan(7, 8)]
     assert true_spans(np.zeros(5, bool)) == []
 
 
-def test_a_group_is_seen_from_one_of_its_instants() -> None:
+def test_group_refuses_reference_outside_span() -> None:
     span = FrameSpan(10, 14)
     assert {Group(span, reference).reference for reference in (10, 11.5, 13)} == {10, 11.5, 13}
     for outside in (9.5, 13.5, float("nan")):
@@ -35,16 +35,16 @@ def test_a_group_is_seen_from_one_of_its_instants() -> None:
             Group(span, outside)
 
 
-def test_a_stream_refuses_frames_it_does_not_hold() -> None:
+def test_stream_info_require_refuses_frames_beyond_the_end() -> None:
     stream = StreamInfo(100, 4, 6, None)
     assert (stream.frame_shape, stream.span) == ((4, 6), FrameSpan(0, 100))
     stream.require(FrameSpan(90, 100))
     with pytest.raises(InputError) as caught:
         stream.require(FrameSpan(90, 101))
-    assert str(caught.value) == "frames 90 to 100 were asked for, but the capture has 100 frames (0 to 99)"
+    assert str(caught.value) == "frames 90 to 100 were requested, but the capture has 100 frames (0 to 99)"
 
 
-def test_places_are_spread_over_all_of_a_capture() -> None:
+def test_spread_covers_the_whole_capture() -> None:
     stream = StreamInfo(1000, 4, 6, None)
     assert stream.spread(3, 10) == [FrameSpan(0, 10), FrameSpan(495, 505), FrameSpan(990, 1000)]
     assert stream.spread(100, 10) == [stream.span]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.merging import SharedCounts
+from photonpano.merging import CountsCache
 
 
 @pytest.fixture
@@ -29,9 +29,9 @@ def counted(memory_source: type) -> tuple[object, list[FrameSpan]]:
     return source, asked
 
 
-def test_a_sum_is_made_once(counted: tuple) -> None:
+def test_counts_cache_computes_each_sum_once(counted: tuple) -> None:
     source, asked = counted
-    shared = SharedCounts(source, 1000)
+    shared = CountsCache(source, 1000)
     first = shared(FrameSpan(0, 5))
     assert shared(FrameSpan(0, 5)) is first
     assert asked == [FrameSpan(0, 5)]
@@ -39,17 +39,17 @@ def test_a_sum_is_made_once(counted: tuple) -> None:
     assert not first.flags.writeable
 
 
-def test_the_sums_asked_for_last_are_kept(counted: tuple) -> None:
+def test_counts_cache_drops_least_recently_used_sum(counted: tuple) -> None:
     source, asked = counted
-    shared = SharedCounts(source, 2 * 4 * 6 * 4)
+    shared = CountsCache(source, 2 * 4 * 6 * 4)
     for start in (0, 1, 0, 2, 0, 1):
         shared(FrameSpan(start, start + 3))
     assert [span.start for span in asked] == [0, 1, 2, 1]
 
 
-def test_threads_that_ask_for_one_sum_wait_for_each_other(counted: tuple) -> None:
+def test_counts_cache_computes_sum_once_for_concurrent_threads(counted: tuple) -> None:
     source, asked = counted
-    shared, together = SharedCounts(source, 1000), Barrier(4)
+    shared, together = CountsCache(source, 1000), Barrier(4)
 
     def ask(_: int) -> np.ndarray:
         together.wait()
@@ -61,8 +61,8 @@ def test_threads_that_ask_for_one_sum_wait_for_each_other(counted: tuple) -> Non
     assert all(each is found[0] for each in found)
 
 
-def test_what_fails_fails_for_everybody(counted: tuple) -> None:
-    shared = SharedCounts(counted[0], 1000)
+def test_counts_cache_raises_source_error_on_each_call(counted: tuple) -> None:
+    shared = CountsCache(counted[0], 1000)
     for _ in range(2):
         with pytest.raises(InputError, match="a damaged block"):
             shared(FrameSpan(7, 9))
