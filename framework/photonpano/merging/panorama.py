@@ -66,7 +66,8 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
         raise CanvasTooLargeError(
             f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
             f"{_gib(memory)} of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
-            f"More often means that the motion is wrong. Raise run.memory, lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
+            "More often means that the motion is wrong. Raise run.memory, "
+            f"lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
             "or choose a render.reference nearer to the middle of the motion"
         )
     return canvas
