@@ -82,7 +82,7 @@ def components() -> str:
     rows = [
         [f"`{KINDS[entry.kind].section}`", f"[`{entry.name}`](#{entry.name})", entry.contribution.summary]
         for entry in discover().rows
-        if entry.plugin == "photonpano"
+        if entry.origin.plugin == "photonpano"
     ]
     return table(["Section", "`use`", "What it is"], rows)
 

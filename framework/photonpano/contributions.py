@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
 from photonpano.errors import CaptureUnreadError
-from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
     from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
@@ -97,33 +97,43 @@ class Requirement:
     install: str
 
 
-C = TypeVar("C", bound=Config)
-ContextT = TypeVar("ContextT")
-ComponentT = TypeVar("ComponentT", covariant=True)
+def install_command(requirements: Iterable[Requirement]) -> str:
+    """Return the line that installs libraries, from an index and from a checkout of photonpano."""
+    from_index = " ".join(f'"{install}"' for install in dict.fromkeys(each.install for each in requirements))
+    in_checkout = from_index.replace('"photonpano[', '".[')
+    return f"pip install {from_index}" + (f" (in a checkout: pip install {in_checkout})" if in_checkout != from_index else "")
+
+
+def no_problems(*_: Any) -> Sequence[str]:
+    """Find nothing: the default `check` of a contribution."""
+    return ()
+
 
 _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contribution(Generic[C, ContextT, ComponentT]):
+class Contribution:
     """One component that a plugin offers. Plugins yield the subclasses, one for each kind.
 
     Attributes:
-        name: how specs call it, in kebab-case.
+        name: its name in specs, in kebab-case.
         summary: one line for lists.
         config: the closed, frozen model of the keys under `with`.
-        build: makes the component from its config and the context; heavy libraries are imported here, not before.
+        build: makes the component from an instance of `config` and the context; heavy libraries are imported here, not before.
+        check: finds problems of a config; the subclasses say of which.
         requires: libraries that may be missing, and how to install them.
-        api_version: the version of the contract that the plugin was made for. A plugin that is published writes the number, so
-            that a photonpano with another contract refuses it with a clear message.
+        api_version: the version of the contract that the plugin was made for. A published plugin writes the number, so that a
+            photonpano with another contract refuses it with a clear message.
     """
 
     kind: ClassVar[str]
 
     name: str
     summary: str
-    config: type[C]
-    build: Callable[[C, ContextT], ComponentT]
+    config: type[Config]
+    build: Callable[[Any, Any], Any]
+    check: Callable[..., Sequence[str]] = no_problems
     requires: tuple[Requirement, ...] = ()
     api_version: int = API_VERSION
 
@@ -141,11 +151,6 @@ class Contribution(Generic[C, ContextT, ComponentT]):
             raise ValueError(
                 f"{self.name}: the config must be closed and frozen; derive {self.config.__name__} from photonpano.Config"
             )
-
-
-def no_problems(*_: Any) -> Sequence[str]:
-    """Find nothing: the default `check` of a contribution."""
-    return ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +171,7 @@ def _not_ours(_: Path) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SourceContribution(Contribution[C, SourceContext, Source]):
+class SourceContribution(Contribution):
     """Offers a source.
 
     Attributes:
@@ -178,48 +183,50 @@ class SourceContribution(Contribution[C, SourceContext, Source]):
     """
 
     kind: ClassVar[str] = "source"
-    check: Callable[[C], Sequence[str]] = no_problems
+    build: Callable[[Any, SourceContext], Source]
+    check: Callable[[Any], Sequence[str]] = no_problems
     recognise: Callable[[Path], Recognised | None] = _not_ours
     suffixes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageContribution(Contribution[C, StageContext, ComponentT]):
+class StageContribution(Contribution):
     """Offers a component of one of the four stages.
 
     Attributes:
         check: problems of a config for a capture that looks like this; reads no data, imports nothing heavy.
     """
 
-    check: Callable[[C, StreamInfo], Sequence[str]] = no_problems
+    check: Callable[[Any, StreamInfo], Sequence[str]] = no_problems
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResamplerContribution(StageContribution[C, Resampler]):
+class ResamplerContribution(StageContribution):
     """Offers a resampler."""
 
     kind: ClassVar[str] = "resampler"
+    build: Callable[[Any, StageContext], Resampler]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergerContribution(StageContribution[C, Merger]):
+class MergerContribution(StageContribution):
     """Offers a merger."""
 
     kind: ClassVar[str] = "merger"
+    build: Callable[[Any, StageContext], Merger]
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocatorContribution(StageContribution[C, Locator]):
+class LocatorContribution(StageContribution):
     """Offers a locator."""
 
     kind: ClassVar[str] = "locator"
+    build: Callable[[Any, StageContext], Locator]
 
 
 @dataclass(frozen=True, kw_only=True)
-class InterpolatorContribution(StageContribution[C, Interpolator]):
+class InterpolatorContribution(StageContribution):
     """Offers an interpolator."""
 
     kind: ClassVar[str] = "interpolator"
-
-
-AnyContribution: TypeAlias = Contribution[Any, Any, Any]
+    build: Callable[[Any, StageContext], Interpolator]

@@ -36,7 +36,7 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 @hookspec
-def photonpano_sources() -> Iterable[SourceContribution]:  # type: ignore[empty-body, type-arg]
+def photonpano_sources() -> Iterable[SourceContribution]:  # type: ignore[empty-body]
     """Offer sources: they open a capture and give the summed counts, or the frames, of a span.
 
     Example:
@@ -62,7 +62,7 @@ def photonpano_sources() -> Iterable[SourceContribution]:  # type: ignore[empty-
 
 
 @hookspec
-def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[empty-body, type-arg]
+def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[empty-body]
     """Offer resamplers: they choose the groups of frames of each level.
 
     Example:
@@ -97,7 +97,7 @@ def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[
 
 
 @hookspec
-def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-body, type-arg]
+def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-body]
     """Offer mergers: they merge the frames of a group into a virtual exposure.
 
     Example:
@@ -133,7 +133,7 @@ def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-
 
 
 @hookspec
-def photonpano_locators() -> Iterable[LocatorContribution]:  # type: ignore[empty-body, type-arg]
+def photonpano_locators() -> Iterable[LocatorContribution]:  # type: ignore[empty-body]
     """Offer locators: they find the motion between two virtual exposures.
 
     Example:
@@ -166,7 +166,7 @@ def photonpano_locators() -> Iterable[LocatorContribution]:  # type: ignore[empt
 
 
 @hookspec
-def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: ignore[empty-body, type-arg]
+def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: ignore[empty-body]
     """Offer interpolators: they turn located instants into a trajectory.
 
     Example:

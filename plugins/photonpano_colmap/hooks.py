@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @hookimpl
-def photonpano_locators() -> Iterator[LocatorContribution[PycolmapTwoViewConfig]]:
+def photonpano_locators() -> Iterator[LocatorContribution]:
     """Offer the two-view geometry of COLMAP."""
     yield LocatorContribution(
         name="pycolmap-two-view",

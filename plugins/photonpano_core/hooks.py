@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from photonpano import (
     InterpolatorContribution,
@@ -29,7 +29,7 @@ from photonpano_core.constant_groups import ConstantGroupsResampler
 from photonpano_core.group_size import AutoResampler
 from photonpano_core.grouping import shortest_of, too_short
 from photonpano_core.midpoint import MidpointResampler
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
+from photonpano_core.packed_npy import PACKED_NPY
 from photonpano_core.sliding_window import SlidingWindowResampler
 from photonpano_core.stratified import StratifiedResampler
 
@@ -42,13 +42,13 @@ Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
 
 @hookimpl
-def photonpano_sources() -> Iterator[SourceContribution[PackedNpyConfig]]:
+def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer packed .npy captures."""
     yield PACKED_NPY
 
 
 @hookimpl
-def photonpano_resamplers() -> Iterator[ResamplerContribution[Any]]:
+def photonpano_resamplers() -> Iterator[ResamplerContribution]:
     """Offer midpoint resampling, and what it is compared with."""
     yield ResamplerContribution(
         name="midpoint",
@@ -81,7 +81,7 @@ def photonpano_resamplers() -> Iterator[ResamplerContribution[Any]]:
 
 
 @hookimpl
-def photonpano_mergers() -> Iterator[MergerContribution[Any]]:
+def photonpano_mergers() -> Iterator[MergerContribution]:
     """Offer maximum-likelihood merging: of everything, of what agrees, and frame by frame."""
     yield MergerContribution(
         name="photon-mle",
@@ -104,7 +104,7 @@ def photonpano_mergers() -> Iterator[MergerContribution[Any]]:
 
 
 @hookimpl
-def photonpano_interpolators() -> Iterator[InterpolatorContribution[Any]]:
+def photonpano_interpolators() -> Iterator[InterpolatorContribution]:
     """Offer the paper's interpolation, and others."""
     yield InterpolatorContribution(
         name="lucas-kanade",

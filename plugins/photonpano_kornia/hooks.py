@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano import LocatorContribution, Requirement, hookimpl
 from photonpano_kornia.configs import KorniaFeaturesConfig, KorniaLoftrConfig, KorniaRegistratorConfig
@@ -17,7 +17,7 @@ REQUIRES = (Requirement("kornia", "photonpano[kornia]"),)
 
 
 @hookimpl
-def photonpano_locators() -> Iterator[LocatorContribution[Any]]:
+def photonpano_locators() -> Iterator[LocatorContribution]:
     """Offer alignment by brightness, features, and learned matches."""
     yield LocatorContribution(
         name="kornia-registrator",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano import LocatorContribution, hookimpl
 from photonpano_opencv.configs import OpencvEccConfig, OpencvOrbConfig, OpencvSiftConfig, PhaseCorrelationConfig
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @hookimpl
-def photonpano_locators() -> Iterator[LocatorContribution[Any]]:
+def photonpano_locators() -> Iterator[LocatorContribution]:
     """Offer features, and alignment by brightness."""
     yield LocatorContribution(
         name="opencv-sift",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano import SourceContribution, hookimpl
 from photonpano_sensors.intensity.contributions import INTENSITY_SOURCES
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @hookimpl
-def photonpano_sources() -> Iterator[SourceContribution[Any]]:
+def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer captures as cameras and their programs write them."""
     yield from SINGLE_PHOTON
     yield from INTENSITY_SOURCES

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from photonpano import SourceContribution
 from photonpano_sensors.mat_parts import MAT_PARTS
 from photonpano_sensors.spad512 import SPAD512
@@ -12,7 +10,7 @@ from photonpano_sensors.swissspad import SWISSSPAD_FULL, SWISSSPAD_HALF
 from photonpano_sensors.ubicept import UBICEPT_H5
 from photonpano_sensors.visionsim import VISIONSIM
 
-SINGLE_PHOTON: tuple[SourceContribution[Any], ...] = (
+SINGLE_PHOTON: tuple[SourceContribution, ...] = (
     SWISSSPAD_HALF,
     SWISSSPAD_FULL,
     SPAD512,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano import InputError, SourceContribution, hookimpl
 from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig, StreetScene
@@ -45,7 +45,7 @@ def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
 
 
 @hookimpl
-def photonpano_sources() -> Iterator[SourceContribution[Any]]:
+def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer the simulators."""
     yield SourceContribution(
         name="simulator",

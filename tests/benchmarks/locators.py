@@ -28,6 +28,7 @@ from photonpano import (
     Located,
     Locator,
     PhotonpanoError,
+    PluginError,
     StageContext,
     VirtualExposure,
     discover,
@@ -112,7 +113,9 @@ def available(catalog: Catalog, context: StageContext) -> Iterator[tuple[str, Lo
         if entry.kind != "locator":
             continue
         try:
-            locator = catalog.get("locator", entry.name).contribution
+            locator = catalog.find("locator", entry.name).contribution
+            if entry.unavailable:
+                raise PluginError(entry.unavailable)
             yield entry.name, locator.build(locator.config(), context)
         except (PhotonpanoError, ValidationError) as error:
             print(f"{entry.name} is left out: {str(error).splitlines()[0]}", file=sys.stderr)

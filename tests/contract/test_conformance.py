@@ -13,7 +13,7 @@ from photonpano.registry.chain import CHAIN
 from photonpano.testing.conformance import Conformance
 
 PLUGINS = Path(__file__).parents[1] / "plugins"
-OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.plugin == "photonpano"]
+OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.origin.plugin == "photonpano"]
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ def test_every_dependency_is_pinned_to_a_version_that_it_allows() -> None:
 
 def test_every_extra_is_what_a_component_asks_for() -> None:
     """What is said of a missing library, `pip install "photonpano[kornia]"`, names an extra that there is, and none is idle."""
-    rows = [entry for entry in photonpano.discover().rows if entry.plugin == "photonpano"]
+    rows = [entry for entry in photonpano.discover().rows if entry.origin.plugin == "photonpano"]
     asked = {requirement.install for entry in rows for requirement in entry.contribution.requires}
     extras = {f"photonpano[{name}]" for name in PROJECT["project"]["optional-dependencies"] if name not in ("dev", "testing")}
     assert asked == extras

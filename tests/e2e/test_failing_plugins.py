@@ -24,7 +24,7 @@ from photonpano import (
     SourceContribution,
     api,
 )
-from photonpano.registry import Catalog, discover
+from photonpano.registry import Catalog, Origin, discover
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
 
@@ -166,7 +166,7 @@ CASES: dict[str, tuple[str, type, Callable[..., Any], str]] = {
 
 def failure(spec: dict[str, Any], contribution: Any, folder: Path) -> str:
     """Run a spec with a plugin that fails; return what is said, once the run folder has been seen to be as it was."""
-    entry = make_entry(contribution, "strange-plugin", "1.2", "strange = strange.hooks")
+    entry = make_entry(contribution, Origin("strange-plugin", "1.2", "strange = strange.hooks"))
     catalog = Catalog((*discover().rows, entry))
     (folder / "panorama.png").write_text("of an earlier run")
     with pytest.raises(PluginError) as caught:

@@ -12,7 +12,7 @@ from pydantic import Field
 from photonpano import Config, Homography, Located, LocatorContribution, NotLocated, StageContext, VirtualExposure, api
 from photonpano.context import Quiet
 from photonpano.pipeline.run import RunOutcome, execute
-from photonpano.registry import Catalog, discover
+from photonpano.registry import Catalog, Origin, discover
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
 
@@ -46,7 +46,7 @@ FORGETFUL = LocatorContribution(name="forgetful", summary="Loses pairs", config=
 
 @pytest.fixture(scope="module")
 def catalog() -> Catalog:
-    return Catalog((*discover().rows, make_entry(FORGETFUL, "toys", "1.2", "toys = toys.hooks")))
+    return Catalog((*discover().rows, make_entry(FORGETFUL, Origin("toys", "1.2", "toys = toys.hooks"))))
 
 
 def run(spec: dict[str, Any], catalog: Catalog, threads: int = 2) -> RunOutcome:
@@ -75,7 +75,7 @@ def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog:
     located = [each for each in rescued.record["plugins"] if each["stage"] == "locate"]
     assert [(each["use"], each["plugin"], each["version"]) for each in located] == [
         ("forgetful", "toys", "1.2"),
-        ("opencv-sift", "photonpano", discover().find("locator", "opencv-sift").version),
+        ("opencv-sift", "photonpano", discover().find("locator", "opencv-sift").origin.version),
     ]
     recorded = parse_spec(json.loads(json.dumps(rescued.record["spec"])), catalog=catalog)
     assert [each.contribution.name for each in recorded.levels[0].fallbacks] == ["opencv-sift"]

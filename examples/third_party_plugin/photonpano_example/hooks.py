@@ -61,12 +61,12 @@ PROFILE_SHIFT = LocatorContribution(
 
 
 @hookimpl
-def photonpano_mergers() -> Iterator[MergerContribution[ShortExposureConfig]]:
+def photonpano_mergers() -> Iterator[MergerContribution]:
     """Offer the merger."""
     yield SHORT_EXPOSURE
 
 
 @hookimpl
-def photonpano_locators() -> Iterator[LocatorContribution[ProfileShiftConfig]]:
+def photonpano_locators() -> Iterator[LocatorContribution]:
     """Offer the locator."""
     yield PROFILE_SHIFT

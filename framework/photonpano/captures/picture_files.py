@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.atomic import atomic_folder, atomic_path
+from photonpano.contributions import Requirement, install_command
 from photonpano.errors import OutputError
 
 Picture = NDArray[np.uint8]
@@ -36,7 +37,8 @@ def require_writable(path: Path, n_pictures: int) -> None:
             "take a longer step, or write an .mp4"
         )
     if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
-        raise OutputError(f'cannot write {path}: videos need av, which is not installed: pip install "photonpano[video]"')
+        install = install_command([Requirement("av", "photonpano[video]")])
+        raise OutputError(f"cannot write {path}: videos need av, which is not installed: {install}")
 
 
 def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str], fps: float) -> None:

@@ -136,7 +136,7 @@ class _Writer:
             return ""
         entry = self._catalog.find(kinds[0], value)
         reasons = [decision.reason for decision in self._plan.decisions if decision.what == path.removesuffix(".use")]
-        return ", ".join([f"{entry.plugin} {entry.version}", *reasons])
+        return ", ".join([f"{entry.origin.plugin} {entry.origin.version}", *reasons])
 
     def _written(self, path: str) -> str:
         """Say where a value comes from, unless it stands in the file as it is."""

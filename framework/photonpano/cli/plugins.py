@@ -1,15 +1,14 @@
 """photonpano plugins list, and photonpano plugins show."""
 
 import json
+from dataclasses import asdict
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer
-
-    Origin: TypeAlias = BrokenPlugin | DisabledPlugin | Entry | Observer
+    from photonpano.registry import Catalog, Entry, Origin
 
 plugins = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="See what the installed plugins offer.")
 
@@ -92,21 +91,21 @@ def show_plugin(
 def _table(rows: list["Entry"], catalog: "Catalog", with_observers: bool) -> list[list[str]]:
     """Return the rows of the list: components, plugins that watch runs, and plugins of which nothing is known."""
     return [
-        *([entry.kind, entry.name, _release(entry), _summary(entry, catalog)] for entry in rows),
+        *([entry.kind, entry.name, _release(entry.origin), _summary(entry, catalog)] for entry in rows),
         *(
-            ["observer", _label(each), _release(each), f"Watches runs: {', '.join(each.watches)}"]
+            ["observer", _label(each.origin), _release(each.origin), f"Watches runs: {', '.join(each.watches)}"]
             for each in (catalog.observers if with_observers else ())
         ),
-        *(["disabled", _label(each), _release(each), f"By {each.by}"] for each in catalog.disabled),
+        *(["disabled", _label(each.origin), _release(each.origin), f"By {each.by}"] for each in catalog.disabled),
     ]
 
 
-def _release(plugin: "Origin") -> str:
-    return f"{plugin.plugin} {plugin.version}"
+def _release(origin: "Origin") -> str:
+    return f"{origin.plugin} {origin.version}"
 
 
-def _label(plugin: "Origin") -> str:
-    return plugin.entry_point.partition(" = ")[0]
+def _label(origin: "Origin") -> str:
+    return origin.entry_point.partition(" = ")[0]
 
 
 def _summary(entry: "Entry", catalog: "Catalog") -> str:
@@ -120,24 +119,18 @@ def _summary(entry: "Entry", catalog: "Catalog") -> str:
 def _data(rows: list["Entry"], catalog: "Catalog") -> dict[str, Any]:
     return {
         "components": [_facts(entry) for entry in rows],
-        "broken": [_origin(each) | {"error": each.error} for each in catalog.broken],
-        "disabled": [_origin(each) | {"by": each.by} for each in catalog.disabled],
-        "observers": [_origin(each) | {"hooks": each.watches} for each in catalog.observers],
+        "broken": [asdict(each.origin) | {"error": each.error} for each in catalog.broken],
+        "disabled": [asdict(each.origin) | {"by": each.by} for each in catalog.disabled],
+        "observers": [asdict(each.origin) | {"hooks": each.watches} for each in catalog.observers],
     }
-
-
-def _origin(plugin: "Origin") -> dict[str, Any]:
-    return {"plugin": plugin.plugin, "version": plugin.version, "entry_point": plugin.entry_point}
 
 
 def _facts(entry: "Entry") -> dict[str, Any]:
     named = {"kind": entry.kind, "name": entry.name, "summary": entry.contribution.summary}
-    return named | _origin(entry) | {"unavailable": entry.unavailable}
+    return named | asdict(entry.origin) | {"unavailable": entry.unavailable}
 
 
 def _details(entry: "Entry") -> dict[str, Any]:
-    from dataclasses import asdict
-
     from photonpano.registry import describe
 
     description = describe(entry.contribution)
@@ -154,7 +147,7 @@ def _page(entry: "Entry") -> str:
     from photonpano.registry import describe
 
     description = describe(entry.contribution)
-    facts = [["kind", entry.kind], ["plugin", entry.origin]]
+    facts = [["kind", entry.kind], ["plugin", str(entry.origin)]]
     if description.install:
         needs = " ".join(f'"{each}"' for each in description.install)
         facts.append(["needs", f"pip install {needs} ({'not installed' if entry.missing else 'installed'})"])

@@ -6,9 +6,9 @@ import importlib.util
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any
 
-from photonpano.contributions import Contribution, SourceContext, StageContext
+from photonpano.contributions import SourceContext, StageContext, install_command
 from photonpano.corrections import corrected_source
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
 from photonpano.motion.attribution import attributed, attributing
@@ -23,8 +23,6 @@ HALVED_LEVELS = 2
 """So many levels, at most, are located at half size unless the spec says otherwise."""
 LARGE_FRAME_PX = 192
 """Smaller sides than this are not halved: a pyramid needs pixels."""
-ContextT = TypeVar("ContextT")
-ComponentT = TypeVar("ComponentT")
 
 
 def build_source(plan: Plan) -> Source:
@@ -37,7 +35,7 @@ def build_source(plan: Plan) -> Source:
     """
     try:
         built = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
-        source = attributed(built, origin_of(plan.source))
+        source = attributed(built, plan.source.label)
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
@@ -71,12 +69,12 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     threads = thread_count(plan.run.threads)
     capture = cache(lambda: summarise(source, threads))
     context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
-    made: list[tuple[Choice[Any], Any]] = []
+    made: list[tuple[Choice, Any]] = []
 
-    def component(choice: Choice[Contribution[Any, StageContext, ComponentT]]) -> ComponentT:
+    def component(choice: Choice) -> Any:
         for known, value in made:
             if known.contribution is choice.contribution and known.config == choice.config:
-                return cast("ComponentT", value)
+                return value
         value = _built(choice, context)
         made.append((choice, value))
         return value
@@ -88,11 +86,10 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
             component(level.resample),
             component(level.merge),
             tuple(
-                NamedLocator(name, component(choice), origin_of(choice))
-                for name, choice in _named((level.locate, *level.fallbacks))
+                NamedLocator(name, component(choice), choice.label) for name, choice in _named((level.locate, *level.fallbacks))
             ),
             component(level.interpolate),
-            {choice.contribution.kind: origin_of(choice) for choice in (level.resample, level.merge, level.interpolate)},
+            {choice.contribution.kind: choice.label for choice in (level.resample, level.merge, level.interpolate)},
         )
         for number, level in enumerate(plan.levels, start=1)
     )
@@ -123,7 +120,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     for number, level in enumerate(plan.levels, start=1):
         resampler: Resampler = _built(level.resample, context)
         try:
-            with attributing(origin_of(level.resample), number):
+            with attributing(level.resample.label, number):
                 foreseen.append(resampler.groups(source.info.n_frames, number))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
@@ -141,7 +138,7 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     threads = thread_count(plan.run.threads)
     context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
     resampler: Resampler = _built(choice, context)
-    with attributing(origin_of(choice), 1):
+    with attributing(choice.label, 1):
         resampler.groups(source.info.n_frames, 1)
     return decisions
 
@@ -155,7 +152,7 @@ def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], 
     return decide
 
 
-def _named(choices: Iterable[Choice[Any]]) -> Iterator[tuple[str, Choice[Any]]]:
+def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:
     """Give each choice its name, with a number from the second of the same name on."""
     seen: Counter[str] = Counter()
     for choice in choices:
@@ -164,20 +161,15 @@ def _named(choices: Iterable[Choice[Any]]) -> Iterator[tuple[str, Choice[Any]]]:
         yield (name if seen[name] == 1 else f"{name} {seen[name]}"), choice
 
 
-def _built(choice: Choice[Contribution[Any, ContextT, ComponentT]], context: ContextT) -> ComponentT:
+def _built(choice: Choice, context: SourceContext | StageContext) -> Any:
     contribution = choice.contribution
-    who = origin_of(choice)
+    who = choice.label
     for requirement in contribution.requires:
         if importlib.util.find_spec(requirement.module) is None:
-            raise PluginError(f'{who} needs {requirement.module}: run pip install "{requirement.install}"')
+            raise PluginError(f"{who} needs {requirement.module}, which is not installed: {install_command([requirement])}")
     try:
         return contribution.build(choice.config, context)
     except PhotonpanoError:
         raise
     except Exception as error:
         raise PluginError(f"{who} could not be built: {type(error).__name__}: {error}") from error
-
-
-def origin_of(choice: Choice[Contribution[Any, Any, Any]]) -> str:
-    """Return who provides a component, such as "merger 'photon-mle' of photonpano 0.1.0"."""
-    return f"{choice.contribution.kind} {choice.contribution.name!r} of {choice.plugin} {choice.version}"

@@ -38,7 +38,7 @@ def plugin_records(plan: Plan) -> list[dict[str, str]]:
     seen: dict[tuple[str, str], dict[str, str]] = {}
     for stage, choice in _choices(plan):
         name = choice.contribution.name
-        seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.plugin, "version": choice.version}
+        seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.origin.plugin, "version": choice.origin.version}
     return list(seen.values())
 
 
@@ -53,7 +53,7 @@ def library_versions(plan: Plan) -> dict[str, str]:
     return versions
 
 
-def _choices(plan: Plan) -> Iterator[tuple[str, Choice[Any]]]:
+def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
     """Yield the sections of a spec with what they choose, level by level."""
     yield "source", plan.source
     for level in plan.levels:

@@ -1,10 +1,9 @@
 """Discovery of plugins and the catalog of what they contribute."""
 
-from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry
+from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer, Origin
 from photonpano.registry.description import ConfigRow, Description, describe
 from photonpano.registry.discovery import discover
 from photonpano.registry.kinds import KINDS, Kind
-from photonpano.registry.observers import Observer
 
 __all__ = [
     "KINDS",
@@ -16,6 +15,7 @@ __all__ = [
     "Entry",
     "Kind",
     "Observer",
+    "Origin",
     "describe",
     "discover",
 ]

@@ -61,7 +61,7 @@ def ask_sources(catalog: Catalog, path: Path) -> Answers:
     for entry in catalog.rows:
         if not isinstance(entry.contribution, SourceContribution):
             continue
-        who = f"recognise of the source {entry.name!r} of {entry.plugin} {entry.version}"
+        who = f"recognise of the {entry.label}"
         try:
             answer = entry.contribution.recognise(path)
         except Exception as error:

@@ -1,4 +1,4 @@
-"""The catalog: what the installed plugins offer, and which of them are broken."""
+"""The catalog: what the installed plugins offer, and which plugins are broken or disabled."""
 
 from __future__ import annotations
 
@@ -6,33 +6,52 @@ import importlib.util
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from photonpano.contributions import Contribution
+from photonpano.contributions import Contribution, install_command
 from photonpano.errors import PluginError
 from photonpano.registry.kinds import KINDS
-from photonpano.registry.observers import Observer
-from photonpano.registry.plugins import contributions_of, observation_of, require_same_contract
+from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of, require_same_contract
 from photonpano.text import listed, suggestion
 
 if TYPE_CHECKING:
-    from photonpano.contributions import AnyContribution, Requirement
+    import pluggy
+
+    from photonpano.contributions import Requirement
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Origin:
+    """The plugin that something comes from.
+
+    Attributes:
+        plugin: its distribution, such as "photonpano".
+        version: the version of the distribution.
+        entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
+    """
+
+    plugin: str
+    version: str
+    entry_point: str
+
+    def label(self, kind: str, name: str) -> str:
+        """Return the name of a component for messages, such as "merger 'photon-mle' of photonpano 0.1.0"."""
+        return f"{kind} {name!r} of {self.plugin} {self.version}"
+
+    def __str__(self) -> str:
+        return f"{self.plugin} {self.version} ({self.entry_point})"
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One component on offer, and where it comes from.
+    """One component on offer.
 
     Attributes:
         contribution: the record of the component.
-        plugin: the distribution it came from, such as "photonpano".
-        version: the version of that distribution.
-        entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
+        origin: the plugin that offers it.
         missing: libraries that the component needs and that are not installed.
     """
 
-    contribution: AnyContribution
-    plugin: str
-    version: str
-    entry_point: str
+    contribution: Contribution
+    origin: Origin
     missing: tuple[Requirement, ...] = ()
 
     @property
@@ -42,63 +61,72 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """What specs call the component."""
+        """The name of the component in specs."""
         return self.contribution.name
 
     @property
-    def origin(self) -> str:
-        """Distribution, version and entry point, for messages."""
-        return f"{self.plugin} {self.version} ({self.entry_point})"
+    def label(self) -> str:
+        """Kind, name, distribution and version, for messages."""
+        return self.origin.label(self.kind, self.name)
 
     @property
     def unavailable(self) -> str | None:
-        """Why the component cannot be built here, with the line that installs what it lacks; None if it can."""
+        """Why the component cannot be built here, and the line that installs what is missing; None if it can."""
         if not self.missing:
             return None
         modules = listed(requirement.module for requirement in self.missing)
-        packages = " ".join(f'"{install}"' for install in dict.fromkeys(each.install for each in self.missing))
         are = "is" if len(self.missing) == 1 else "are"
-        return f"the {self.kind} {self.name!r} needs {modules}, which {are} not installed: pip install {packages}"
+        return f"the {self.kind} {self.name!r} needs {modules}, which {are} not installed: {install_command(self.missing)}"
 
 
 @dataclass(frozen=True, slots=True)
 class BrokenPlugin:
-    """A plugin that offers nothing because something is wrong with it.
+    """A plugin that failed to load, and offers nothing.
 
     Attributes:
-        plugin: its distribution.
-        version: the version of that distribution.
-        entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
+        origin: the plugin.
         error: what went wrong, in a line.
     """
 
-    plugin: str
-    version: str
-    entry_point: str
+    origin: Origin
     error: str
 
     def __str__(self) -> str:
-        return f"{self.plugin} {self.version} ({self.entry_point}): {self.error}"
+        return f"{self.origin}: {self.error}"
 
 
 @dataclass(frozen=True, slots=True)
 class DisabledPlugin:
-    """A plugin that was not imported, because the environment says so.
+    """A plugin that was not imported, because the environment disables it.
 
     Attributes:
-        plugin: its distribution.
-        version: the version of that distribution.
-        entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
+        origin: the plugin.
         by: what disables it, such as "PHOTONPANO_DISABLE_PLUGINS=core".
     """
 
-    plugin: str
-    version: str
-    entry_point: str
+    origin: Origin
     by: str
 
     def __str__(self) -> str:
-        return f"{self.plugin} {self.version} ({self.entry_point}), by {self.by}"
+        return f"{self.origin}, by {self.by}"
+
+
+@dataclass(frozen=True, slots=True)
+class Observer:
+    """A plugin with observation hooks.
+
+    Attributes:
+        origin: the plugin.
+        hook: calls the observation hooks of the plugin by their names; a hook that it lacks does nothing.
+    """
+
+    origin: Origin
+    hook: pluggy.HookRelay
+
+    @property
+    def watches(self) -> tuple[str, ...]:
+        """The names of the observation hooks that the plugin has."""
+        return tuple(name for name in OBSERVATION_HOOKS if getattr(self.hook, name).get_hookimpls())
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +136,7 @@ class Catalog:
     Attributes:
         rows: every component on offer, ordered by kind and name.
         broken: the plugins that failed; none of their components is on offer.
-        disabled: the plugins that were not imported; what they offer is not known.
+        disabled: the plugins that were not imported, so that their components are not known.
         observers: the plugins that watch runs.
     """
 
@@ -122,38 +150,23 @@ class Catalog:
         return tuple(sorted({entry.name for entry in self.rows if entry.kind == kind}))
 
     def find(self, kind: str, name: str) -> Entry:
-        """Look a component up, whether or not its libraries are installed.
+        """Look a component up, whether or not its libraries are installed: see `Entry.unavailable`.
 
         Args:
             kind: "source", "resampler", "merger", "locator" or "interpolator".
-            name: what specs call it.
+            name: the name of the component in specs.
 
         Raises:
-            PluginError: no plugin offers the name (says the nearest ones, and which plugins are broken
-                or disabled), or several do.
+            PluginError: no plugin offers the name (the message has the nearest names, and the plugins that are broken or
+                disabled), or several do.
         """
-        found = [entry for entry in self.rows if entry.kind == kind and entry.name == name]
+        found = [entry for entry in self.rows if (entry.kind, entry.name) == (kind, name)]
         if not found:
             raise PluginError(self.unknown(kind, name))
         if len(found) > 1:
-            origins = listed(entry.origin for entry in found)
+            origins = listed(str(entry.origin) for entry in found)
             raise PluginError(f"the {kind} {name!r} is offered by {origins}; uninstall or disable all but one")
         return found[0]
-
-    def get(self, kind: str, name: str) -> Entry:
-        """Look a component up that is to be built.
-
-        Args:
-            kind: "source", "resampler", "merger", "locator" or "interpolator".
-            name: what specs call it.
-
-        Raises:
-            PluginError: as `find`, or a library that the component needs is not installed (says how to install it).
-        """
-        entry = self.find(kind, name)
-        if entry.unavailable:
-            raise PluginError(entry.unavailable)
-        return entry
 
     def including(self, *offers: object) -> Catalog:
         """Return a catalog that also offers these, for notebooks and tests.
@@ -167,23 +180,23 @@ class Catalog:
         added: list[Entry] = []
         observers = list(self.observers)
         for offer in offers:
+            given: tuple[Contribution, ...]
             if isinstance(offer, Contribution):
                 require_same_contract(offer)
-                given: tuple[AnyContribution, ...] = (offer,)
+                given = (offer,)
             else:
                 given = contributions_of(offer)
                 if hook := observation_of(offer):
-                    name = getattr(offer, "__name__", type(offer).__name__)
-                    observers.append(Observer(name, "unreleased", "given in Python", hook))
-            added += [make_entry(each, each.build.__module__, "unreleased", "given in Python") for each in given]
+                    observers.append(Observer(_given_in_python(getattr(offer, "__name__", type(offer).__name__)), hook))
+            added += [make_entry(each, _given_in_python(each.build.__module__)) for each in given]
         return replace(self, rows=ordered([*self.rows, *added]), observers=tuple(observers))
 
     def unknown(self, kind: str | None, name: str) -> str:
-        """Say that no plugin offers a name: the nearest ones, and which plugins might, were they not broken or disabled.
+        """Return the message for a name that no plugin offers: with the nearest names, and the plugins that might offer it.
 
         Args:
             kind: such as "locator"; None if any would do.
-            name: what was asked for.
+            name: the name that was looked up.
         """
         message = f"there is no {kind or 'component'} {name!r}"
         others = [entry.kind for entry in self.rows if entry.name == name]
@@ -197,16 +210,19 @@ class Catalog:
         return message
 
 
-def make_entry(contribution: AnyContribution, plugin: str, version: str, entry_point: str) -> Entry:
-    """Make the entry of a contribution; finds out which of its libraries are missing, without importing them."""
-    missing = tuple(each for each in contribution.requires if not _is_installed(each.module))
-    return Entry(contribution, plugin, version, entry_point, missing)
+def make_entry(contribution: Contribution, origin: Origin) -> Entry:
+    """Make the entry of a contribution; finds its missing libraries without importing any."""
+    return Entry(contribution, origin, tuple(each for each in contribution.requires if not _is_installed(each.module)))
 
 
 def ordered(rows: list[Entry]) -> tuple[Entry, ...]:
     """Order entries by kind, then name, then origin."""
     kinds = list(KINDS)
     return tuple(sorted(rows, key=lambda entry: (kinds.index(entry.kind), entry.name, entry.origin)))
+
+
+def _given_in_python(module: str) -> Origin:
+    return Origin(module, "unreleased", "given in Python")
 
 
 def _is_installed(module: str) -> bool:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from photonpano.contributions import AnyContribution
+    from photonpano.contributions import Contribution
     from photonpano.registry.schema_text import Schema
 
 PLAIN_TEXT = re.compile(r"[A-Za-z/][\w./-]*")
@@ -76,7 +76,7 @@ class Description:
     install: tuple[str, ...]
 
 
-def describe(contribution: AnyContribution) -> Description:
+def describe(contribution: Contribution) -> Description:
     """Describe a component: a table of its config, and a snippet of YAML to paste."""
     root = config_schema(contribution.config)
     snippet = [f"{KINDS[contribution.kind].section}:", f"  use: {contribution.name}"]

@@ -1,4 +1,4 @@
-"""Find the installed plugins; a broken one becomes a row, and the others go on."""
+"""Find the installed plugins: a broken one becomes a row of the catalog, and the others go on."""
 
 from __future__ import annotations
 
@@ -9,42 +9,40 @@ from importlib.metadata import version as version_of
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
 from photonpano.registry.auto import AUTO
-from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, make_entry, ordered
+from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer, Origin, make_entry, ordered
 from photonpano.registry.chain import CHAIN
-from photonpano.registry.disabling import DISABLE, Switch
-from photonpano.registry.observers import Observer
+from photonpano.registry.disabling import DisabledNames
 from photonpano.registry.plugins import contributions_of, observation_of
 
 logger = logging.getLogger(__name__)
 
 
 def discover() -> Catalog:
-    """Load every plugin in the entry-point group `photonpano` and collect what they and the framework offer.
+    """Load every plugin in the entry-point group `photonpano` and collect what they offer.
 
-    Never raises for what a plugin does wrong: see `Catalog.broken`. A plugin is taken whole or not at all. One that the
-    environment variable `PHOTONPANO_DISABLE_PLUGINS` names, by its distribution or its entry point, is not even imported: see
-    `Catalog.disabled`. Names there that are no plugin's are logged as a warning.
+    Never raises for what a plugin does wrong: see `Catalog.broken`. A plugin is taken whole or not at all. A plugin that the
+    environment variable `PHOTONPANO_DISABLE_PLUGINS` names, by its distribution or its entry point, is not imported: see
+    `Catalog.disabled`. Names in the variable that are no plugin's are logged as a warning.
     """
-    rows = [make_entry(own, PROJECT, version_of(PROJECT), "built in") for own in (AUTO, CHAIN)]
+    rows: list[Entry] = [make_entry(own, Origin(PROJECT, version_of(PROJECT), "built in")) for own in (AUTO, CHAIN)]
     broken: list[BrokenPlugin] = []
     disabled: list[DisabledPlugin] = []
     observers: list[Observer] = []
-    switch = Switch()
+    names = DisabledNames()
     for entry_point in entry_points(group=PROJECT):
-        plugin, version = _distribution(entry_point)
-        label = f"{entry_point.name} = {entry_point.value}"
-        if word := switch.word_for(entry_point.name, plugin):
-            disabled.append(DisabledPlugin(plugin, version, label, f"{DISABLE}={word}"))
+        origin = _origin(entry_point)
+        if by := names.disabled_by(entry_point.name, origin.plugin):
+            disabled.append(DisabledPlugin(origin, by))
             continue
         try:
             loaded = entry_point.load()
             hook = observation_of(loaded)
-            rows += [make_entry(contribution, plugin, version, label) for contribution in contributions_of(loaded)]
+            rows += [make_entry(contribution, origin) for contribution in contributions_of(loaded)]
             if hook:
-                observers.append(Observer(plugin, version, label, hook))
+                observers.append(Observer(origin, hook))
         except (Exception, SystemExit) as error:  # whatever the plugin's import does, it is a row
-            broken.append(BrokenPlugin(plugin, version, label, _in_a_line(error)))
-    if unknown := switch.unknown():
+            broken.append(BrokenPlugin(origin, _in_a_line(error)))
+    if unknown := names.unknown():
         logger.warning(unknown)
     return Catalog(
         ordered(rows),
@@ -59,10 +57,8 @@ def _in_a_line(error: BaseException) -> str:
     return head + " ".join(str(error).split())
 
 
-def _distribution(entry_point: EntryPoint) -> tuple[str, str]:
-    """Return name and version; the metadata of a damaged installation may lack either."""
-    if entry_point.dist is None:
-        return "unknown", "unknown"
-    metadata = entry_point.dist.metadata
-    name, version = (metadata.get_all(key, ["unknown"])[0] for key in ("Name", "Version"))
-    return name, version
+def _origin(entry_point: EntryPoint) -> Origin:
+    """Return the origin of a plugin; the metadata of a damaged installation may lack name or version."""
+    metadata = entry_point.dist.metadata if entry_point.dist else None
+    name, version = (metadata.get_all(key, ["unknown"])[0] if metadata else "unknown" for key in ("Name", "Version"))
+    return Origin(name, version, f"{entry_point.name} = {entry_point.value}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano.contributions import (
     Contribution,
@@ -32,7 +32,7 @@ class Kind:
     name: str
     section: str
     hook: str
-    contribution: type[Contribution[Any, Any, Any]]
+    contribution: type[Contribution]
 
 
 KINDS: Mapping[str, Kind] = {

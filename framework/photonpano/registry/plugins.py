@@ -13,7 +13,7 @@ from photonpano.registry.kinds import KINDS, Kind
 from photonpano.text import listed
 
 if TYPE_CHECKING:
-    from photonpano.contributions import AnyContribution
+    from photonpano.contributions import Contribution
 
 PREFIX = f"{hookspecs.PROJECT}_"
 HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
@@ -22,7 +22,7 @@ OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for k
 """Those that offer nothing: they are told what happens in a run."""
 
 
-def contributions_of(plugin: object) -> tuple[AnyContribution, ...]:
+def contributions_of(plugin: object) -> tuple[Contribution, ...]:
     """Call the five hooks of one plugin that offer components, and check what they return.
 
     Args:
@@ -47,7 +47,7 @@ def observation_of(plugin: object) -> pluggy.HookRelay | None:
     return manager.hook if implemented.intersection(OBSERVATION_HOOKS) else None
 
 
-def require_same_contract(contribution: AnyContribution) -> None:
+def require_same_contract(contribution: Contribution) -> None:
     """Refuse a contribution that was made for another version of the contract.
 
     Raises:
@@ -86,7 +86,7 @@ def _check_names(plugin: object, manager: pluggy.PluginManager) -> None:
             raise PluginError(f"{name} is not marked with @photonpano.hookimpl")
 
 
-def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[AnyContribution]:
+def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[Contribution]:
     try:
         results: list[Any] = getattr(manager.hook, kind.hook)()
         offered = [item for result in results for item in _items(result)]

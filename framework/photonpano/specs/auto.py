@@ -126,7 +126,7 @@ def _complaints(entry: Entry, keys: Value, directory: Path) -> tuple[str, ...]:
         return ()
     if config is None:
         return ()
-    return complaints(Choice(entry.contribution, config, entry.plugin, entry.version))
+    return complaints(Choice(entry.contribution, config, entry.origin))
 
 
 def _looks(path: Path) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano.registry.kinds import KINDS
 from photonpano.specs.tree import Place
@@ -42,12 +42,11 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
     return problems
 
 
-def complaints(choice: Choice[Any], *stream: StreamInfo) -> tuple[str, ...]:
+def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
     """Run the `check` of a component; one that fails is a complaint itself."""
     contribution = choice.contribution
     try:
         found = contribution.check(choice.config, *stream)
         return (found,) if isinstance(found, str) else tuple(map(str, found))
     except Exception as error:
-        origin = f"{contribution.kind} {contribution.name!r} of {choice.plugin} {choice.version}"
-        return (f"the check of the {origin} raised {type(error).__name__}: {error}",)
+        return (f"the check of the {choice.label} raised {type(error).__name__}: {error}",)

@@ -3,44 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from photonpano.contributions import (
-        Config,
-        InterpolatorContribution,
-        LocatorContribution,
-        MergerContribution,
-        ResamplerContribution,
-        SourceContribution,
-    )
+    from photonpano.contributions import Config, Contribution
     from photonpano.corrections import Correction
-    from photonpano.registry import Observer
+    from photonpano.registry import Observer, Origin
     from photonpano.specs.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.specs.tree import Place
     from photonpano.values import Decision
 
-ContributionT = TypeVar("ContributionT", covariant=True)
-
 
 @dataclass(frozen=True, slots=True)
-class Choice(Generic[ContributionT]):
+class Choice:
     """A component chosen by name, with its validated config.
 
     Attributes:
         contribution: what the plugin offers under that name.
         config: an instance of `contribution.config`.
-        plugin: the distribution it came from, such as "photonpano".
-        version: the version of that distribution.
+        origin: the plugin.
     """
 
-    contribution: ContributionT
+    contribution: Contribution
     config: Config
-    plugin: str
-    version: str
+    origin: Origin
+
+    @property
+    def label(self) -> str:
+        """Kind, name, distribution and version, for messages, such as "merger 'photon-mle' of photonpano 0.1.0"."""
+        return self.origin.label(self.contribution.kind, self.contribution.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +44,11 @@ class LevelPlan:
     Pairs that `locate` loses are offered to the `fallbacks`, in order.
     """
 
-    resample: Choice[ResamplerContribution[Any]]
-    merge: Choice[MergerContribution[Any]]
-    locate: Choice[LocatorContribution[Any]]
-    fallbacks: tuple[Choice[LocatorContribution[Any]], ...]
-    interpolate: Choice[InterpolatorContribution[Any]]
+    resample: Choice
+    merge: Choice
+    locate: Choice
+    fallbacks: tuple[Choice, ...]
+    interpolate: Choice
     scale: float | Literal["auto"]
 
 
@@ -78,7 +72,7 @@ class Plan:
         decisions: what the spec leaves open, and reading it has decided: which source recognises the capture.
     """
 
-    source: Choice[SourceContribution[Any]]
+    source: Choice
     corrections: tuple[Correction, ...]
     levels: tuple[LevelPlan, ...]
     until_converged: bool

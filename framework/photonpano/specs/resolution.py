@@ -57,8 +57,8 @@ class _Selection:
 
     entry: Entry | None
     keys: Value
-    choice: Choice[Any] | None
-    fallbacks: tuple[Choice[Any], ...] = ()
+    choice: Choice | None
+    fallbacks: tuple[Choice, ...] = ()
 
 
 def resolve(root: Value, directory: Path, catalog: Catalog, problems: list[Problem]) -> Plan:
@@ -190,8 +190,8 @@ class _Resolver:
         return _Selection(entry, found.keys, choice)
 
     def fallbacks(
-        self, value: Value, content: dict[str, Value], first: Choice[Any] | None, base: _Selection | None
-    ) -> tuple[Choice[Any], ...]:
+        self, value: Value, content: dict[str, Value], first: Choice | None, base: _Selection | None
+    ) -> tuple[Choice, ...]:
         """Resolve the locators to which lost pairs are offered: one or a list, each a name or a mapping.
 
         The default locator has a default fallback; one that is named has those that are named.
@@ -226,7 +226,7 @@ class _Resolver:
                 found.append(choice)
         return tuple(found)
 
-    def default_fallbacks(self, value: Value) -> tuple[Choice[Any], ...]:
+    def default_fallbacks(self, value: Value) -> tuple[Choice, ...]:
         """Resolve the fallback of a section that names neither a locator nor fallbacks."""
         if DEFAULT_FALLBACK not in self.catalog.names(KIND_OF["locate"].name):
             return ()
@@ -234,7 +234,7 @@ class _Resolver:
         choice = self.fallback(Value(DEFAULT_FALLBACK, place))
         return () if choice is None else (choice,)
 
-    def fallback(self, item: Value) -> Choice[Any] | None:
+    def fallback(self, item: Value) -> Choice | None:
         """Resolve one locator to which lost pairs are offered."""
         kind = KIND_OF["locate"]
         content = {"use": item} if isinstance(item.content, str) else item.content
@@ -260,7 +260,7 @@ class _Resolver:
         if isinstance(item.content, str):
             self.places[joined(where, "use")] = item.head
 
-    def choice(self, entry: Entry, keys: Value, base: _Selection | None) -> Choice[Any] | None:
+    def choice(self, entry: Entry, keys: Value, base: _Selection | None) -> Choice | None:
         """Validate the keys of a component; what is wrong in the base of a level is not said again."""
         found: list[Problem] = []
         try:
@@ -268,14 +268,13 @@ class _Resolver:
             if config is not None:
                 config.model_dump(mode="json")  # a run records it
         except Exception as error:
-            origin = f"{entry.kind} {entry.name!r} of {entry.plugin} {entry.version}"
-            found.append(keys.head.problem(f"the config of the {origin} raised {type(error).__name__}: {error}"))
+            found.append(keys.head.problem(f"the config of the {entry.label} raised {type(error).__name__}: {error}"))
             config = None
         if base is not None:
             said = {(each.where.removeprefix(base.keys.head.where), each.message) for each in self.problems}
             found = [each for each in found if (each.where.removeprefix(keys.head.where), each.message) not in said]
         self.problems += found
-        return None if config is None else Choice(entry.contribution, config, entry.plugin, entry.version)
+        return None if config is None else Choice(entry.contribution, config, entry.origin)
 
     def entry(self, kind: Kind, value: Value, use: Value | None) -> Entry | None:
         """Look up the component that a section names; None if it names none, or one that there is not."""
@@ -374,9 +373,9 @@ def _updated(base: _Selection, keys: Value) -> Value:
     return Value(base.keys.content | keys.content, keys.place, keys.key)
 
 
-def _stage(name: str, choice: Any, fallbacks: Iterable[Choice[Any]]) -> dict[str, Any]:
+def _stage(name: str, choice: Any, fallbacks: Iterable[Choice]) -> dict[str, Any]:
     return _written(choice) | ({"fallback": [_written(each) for each in fallbacks]} if name == "locate" else {})
 
 
-def _written(choice: Choice[Any]) -> dict[str, Any]:
+def _written(choice: Choice) -> dict[str, Any]:
     return {"use": choice.contribution.name, "with": choice.config.model_dump(mode="json", by_alias=True)}

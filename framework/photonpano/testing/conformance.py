@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from photonpano.contributions import AnyContribution
+from photonpano.contributions import Contribution
 from photonpano.registry import KINDS
 
 HEAVY = frozenset(
@@ -74,7 +74,7 @@ class Conformance:
     kind: ClassVar[str]
     methods: ClassVar[tuple[str, ...]]
 
-    contribution: AnyContribution
+    contribution: Contribution
     config: Mapping[str, Any] = {}
     hook_module: str | None = None
     heavy: frozenset[str] = HEAVY

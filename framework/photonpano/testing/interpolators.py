@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ class InterpolatorConformance(StageConformance):
     kind: ClassVar[str] = "interpolator"
     methods: ClassVar[tuple[str, ...]] = ("fit",)
 
-    contribution: InterpolatorContribution[Any]
+    contribution: InterpolatorContribution
     tolerance_px: float = 1e-3
     keeps_velocity: bool = True
 

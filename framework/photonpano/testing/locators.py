@@ -62,7 +62,7 @@ class LocatorConformance(StageConformance):
     kind: ClassVar[str] = "locator"
     methods: ClassVar[tuple[str, ...]] = ("describe", "register")
 
-    contribution: LocatorContribution[Any]
+    contribution: LocatorContribution
     tolerance_px: float = 0.5
     motions: tuple[str, ...] = tuple(MOTIONS)
     free: tuple[int, ...] = tuple(range(8))

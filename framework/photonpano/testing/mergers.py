@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache, partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ class MergerConformance(StageConformance):
     kind: ClassVar[str] = "merger"
     methods: ClassVar[tuple[str, ...]] = ("merge",)
 
-    contribution: MergerContribution[Any]
+    contribution: MergerContribution
     tolerance_px: float = 0.1
     scales: tuple[float, ...] = (0.5, 1.0, 2.0)
     compensates: bool = True

@@ -29,7 +29,7 @@ class ResamplerConformance(StageConformance):
     kind: ClassVar[str] = "resampler"
     methods: ClassVar[tuple[str, ...]] = ("groups",)
 
-    contribution: ResamplerContribution[Any]
+    contribution: ResamplerContribution
 
     def groups(self, n_frames: int, level: int) -> Any:
         """Ask a resampler that has just been built."""

@@ -36,7 +36,7 @@ class SourceConformance(Conformance):
     kind: ClassVar[str] = "source"
     methods: ClassVar[tuple[str, ...]] = ("info", "response", "valid", "counts", "frames", "close", "__enter__", "__exit__")
 
-    contribution: SourceContribution[Any]
+    contribution: SourceContribution
     frame_shape: tuple[int, int] = (18, 27)
     n_frames: int = 75
     bit_depth: int = 1

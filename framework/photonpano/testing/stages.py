@@ -20,7 +20,7 @@ SUMMARY = CaptureSummary(flux=0.5, speed_px=0.15, how="as the kit says")
 class StageConformance(Conformance):
     """Checks of components that are built for a capture."""
 
-    contribution: StageContribution[Any, Any]
+    contribution: StageContribution
 
     def built(self, stream: StreamInfo = STREAM, threads: int = 1) -> Any:
         """Build the component for a capture that looks like this; what the frames tell can be asked for afterwards."""

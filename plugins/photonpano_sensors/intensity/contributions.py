@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from photonpano import Requirement, SourceContribution
 from photonpano.reading import objections
@@ -61,7 +61,7 @@ def _check_pictures(config: ImageFolderConfig) -> Sequence[str]:
     return objections(lambda: ImageFolderSource(config).close())
 
 
-INTENSITY_SOURCES: tuple[SourceContribution[Any], ...] = (
+INTENSITY_SOURCES: tuple[SourceContribution, ...] = (
     SourceContribution(
         name="video",
         summary="Grey frames of a video, such as an MP4 or AVI file of a high-speed camera",

@@ -12,5 +12,6 @@ from photonpano import discover
 def test_without_the_library_it_is_listed_and_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert discover().find("locator", "pycolmap-two-view").unavailable == (
-        "the locator 'pycolmap-two-view' needs pycolmap, which is not installed: pip install \"photonpano[colmap]\""
+        "the locator 'pycolmap-two-view' needs pycolmap, which is not installed: "
+        'pip install "photonpano[colmap]" (in a checkout: pip install ".[colmap]")'
     )

@@ -268,7 +268,10 @@ def test_a_missing_library_comes_with_its_extra(tmp_path: Path, monkeypatch: pyt
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "av" else there(name, *more))
     (tmp_path / "a.mp4").write_bytes(b"1234")
-    missing = "the source 'video' needs av, which is not installed: pip install \"photonpano[video]\""
+    missing = (
+        "the source 'video' needs av, which is not installed: "
+        'pip install "photonpano[video]" (in a checkout: pip install ".[video]")'
+    )
     golden = f"DIR/spec.yaml:2:15: source.use: {missing}\nerror: the spec has 1 problem\n"
     run(tmp_path, "video", "a.mp4", golden)
 

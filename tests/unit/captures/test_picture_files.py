@@ -96,7 +96,8 @@ def test_what_cannot_be_written_is_told_before_the_work(tmp_path: Path, monkeypa
     )
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     assert refused(tmp_path / "look.mp4") == (
-        'cannot write look.mp4: videos need av, which is not installed: pip install "photonpano[video]"'
+        'cannot write look.mp4: videos need av, which is not installed: pip install "photonpano[video]" '
+        '(in a checkout: pip install ".[video]")'
     )
     assert refused(tmp_path / "no" / "look") == "cannot write look: there is no folder " + str(tmp_path / "no") + (
         "; create it or choose another"

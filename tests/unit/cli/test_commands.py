@@ -13,7 +13,7 @@ from pydantic import Field
 from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, hookimpl
-from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer
+from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.plugins import observation_of
 from photonpano.specs import load_spec, parse_spec
@@ -204,19 +204,21 @@ class Keys(Config):
     ratio: float = Field(0.8, gt=0, description="how far")
 
 
-def locator(name: str, *requires: Requirement) -> LocatorContribution[Keys]:
+def locator(name: str, *requires: Requirement) -> LocatorContribution:
     return LocatorContribution(name=name, summary="A toy", config=Keys, build=lambda *_: None, requires=requires)
 
 
 @pytest.fixture
 def odd_catalog(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [make_entry(locator("twice"), plugin, "2.0", f"{plugin} = {plugin}.hooks") for plugin in ("alpha", "beta")]
-    rows.append(make_entry(locator("far", Requirement("no_such_library", "gamma[far]")), "gamma", "1.0", "g = gamma.hooks"))
-    broken = BrokenPlugin("delta", "0.3", "d = delta.hooks", "ImportError: no module named [delta]")
-    disabled = DisabledPlugin("epsilon", "0.4", "e = epsilon.hooks", "PHOTONPANO_DISABLE_PLUGINS=e")
+    rows = [make_entry(locator("twice"), Origin(plugin, "2.0", f"{plugin} = {plugin}.hooks")) for plugin in ("alpha", "beta")]
+    rows.append(
+        make_entry(locator("far", Requirement("no_such_library", "gamma[far]")), Origin("gamma", "1.0", "g = gamma.hooks"))
+    )
+    broken = BrokenPlugin(Origin("delta", "0.3", "d = delta.hooks"), "ImportError: no module named [delta]")
+    disabled = DisabledPlugin(Origin("epsilon", "0.4", "e = epsilon.hooks"), "PHOTONPANO_DISABLE_PLUGINS=e")
     plugin = ModuleType("zeta")
     plugin.photonpano_run_started = plugin.photonpano_run_finished = hookimpl(lambda: None)
-    observer = Observer("zeta", "0.5", "z = zeta.hooks", observation_of(plugin))
+    observer = Observer(Origin("zeta", "0.5", "z = zeta.hooks"), observation_of(plugin))
     catalog = Catalog(tuple(rows), (broken,), (disabled,), (observer,))
     monkeypatch.setattr("photonpano.registry.discover", lambda: catalog)
 

@@ -23,7 +23,7 @@ from photonpano import (
     StreamInfo,
 )
 from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
-from photonpano.registry import Catalog
+from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec
 from photonpano.values import Decision
@@ -56,7 +56,7 @@ def plan(levels: Any = 1, **changes: Any) -> Plan:
     rows = []
     for kind in KINDS:
         fields = {"name": "toy", "summary": "A toy", "config": Keys, "build": Built} | changes.get(kind.kind, {})
-        rows.append(make_entry(kind(**fields), "toys", "1.0", "toys = toys.hooks"))
+        rows.append(make_entry(kind(**fields), Origin("toys", "1.0", "toys = toys.hooks")))
     spec = {"version": 1, **{section: {"use": "toy"} for section in SECTIONS}, "levels": levels}
     return parse_spec(spec | {"run": {"seed": 7, "threads": 3}}, catalog=Catalog(tuple(rows)))
 
@@ -168,7 +168,10 @@ def test_a_library_that_went_missing_is_named_with_its_install_line() -> None:
     object.__setattr__(contribution, "requires", (Requirement("no_such_library", "photonpano[camera]"),))
     with pytest.raises(PluginError) as caught:
         build_source(made)
-    assert str(caught.value) == "source 'toy' of toys 1.0 needs no_such_library: run pip install \"photonpano[camera]\""
+    assert str(caught.value) == (
+        "source 'toy' of toys 1.0 needs no_such_library, which is not installed: "
+        'pip install "photonpano[camera]" (in a checkout: pip install ".[camera]")'
+    )
 
 
 def test_the_response_reaches_every_stage() -> None:

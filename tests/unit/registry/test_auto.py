@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from photonpano import Config, PluginError, Recognised, SourceContribution
-from photonpano.registry import Catalog
+from photonpano.registry import Catalog, Origin
 from photonpano.registry.auto import AUTO, AutoConfig, ask_sources
 from photonpano.registry.catalog import make_entry
 
@@ -18,7 +18,7 @@ class NoKeys(Config):
 
 def source(name, recognise):
     contribution = SourceContribution(name=name, summary="Toy", config=NoKeys, build=lambda *_: None, recognise=recognise)
-    return make_entry(contribution, "toys", "1.2", "toys = toys.hooks")
+    return make_entry(contribution, Origin("toys", "1.2", "toys = toys.hooks"))
 
 
 def raises(path):

@@ -7,7 +7,7 @@ from types import ModuleType
 import pytest
 
 from photonpano import Config, LocatorContribution, MergerContribution, PluginError, Requirement, hookimpl
-from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin
+from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Origin
 
 
 class Keys(Config):
@@ -33,7 +33,7 @@ def catalog():
 
 def message(catalog, kind, name):
     with pytest.raises(PluginError) as caught:
-        catalog.get(kind, name)
+        catalog.find(kind, name)
     return str(caught.value)
 
 
@@ -41,14 +41,14 @@ def test_including_contributions_leaves_the_catalog_as_it_was(catalog):
     extended = catalog.including(locator("phase"))
     assert extended.names("locator") == ("direct", "opencv-sift", "phase")
     assert catalog.names("locator") == ("direct", "opencv-sift")
-    entry = extended.get("locator", "phase")
-    assert (entry.plugin, entry.version) == (__name__, "unreleased")
+    entry = extended.find("locator", "phase")
+    assert (entry.origin.plugin, entry.origin.version) == (__name__, "unreleased")
 
 
 def test_including_a_plugin():
     plugin = ModuleType("my_hooks")
     plugin.photonpano_mergers = hookimpl(lambda: [MERGER])
-    assert Catalog().including(plugin).get("merger", "sum").contribution is MERGER
+    assert Catalog().including(plugin).find("merger", "sum").contribution is MERGER
 
 
 def test_including_a_broken_plugin_is_an_error():
@@ -62,7 +62,7 @@ def test_including_what_watches_runs():
     plugin = ModuleType("my_hooks")
     plugin.photonpano_run_started = hookimpl(lambda: None)
     catalog = Catalog().including(plugin, MERGER).including(locator("direct"))
-    assert [each.origin for each in catalog.observers] == ["my_hooks unreleased (given in Python)"]
+    assert [str(each.origin) for each in catalog.observers] == ["my_hooks unreleased (given in Python)"]
     assert [each.name for each in catalog.rows] == ["sum", "direct"]
 
 
@@ -91,7 +91,10 @@ def test_unknown_name_says_what_is_near(kind, name, expected, catalog):
 
 
 def test_unknown_name_of_a_catalog_with_broken_plugins():
-    broken = (BrokenPlugin("a", "1", "a = a.hooks", "ImportError: x"), BrokenPlugin("b", "2", "b = b.hooks", "ValueError: y"))
+    broken = (
+        BrokenPlugin(Origin("a", "1", "a = a.hooks"), "ImportError: x"),
+        BrokenPlugin(Origin("b", "2", "b = b.hooks"), "ValueError: y"),
+    )
     assert message(Catalog(broken=broken), "source", "cube") == (
         "there is no source 'cube'. Broken plugins may have offered it: "
         "a 1 (a = a.hooks): ImportError: x and b 2 (b = b.hooks): ValueError: y"
@@ -99,7 +102,7 @@ def test_unknown_name_of_a_catalog_with_broken_plugins():
 
 
 def test_unknown_name_of_a_catalog_with_disabled_plugins():
-    disabled = (DisabledPlugin("a", "1", "a = a.hooks", "X=a"),)
+    disabled = (DisabledPlugin(Origin("a", "1", "a = a.hooks"), "X=a"),)
     assert message(Catalog(disabled=disabled), "source", "cube") == (
         "there is no source 'cube'. Disabled plugins may have offered it: a 1 (a = a.hooks), by X=a"
     )
@@ -107,17 +110,18 @@ def test_unknown_name_of_a_catalog_with_disabled_plugins():
 
 def test_missing_library_says_how_to_install_it():
     catalog = Catalog().including(locator("loftr", KORNIA), locator("both", KORNIA, Requirement("no.such.module", "other>=2")))
-    assert message(catalog, "locator", "loftr") == (
-        "the locator 'loftr' needs no_such_kornia, which is not installed: pip install \"photonpano[kornia]\""
+    assert catalog.find("locator", "loftr").unavailable == (
+        "the locator 'loftr' needs no_such_kornia, which is not installed: "
+        'pip install "photonpano[kornia]" (in a checkout: pip install ".[kornia]")'
     )
-    assert message(catalog, "locator", "both") == (
+    assert catalog.find("locator", "both").unavailable == (
         "the locator 'both' needs no_such_kornia and no.such.module, which are not installed: "
-        'pip install "photonpano[kornia]" "other>=2"'
+        'pip install "photonpano[kornia]" "other>=2" (in a checkout: pip install ".[kornia]" "other>=2")'
     )
     assert catalog.find("locator", "loftr").missing == (KORNIA,)
 
 
 def test_installed_library_is_found_without_importing_it():
     assert "this" not in sys.modules
-    assert Catalog().including(locator("zen", Requirement("this", "python"))).get("locator", "zen").unavailable is None
+    assert Catalog().including(locator("zen", Requirement("this", "python"))).find("locator", "zen").unavailable is None
     assert "this" not in sys.modules

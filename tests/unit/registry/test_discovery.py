@@ -4,7 +4,7 @@ import pytest
 
 import photonpano
 from photonpano import PluginError
-from photonpano.registry import BrokenPlugin, DisabledPlugin, discover
+from photonpano.registry import BrokenPlugin, DisabledPlugin, Origin, discover
 from photonpano.text import listed
 
 GOOD = """
@@ -20,26 +20,32 @@ def photonpano_locators():
 
 def of_toys(rows):
     """Leave out what is really installed."""
-    return [row for row in rows if row.entry_point.endswith("_hooks")]
+    return [row for row in rows if row.origin.entry_point.endswith("_hooks")]
 
 
 def test_good_plugin_is_on_offer_with_its_distribution(install):
     install("alpha", "1.2", GOOD)
     catalog = discover()
-    rows = [(row.kind, row.name, row.plugin, row.version, row.entry_point) for row in of_toys(catalog.rows)]
+    rows = [
+        (row.kind, row.name, row.origin.plugin, row.origin.version, row.origin.entry_point) for row in of_toys(catalog.rows)
+    ]
     assert rows == [
         ("source", "toy-camera", "alpha", "1.2", "alpha = alpha_hooks"),
         ("locator", "another", "alpha", "1.2", "alpha = alpha_hooks"),
         ("locator", "toy-locator", "alpha", "1.2", "alpha = alpha_hooks"),
     ]
-    assert catalog.get("source", "toy-camera").contribution.summary == "A toy"
+    assert catalog.find("source", "toy-camera").contribution.summary == "A toy"
     assert of_toys(catalog.broken) == []
 
 
 @pytest.mark.parametrize(("kind", "name"), [("source", "auto"), ("locator", "chain-of-backends")])
 def test_the_framework_offers_some_names_itself(kind, name):
-    entry = discover().get(kind, name)
-    assert (entry.plugin, entry.entry_point, entry.version) == ("photonpano", "built in", photonpano.__version__)
+    entry = discover().find(kind, name)
+    assert (entry.origin.plugin, entry.origin.entry_point, entry.origin.version) == (
+        "photonpano",
+        "built in",
+        photonpano.__version__,
+    )
 
 
 @pytest.mark.parametrize(
@@ -106,8 +112,8 @@ def test_broken_plugin_is_a_row_and_harms_no_other(code, error, install, tmp_pat
     install("broken", "0.3", code)
     catalog = discover()
     error = error.format(path=tmp_path / "broken_hooks.py") if "{path}" in error else error
-    assert of_toys(catalog.broken) == [BrokenPlugin("broken", "0.3", "broken = broken_hooks", error)]
-    assert {row.plugin for row in of_toys(catalog.rows)} == {"alpha"}
+    assert of_toys(catalog.broken) == [BrokenPlugin(Origin("broken", "0.3", "broken = broken_hooks"), error)]
+    assert {row.origin.plugin for row in of_toys(catalog.rows)} == {"alpha"}
 
 
 def test_hook_module_that_is_not_there(install, tmp_path):
@@ -119,12 +125,12 @@ def test_hook_module_that_is_not_there(install, tmp_path):
 
 def test_distribution_without_metadata_is_still_used(install):
     install("alpha", "1.2", GOOD, metadata=False)
-    assert {(row.plugin, row.version) for row in of_toys(discover().rows)} == {("unknown", "unknown")}
+    assert {(row.origin.plugin, row.origin.version) for row in of_toys(discover().rows)} == {("unknown", "unknown")}
 
 
 def test_one_contribution_instead_of_a_list_will_do(install):
     install("alpha", "1.2", "@hookimpl\ndef photonpano_sources(): return source('single')")
-    assert discover().get("source", "single").plugin == "alpha"
+    assert discover().find("source", "single").origin.plugin == "alpha"
 
 
 def test_name_of_two_plugins_is_an_error_on_use_alone(install):
@@ -133,7 +139,7 @@ def test_name_of_two_plugins_is_an_error_on_use_alone(install):
     catalog = discover()
     assert len(of_toys(catalog.rows)) == 6
     with pytest.raises(PluginError) as caught:
-        catalog.get("source", "toy-camera")
+        catalog.find("source", "toy-camera")
     assert str(caught.value) == (
         "the source 'toy-camera' is offered by alpha 1.2 (alpha = alpha_hooks) and beta 2.0 (beta = beta_hooks); "
         "uninstall or disable all but one"
@@ -144,7 +150,7 @@ def test_unknown_name_mentions_the_broken_plugins(install):
     install("alpha", "1.2", GOOD)
     install("broken", "0.3", "raise RuntimeError('two\\nlines')")
     with pytest.raises(PluginError) as caught:
-        discover().get("locator", "toy-lokator")
+        discover().find("locator", "toy-lokator")
     assert str(caught.value).endswith(
         "there is no locator 'toy-lokator'; did you mean 'toy-locator'? "
         "Broken plugins may have offered it: broken 0.3 (broken = broken_hooks): RuntimeError: two lines"
@@ -155,11 +161,11 @@ def test_observers_are_kept_apart_from_components(install):
     install("watcher", "0.4", "@hookimpl\ndef photonpano_run_started(spec): pass")
     install("both", "0.5", GOOD + "@hookimpl\ndef photonpano_run_finished(): pass")
     catalog = discover()
-    assert [(each.origin, each.watches) for each in catalog.observers] == [
+    assert [(str(each.origin), each.watches) for each in catalog.observers] == [
         ("both 0.5 (both = both_hooks)", ("photonpano_run_finished",)),
         ("watcher 0.4 (watcher = watcher_hooks)", ("photonpano_run_started",)),
     ]
-    assert {row.plugin for row in of_toys(catalog.rows)} == {"both"}
+    assert {row.origin.plugin for row in of_toys(catalog.rows)} == {"both"}
 
 
 @pytest.mark.parametrize("word", ["Beta", "beta_lab", "beta-lab", " beta.lab ,"])
@@ -169,17 +175,17 @@ def test_a_disabled_plugin_is_a_row_and_is_not_imported(word, install, monkeypat
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", word)
     catalog = discover()
     by = f"PHOTONPANO_DISABLE_PLUGINS={word.strip(' ,')}"
-    assert of_toys(catalog.disabled) == [DisabledPlugin("beta-lab", "2.0", "beta = beta_hooks", by)]
+    assert of_toys(catalog.disabled) == [DisabledPlugin(Origin("beta-lab", "2.0", "beta = beta_hooks"), by)]
     assert of_toys(catalog.broken) == []
-    assert {row.plugin for row in of_toys(catalog.rows)} == {"alpha"}
+    assert {row.origin.plugin for row in of_toys(catalog.rows)} == {"alpha"}
 
 
 def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "photonpano")
     catalog = discover()
-    assert {row.plugin for row in catalog.rows if row.entry_point != "built in"} == {"alpha"}
-    disabled = [row.entry_point.partition(" = ")[0] for row in catalog.disabled]
+    assert {row.origin.plugin for row in catalog.rows if row.origin.entry_point != "built in"} == {"alpha"}
+    disabled = [row.origin.entry_point.partition(" = ")[0] for row in catalog.disabled]
     assert disabled == ["colmap", "core", "direct", "framework", "kornia", "opencv", "sensors", "simulator"]
 
 
@@ -188,7 +194,7 @@ def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
     install("beta", "2.0", GOOD.replace("toy", "mine"))
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "beta")
     with pytest.raises(PluginError) as caught:
-        discover().get("source", "zzz")
+        discover().find("source", "zzz")
     known = listed(discover().names("source"))
     assert str(caught.value) == (
         f"there is no source 'zzz'; known: {known}. Disabled plugins may have offered it: "
@@ -200,7 +206,7 @@ def test_disabling_one_of_two_settles_whose_a_name_is(install, monkeypatch):
     install("alpha", "1.2", GOOD)
     install("beta", "2.0", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "alpha")
-    assert discover().get("source", "toy-camera").plugin == "beta"
+    assert discover().find("source", "toy-camera").origin.plugin == "beta"
 
 
 @pytest.mark.parametrize(

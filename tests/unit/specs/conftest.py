@@ -16,7 +16,7 @@ from photonpano import (
     SourceContribution,
     SpecPath,
 )
-from photonpano.registry import Catalog
+from photonpano.registry import Catalog, Origin
 from photonpano.registry.auto import AUTO
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.chain import CHAIN
@@ -135,6 +135,6 @@ TWICE = LocatorContribution(name="twice", summary="Toy", config=DirectConfig, bu
 
 @pytest.fixture(scope="session")
 def catalog() -> Catalog:
-    rows = [make_entry(each, "photonpano", "0.1.0", "toys = toys.hooks") for each in CONTRIBUTIONS]
-    rows += [make_entry(TWICE, plugin, "2.0", f"{plugin} = {plugin}.hooks") for plugin in ("alpha", "beta")]
+    rows = [make_entry(each, Origin("photonpano", "0.1.0", "toys = toys.hooks")) for each in CONTRIBUTIONS]
+    rows += [make_entry(TWICE, Origin(plugin, "2.0", f"{plugin} = {plugin}.hooks")) for plugin in ("alpha", "beta")]
     return Catalog(tuple(rows))

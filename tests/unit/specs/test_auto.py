@@ -177,5 +177,5 @@ def test_a_source_that_lacks_a_library_says_so(folder, catalog):
     said = told(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
     assert said == (
         "scan.yaml:2:15: source.use: the source 'needy' needs no_such_library, which is not installed: pip install "
-        '"photonpano[heavy]" (cube.dat is taken for needy: it is heavy)'
+        '"photonpano[heavy]" (in a checkout: pip install ".[heavy]") (cube.dat is taken for needy: it is heavy)'
     )

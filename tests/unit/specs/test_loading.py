@@ -27,7 +27,7 @@ def test_minimal_spec_is_complete(catalog):
     names = [choice.contribution.name for choice in (level.resample, level.merge, level.locate, level.interpolate)]
     assert names == ["midpoint", "photon-mle", "direct", "smoothing-spline"]
     assert [choice.contribution.name for choice in level.fallbacks] == ["opencv-sift"]
-    assert (plan.source.plugin, plan.source.version) == ("photonpano", "0.1.0")
+    assert (plan.source.origin.plugin, plan.source.origin.version) == ("photonpano", "0.1.0")
     assert {level.scale for level in plan.levels} == {"auto"}
 
 
