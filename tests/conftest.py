@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, VirtualExposure
-from photonpano.api import RunResult
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
+from photonpano.pipeline.run import RunResult
 from photonpano.testing import KnownMotion, MemorySource
 
 
@@ -114,10 +114,10 @@ def small_spec(small_capture: Path) -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A whole run of the small capture. Tests read its folder and leave it as it is."""
-    from photonpano import api
+    from photonpano import run
     from photonpano.specs import parse_spec
 
-    return api.run(parse_spec(small_spec, output=tmp_path_factory.mktemp("runs") / "small"))
+    return run(parse_spec(small_spec, output=tmp_path_factory.mktemp("runs") / "small"))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from photonpano.lazy import imported_on_use
 
 if TYPE_CHECKING:
-    from photonpano.api import RunResult, evaluate, open_source, run
+    from photonpano.api import evaluate
     from photonpano.contributions import (
         Config,
         InterpolatorContribution,
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
         SpecError,
     )
     from photonpano.hookspecs import hookimpl
+    from photonpano.pipeline.components import open_source
+    from photonpano.pipeline.run import RunResult, run
     from photonpano.protocols import (
         Interpolator,
         KnowsTruth,
@@ -125,6 +127,5 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
-    __getattr__, __dir__ = imported_on_use(
-        __name__, __all__, ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "specs")
-    )
+    _HOMES = ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "specs", "pipeline.components")
+    __getattr__, __dir__ = imported_on_use(__name__, __all__, (*_HOMES, "pipeline.run"))

@@ -2,102 +2,17 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
-
-from photonpano.errors import InputError, SpecError
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from photonpano.context import Progress
     from photonpano.evaluation import Evaluation
     from photonpano.geometry import Canvas
-    from photonpano.pipeline.observers import Observers
-    from photonpano.protocols import Source, Trajectory
+    from photonpano.protocols import Trajectory
     from photonpano.registry import Catalog
-    from photonpano.report import RunRecord
     from photonpano.specs import Plan
     from photonpano.values import Panorama
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """What a run left behind.
-
-    Attributes:
-        directory: the run folder.
-        record: the content of its `run.json`.
-    """
-
-    directory: Path
-    record: RunRecord
-
-
-@contextmanager
-def open_source(plan: Plan) -> Iterator[Source]:
-    """Open the capture of a plan, and check the stages against what it is.
-
-    Raises:
-        InputError: the capture cannot be used as it is.
-        SpecError: a stage does not suit it.
-    """
-    from photonpano.pipeline.components import build_source
-    from photonpano.specs import check_stream
-
-    with build_source(plan) as source:
-        if problems := check_stream(plan, source.info):
-            raise SpecError(problems)
-        yield source
-
-
-def run(plan: Plan, progress: Progress | None = None) -> RunResult:
-    """Run a plan and write its run folder: panorama, coverage, trajectory, record and report.
-
-    Args:
-        plan: from `load_spec` or `parse_spec`.
-        progress: is told of stages; quiet by default.
-
-    Raises:
-        PhotonpanoError: the run failed; the message says why, and what was in the run folder before is still there.
-    """
-    from photonpano.context import Quiet
-    from photonpano.pipeline.observers import Observers
-
-    observers = Observers(plan.observers, plan.output.directory)
-    with observers.run(plan.document):
-        record = _run(plan, progress or Quiet(), observers)
-    observers.run_finished(record)
-    return RunResult(plan.output.directory, cast("RunRecord", record))
-
-
-def _run(plan: Plan, progress: Progress, observers: Observers) -> dict[str, Any]:
-    """Run a plan, write its run folder, and return the content of `run.json`."""
-    from photonpano import __version__
-    from photonpano.pipeline.run import execute, write_outcome
-    from photonpano.pipeline.run_folder import run_folder
-    from photonpano.report import RunArrays, load_figures, render_report
-
-    with open_source(plan) as source, run_folder(plan.output.directory) as folder, ThreadPoolExecutor(1) as aside:
-        # A second of imports that nothing waits for.
-        aside.submit(load_figures)
-        outcome = execute(plan, source, __version__, progress, observers, folder.write_tile)
-        write_outcome(folder, outcome, source.info.frame_shape)
-        arrays = RunArrays(
-            preview=outcome.picture,
-            coverage=outcome.panorama.weight,
-            homographies=outcome.homographies,
-            located=outcome.located,
-            std_px=outcome.std_px,
-            canvas=outcome.panorama.canvas,
-            frame_shape=source.info.frame_shape,
-            reference=outcome.reference,
-        )
-        folder.write_report(render_report(cast("RunRecord", outcome.record), arrays))
-    return outcome.record
 
 
 def evaluate(
@@ -122,6 +37,7 @@ def evaluate(
     from photonpano.context import Context, Quiet
     from photonpano.evaluation import evaluate as evaluate_folder
     from photonpano.merging.panorama import render
+    from photonpano.pipeline.components import open_source
     from photonpano.threads import thread_count
 
     if not oracle:
@@ -138,17 +54,7 @@ def evaluate(
 
 def _recorded_plan(run_folder: Path, catalog: Catalog | None) -> Plan:
     """Return the plan that a run folder was made with."""
-    import json
-
+    from photonpano.record.run_json import read_record
     from photonpano.specs import parse_spec
 
-    file = run_folder / "run.json"
-    if not file.is_file():
-        raise InputError(f"{run_folder} has no run.json, so no run finished in it; give the run folder of one that did")
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))["spec"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{file}: cannot be read as the record of a run ({error}); give the folder of a finished run"
-        ) from error
-    return parse_spec(document, name=str(file), catalog=catalog)
+    return parse_spec(read_record(run_folder)["spec"], name=str(run_folder / "run.json"), catalog=catalog)

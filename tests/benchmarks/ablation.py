@@ -21,7 +21,7 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
-from photonpano import PhotonpanoError, api, parse_spec
+from photonpano import PhotonpanoError, evaluate, parse_spec, run
 from photonpano.evaluation import exposure_bound_px, load_truth
 from photonpano.photometry import BinaryResponse
 
@@ -65,8 +65,8 @@ def measure(cube: Path, locator: str, graph: str, resampler: str) -> tuple[float
             "output": {"directory": str(cube.with_suffix(".run"))},
         }
     )
-    result = api.run(plan)
-    scores = api.evaluate(result.directory, cube.with_suffix(".truth.npz"))
+    result = run(plan)
+    scores = evaluate(result.directory, cube.with_suffix(".truth.npz"))
     assert scores.below_oracle_db is not None
     return scores.trajectory.mean_px, scores.trajectory.max_px, scores.below_oracle_db
 

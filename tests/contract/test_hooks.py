@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, PluginError, api, hookspecs, registry
+from photonpano import FrameSpan, Group, PluginError, hookspecs, registry, run
 from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.specs import parse_spec
@@ -81,7 +81,7 @@ def test_examples_of_stages_do_their_work(section: str, small_spec: dict[str, An
     hook, name = {"merge": ("photonpano_mergers", "naive-sum"), "interpolate": ("photonpano_interpolators", "nearest")}[section]
     catalog = discover().including(example_of(hook))
     plan = parse_spec(small_spec | {section: {"use": name}, "levels": 1}, output=tmp_path / "run", catalog=catalog)
-    record = api.run(plan).record
+    record = run(plan).record
     assert {"stage": section, "use": name, "plugin": f"example_of_{hook}", "version": "unreleased"} in record["plugins"]
     assert record["levels"][0]["located"] == 6
 
@@ -100,7 +100,7 @@ def test_an_example_that_takes_no_scale_is_refused_where_there_is_one(small_spec
     catalog = discover().including(example_of("photonpano_mergers"))
     spec = small_spec | {"merge": {"use": "naive-sum"}, "levels": [{"scale": 0.5}]}
     with pytest.raises(PluginError) as caught:
-        api.run(parse_spec(spec, output=tmp_path / "run", catalog=catalog))
+        run(parse_spec(spec, output=tmp_path / "run", catalog=catalog))
     assert str(caught.value) == (
         "merger 'naive-sum' of example_of_photonpano_mergers unreleased broke its contract at level 1: "
         "expected an exposure of scale 0.5, got 1"

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from photonpano.api import RunResult
 from photonpano.geometry import apply, corners
 from photonpano.photometry import tone_mapped
+from photonpano.pipeline.run import RunResult
 from photonpano.specs import parse_spec
 
 N_FRAMES, SHAPE = 300, (128, 160)

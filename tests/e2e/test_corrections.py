@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from photonpano import FrameSpan, SpecError, api
+from photonpano import FrameSpan, SpecError, evaluate, open_source, run
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.cli.app import app
 from photonpano.context import Context
@@ -88,8 +88,8 @@ def dark_file(dark_rates: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def scored(spec: dict[str, Any], capture: Path, folder: Path) -> Evaluation:
-    done = api.run(parse_spec(spec, output=folder / "run"))
-    return api.evaluate(done.directory, truth_path(capture))
+    done = run(parse_spec(spec, output=folder / "run"))
+    return evaluate(done.directory, truth_path(capture))
 
 
 def test_a_corrected_sensor_is_as_good_as_one_without_faults(
@@ -158,7 +158,7 @@ def test_a_correction_that_does_not_suit_the_capture_is_told_with_its_place(smal
 def test_what_leaves_no_pixel_is_told_as_well_when_frames_tell_it(small_capture: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "rates.npy", np.full(SHAPE, 0.3))
     spec = spec_of(small_capture, {"dark-counts": {"dark": str(tmp_path / "rates.npy")}})
-    with pytest.raises(SpecError) as caught, api.open_source(parse_spec(spec)):
+    with pytest.raises(SpecError) as caught, open_source(parse_spec(spec)):
         pass
     assert str(caught.value) == "corrections.0: dark-counts leaves no pixel that may be used"
 

@@ -22,8 +22,8 @@ from photonpano import (
     PluginError,
     ResamplerContribution,
     SourceContribution,
-    api,
 )
+from photonpano.pipeline.run import run
 from photonpano.registry import Catalog, Origin, discover
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
@@ -170,7 +170,7 @@ def failure(spec: dict[str, Any], contribution: Any, folder: Path) -> str:
     catalog = Catalog((*discover().rows, entry))
     (folder / "panorama.png").write_text("of an earlier run")
     with pytest.raises(PluginError) as caught:
-        api.run(parse_spec(spec, output=folder, catalog=catalog))
+        run(parse_spec(spec, output=folder, catalog=catalog))
     assert [(file.name, file.read_text()) for file in folder.iterdir()] == [("panorama.png", "of an earlier run")]
     return str(caught.value)
 
@@ -250,6 +250,6 @@ def test_numbers_of_numpy_and_those_that_json_cannot_hold_are_recorded(small_spe
     plan = parse_spec(
         small_spec | {"locate": {"use": "shy"}, "levels": 1}, output=tmp_path / "run", catalog=discover().including(shy)
     )
-    api.run(plan)
+    run(plan)
     (lost,) = json.loads((tmp_path / "run" / "run.json").read_text())["levels"][0]["failures"]
     assert lost["evidence"] == {"matches": 7, "score": 0.5, "ncc": None, "found": True}

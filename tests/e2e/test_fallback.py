@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import Field
 
-from photonpano import Config, Homography, Located, LocatorContribution, NotLocated, StageContext, VirtualExposure, api
-from photonpano.context import Quiet
-from photonpano.pipeline.run import RunOutcome, execute
+from photonpano import Config, Located, LocatorContribution, NotLocated, StageContext, VirtualExposure
 from photonpano.registry import Catalog, Origin, discover
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
+from photonpano.values import Homography
 
 SIFT = discover().find("locator", "opencv-sift").contribution
 
@@ -49,13 +49,15 @@ def catalog() -> Catalog:
     return Catalog((*discover().rows, make_entry(FORGETFUL, Origin("toys", "1.2", "toys = toys.hooks"))))
 
 
-def run(spec: dict[str, Any], catalog: Catalog, threads: int = 2) -> RunOutcome:
-    plan = parse_spec(spec | {"levels": 1, "run": {"threads": threads}}, catalog=catalog)
-    with api.open_source(plan) as source:
-        return execute(plan, source, "tests", Quiet())
+@pytest.fixture(scope="module")
+def run(outcome_of: Callable) -> Callable[..., Any]:
+    def run(spec: dict[str, Any], catalog: Catalog, threads: int = 2) -> Any:
+        return outcome_of(parse_spec(spec | {"levels": 1, "run": {"threads": threads}}, catalog=catalog))
+
+    return run
 
 
-def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog: Catalog) -> None:
+def test_the_run_is_as_good_as_its_fallback(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
     forgetful = {"use": "forgetful", "with": {"every": 3}}
     with_sift = small_spec | {"locate": forgetful | {"fallback": "opencv-sift"}}
     rescued, again = (run(with_sift, catalog, threads) for threads in (3, 1))
@@ -81,7 +83,9 @@ def test_the_run_is_as_good_as_its_fallback(small_spec: dict[str, Any], catalog:
     assert [each.contribution.name for each in recorded.levels[0].fallbacks] == ["opencv-sift"]
 
 
-def test_a_chain_is_its_first_locator_with_the_others_as_fallbacks(small_spec: dict[str, Any], catalog: Catalog) -> None:
+def test_chain_is_its_first_locator_with_the_others_as_fallbacks(
+    run: Callable, small_spec: dict[str, Any], catalog: Catalog
+) -> None:
     forgetful = {"use": "forgetful", "with": {"every": 3}}
     chain = {"use": "chain-of-backends", "with": {"backends": [forgetful, "opencv-sift"]}}
     with_chain, with_fallback = (
@@ -93,7 +97,7 @@ def test_a_chain_is_its_first_locator_with_the_others_as_fallbacks(small_spec: d
     assert with_chain.record["spec"] == with_fallback.record["spec"]
 
 
-def test_what_nobody_locates_lists_what_each_said(small_spec: dict[str, Any], catalog: Catalog) -> None:
+def test_what_nobody_locates_lists_what_each_said(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
     """The first and the fifth of six groups are found by neither; the others hold together."""
     forgetful = {"use": "forgetful", "with": {"every": 4}}
     fallback = {"use": "forgetful", "with": {"every": 4, "group_size": 49}}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from photonpano import api
+from photonpano import evaluate, open_source, run
 from photonpano.cli.app import app
 from photonpano.evaluation import Evaluation
 from photonpano.specs import parse_spec
@@ -38,10 +38,10 @@ def scored(tmp_path: Path) -> Callable[..., tuple[Evaluation, dict[str, Any]]]:
     def scored(
         simulated: dict[str, Any], source: dict[str, Any], oracle: bool = True, **sections: Any
     ) -> tuple[Evaluation, dict[str, Any]]:
-        with api.open_source(parse_spec({"version": 1, "source": simulated})) as opened:
+        with open_source(parse_spec({"version": 1, "source": simulated})) as opened:
             np.savez(tmp_path / "truth.npz", **opened.truth())
-        result = api.run(parse_spec({"version": 1, "source": source, **sections}, output=tmp_path / "run"))
-        return api.evaluate(result.directory, tmp_path / "truth.npz", oracle=oracle), result.record
+        result = run(parse_spec({"version": 1, "source": source, **sections}, output=tmp_path / "run"))
+        return evaluate(result.directory, tmp_path / "truth.npz", oracle=oracle), result.record
 
     return scored
 
@@ -50,7 +50,7 @@ def test_a_noisy_compressed_video_comes_close_to_a_clean_one(write_video: Callab
     """0.05 and 0.02 px, 28.2 and 31.5 dB when this was written."""
 
     def of_video(simulated: dict[str, Any], *how: str, **options: Any) -> tuple[Evaluation, dict[str, Any]]:
-        with api.open_source(parse_spec({"version": 1, "source": simulated})) as opened:
+        with open_source(parse_spec({"version": 1, "source": simulated})) as opened:
             path = write_video(opened.frames(opened.info.span), *how, **options)
         sensor = simulated["with"]["sensor"]
         response = {"saturation_photons": sensor["full_well"], "read_noise": sensor["read_noise"]}

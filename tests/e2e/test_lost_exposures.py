@@ -5,24 +5,25 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import LocationError, api
-from photonpano.context import Quiet
-from photonpano.pipeline.run import RunOutcome, execute
+from photonpano import LocationError
 from photonpano.specs import parse_spec
 
 
-def run(capture: Path, *overrides: str) -> RunOutcome:
-    source = {"use": "packed-npy", "with": {"path": str(capture)}}
-    plan = parse_spec({"version": 1, "source": source, "levels": 1}, overrides=overrides)
-    with api.open_source(plan) as opened:
-        return execute(plan, opened, "tests", Quiet())
+@pytest.fixture(scope="module")
+def run(outcome_of: Callable) -> Callable[..., Any]:
+    def run(capture: Path, *overrides: str) -> Any:
+        source = {"use": "packed-npy", "with": {"path": str(capture)}}
+        return outcome_of(parse_spec({"version": 1, "source": source, "levels": 1}, overrides=overrides))
+
+    return run
 
 
-def refusal(capture: Path, *overrides: str) -> list[str]:
+def refusal(run: Callable, capture: Path, *overrides: str) -> list[str]:
     """Return the lines of the error, with # for what the locators count and for the reasons of the first."""
     with pytest.raises(LocationError) as caught:
         run(capture, *overrides)
@@ -52,7 +53,7 @@ def with_a_wall(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -
     return with_a_wall
 
 
-def test_a_single_lost_exposure_is_tolerated_and_told(with_a_wall: Callable) -> None:
+def test_a_single_lost_exposure_is_tolerated_and_told(run: Callable, with_a_wall: Callable) -> None:
     outcome = run(with_a_wall(100, 150), "resample.with.group_size=50")
     (level,) = outcome.record["levels"]
     assert (level["groups"], level["located"]) == (6, 5)
@@ -65,9 +66,9 @@ def test_a_single_lost_exposure_is_tolerated_and_told(with_a_wall: Callable) -> 
     assert outcome.located[100:150].all()
 
 
-def test_a_longer_part_without_texture_is_named(with_a_wall: Callable) -> None:
+def test_a_longer_part_without_texture_is_named(run: Callable, with_a_wall: Callable) -> None:
     """Of the two parts that it separates the smaller one is lost with it."""
-    lines = refusal(with_a_wall(50, 150), "resample.with.group_size=25")
+    lines = refusal(run, with_a_wall(50, 150), "resample.with.group_size=25")
     assert re.fullmatch(
         r"level 1: \d+ of \d+ pairs of exposures could not be located, so that frames 0 to 149 cannot be tied to the rest",
         lines[0],
@@ -82,7 +83,7 @@ def test_a_longer_part_without_texture_is_named(with_a_wall: Callable) -> None:
     ]
 
 
-def test_the_largest_part_is_shown_if_the_spec_asks_for_it(with_a_wall: Callable) -> None:
+def test_the_largest_part_is_shown_if_the_spec_asks_for_it(run: Callable, with_a_wall: Callable) -> None:
     outcome = run(with_a_wall(50, 150), "resample.with.group_size=25", "graph.disconnected=largest")
     np.testing.assert_array_equal(np.flatnonzero(outcome.located), np.arange(150, 300))
     warnings = outcome.record["warnings"]
@@ -92,8 +93,8 @@ def test_the_largest_part_is_shown_if_the_spec_asks_for_it(with_a_wall: Callable
     np.testing.assert_allclose(outcome.homographies[150], np.eye(3), atol=1e-12)
 
 
-def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
-    lines = refusal(simulated(flux=0.001), "resample.with.group_size=50")
+def test_a_dark_capture_is_told_from_a_blurred_one(run: Callable, simulated: Callable) -> None:
+    lines = refusal(run, simulated(flux=0.001), "resample.with.group_size=50")
     assert lines[:3] == [
         "level 1: none of the 14 pairs of exposures could be located",
         pair("50 to 99", "0 to 49"),
@@ -104,7 +105,7 @@ def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
         "(try larger groups, such as resample.with.group_size=100), or the scene has no texture there."
     )
     fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 3})
-    assert refusal(fast, "resample.with.group_size=100") == [
+    assert refusal(run, fast, "resample.with.group_size=100") == [
         "level 1: none of the 3 pairs of exposures could be located",
         pair("100 to 199", "0 to 99"),
         pair("200 to 299", "0 to 99"),
@@ -115,7 +116,7 @@ def test_a_dark_capture_is_told_from_a_blurred_one(simulated: Callable) -> None:
     ]
 
 
-def test_a_smear_is_not_taken_for_a_place(simulated: Callable) -> None:
+def test_a_smear_is_not_taken_for_a_place(run: Callable, simulated: Callable) -> None:
     """Groups blurred by 500 px on frames of 160 px: the few stripes of two of them can be laid onto each other."""
     fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 1})
     with pytest.raises(LocationError):

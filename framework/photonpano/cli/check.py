@@ -13,9 +13,8 @@ def check(spec: Spec, overrides: Overrides = None) -> None:
 
     Example: photonpano check scan.yaml
     """
-    from photonpano.api import open_source
     from photonpano.cli.wording import capture_words
-    from photonpano.pipeline.components import foreseen_groups
+    from photonpano.pipeline.components import foreseen_groups, open_source
     from photonpano.specs import load_spec
 
     plan = load_spec(spec, overrides or ())

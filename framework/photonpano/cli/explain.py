@@ -31,10 +31,9 @@ def explain(
 
     Example: photonpano explain scan.yaml > resolved.yaml
     """
-    from photonpano.api import open_source
     from photonpano.cli.wording import capture_words
     from photonpano.motion.pairs import pairs_of
-    from photonpano.pipeline.components import foreseen_groups, scale_of
+    from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
     from photonpano.registry import discover
     from photonpano.specs import load_spec
 

@@ -23,9 +23,9 @@ def run(
 
     Example: photonpano run scan.yaml --output runs/first --set render.scale=2
     """
-    from photonpano.api import run as run_plan
     from photonpano.cli.outcome import warn
     from photonpano.cli.progress import progress_for_stderr
+    from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
 
     result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())

@@ -24,7 +24,7 @@ def warm_up() -> None:
     import time
     from pathlib import Path
 
-    from photonpano.api import run
+    from photonpano.pipeline.run import run
     from photonpano.specs import parse_spec
 
     start = time.perf_counter()

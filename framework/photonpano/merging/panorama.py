@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Canvas, canvas_of, rescaling, translation
 from photonpano.merging import accumulate, chunks_of
+from photonpano.photometry import tone_mapped
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
@@ -20,6 +23,25 @@ BYTES_PER_PIXEL = 40
 """Peak memory of rendering, per pixel of a tile: sums, estimate and output, as measured in the tests."""
 MAX_EXCESS = 16
 """A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time."""
+
+
+class RenderOptions(Protocol):
+    """How a panorama is rendered."""
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the panorama per pixel of the reference frame."""
+        ...
+
+    @property
+    def tolerance_px(self) -> float:
+        """Frames are summed before they are warped while they move less than this, in px."""
+        ...
+
+    @property
+    def white_quantile(self) -> float:
+        """The quantile of the flux that is white in the picture."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,6 +202,68 @@ def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:
     padded = np.pad(image, ((0, -height % step), (0, -width % step))).astype(np.float32, copy=False)
     blocks = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step)
     return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedPanorama:
+    """A panorama whose tiles have been written.
+
+    Attributes:
+        canvas: its pixel grid.
+        thumbnail: flux and weight, averaged down by `reduction`.
+        reduction: side of the squares of pixels that are averaged; 1 if the panorama fits into memory.
+        picture: (H, W) uint8, the thumbnail in sRGB.
+        white_flux: the flux that is white in the picture, in photons per pixel per frame.
+        coverage_share: share of the pixels that were seen.
+        seconds: time that rendering and writing took.
+    """
+
+    canvas: Canvas
+    thumbnail: Panorama
+    reduction: int
+    picture: NDArray[np.uint8]
+    white_flux: float
+    coverage_share: float
+    seconds: float
+
+
+def render_panorama(
+    source: Source,
+    trajectory: Trajectory,
+    span: FrameSpan,
+    options: RenderOptions,
+    memory: int,
+    write_tile: Callable[[Tile, Panorama, Canvas], object],
+    context: Context,
+) -> RenderedPanorama:
+    """Render the frames of a span, in tiles if the panorama exceeds the memory.
+
+    Args:
+        source: the capture.
+        trajectory: the motion, frame pixels to reference pixels.
+        span: the frames that are merged.
+        options: scale, tolerance and white.
+        memory: bytes that rendering may take.
+        write_tile: called with each tile, its pixels, and the canvas that it is a part of.
+        context: threads and progress.
+
+    Raises:
+        CanvasTooLargeError: the panorama is more than `LARGEST` times as large as what fits into the memory.
+        LocationError: frames reach the horizon of the reference plane.
+    """
+    start = time.perf_counter()
+    canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory)
+    tiles, reduction = tiles_of(canvas, memory)
+    shown = Thumbnail(canvas, reduction)
+    rendered = render_tiles(source, trajectory, span, tiles, options.tolerance_px, context)
+    for tile, part in zip(tiles, rendered, strict=True):
+        write_tile(tile, part, canvas)
+        shown.add(tile, part)
+    thumbnail = shown.panorama
+    white_flux = float(np.quantile(thumbnail.flux[thumbnail.weight > 0], options.white_quantile)) or 1.0
+    picture = tone_mapped(thumbnail.flux, white_flux)
+    seconds = time.perf_counter() - start
+    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, shown.coverage_share, seconds)
 
 
 def _gib(size: float) -> str:

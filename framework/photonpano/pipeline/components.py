@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -14,6 +15,7 @@ from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, P
 from photonpano.motion.attribution import attributed, attributing
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.protocols import Resampler, Source
+from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.specs.tree import Place
 from photonpano.threads import thread_count
@@ -23,6 +25,20 @@ HALVED_LEVELS = 2
 """So many levels, at most, are located at half size unless the spec says otherwise."""
 LARGE_FRAME_PX = 192
 """Smaller sides than this are not halved: a pyramid needs pixels."""
+
+
+@contextmanager
+def open_source(plan: Plan) -> Iterator[Source]:
+    """Open the capture of a plan, and check the stages against it.
+
+    Raises:
+        InputError: the capture cannot be used as it is.
+        SpecError: a stage does not suit it.
+    """
+    with build_source(plan) as source:
+        if problems := check_stream(plan, source.info):
+            raise SpecError(problems)
+        yield source
 
 
 def build_source(plan: Plan) -> Source:

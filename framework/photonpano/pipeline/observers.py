@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,19 +32,17 @@ class Observers:
     directory: Path = Path()
 
     @contextmanager
-    def run(self, spec: Mapping[str, Any]) -> Iterator[None]:
-        """Tell that a run starts, and what ended it if the block raises."""
+    def watching(self, spec: Mapping[str, Any]) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+        """Call the observers when a run starts and when it ends; the block gives its record to what is yielded."""
         self._tell("photonpano_run_started", spec=frozen(spec))
+        records: list[Mapping[str, Any]] = []
         try:
-            yield
+            yield records.append
         except BaseException as error:  # an interrupt ends a run as well
             message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             self._tell("photonpano_run_finished", record=None, error=message)
             raise
-
-    def run_finished(self, record: Mapping[str, Any]) -> None:
-        """Tell that a run ended well."""
-        self._tell("photonpano_run_finished", record=frozen(record), error=None)
+        self._tell("photonpano_run_finished", record=frozen(records[-1]), error=None)
 
     def level_finished(self, result: LevelResult) -> None:
         """Tell of the four stages of a level."""
@@ -72,10 +70,6 @@ class Observers:
             except (Exception, SystemExit) as error:
                 what = f"{type(error).__name__}: {error}"
                 logger.warning("%s of %s raised %s; the run goes on", hook, observer.origin, what, exc_info=True)
-
-
-NOBODY = Observers()
-"""Nobody watches."""
 
 
 def frozen(value: Any) -> Any:

@@ -7,21 +7,21 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
 from photonpano.geometry import Canvas
-from photonpano.merging.panorama import Tile
-from photonpano.values import BoolArray, FloatArray, FluxImage, Homography, Panorama
+from photonpano.merging.panorama import RenderedPanorama, Tile
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.record.schema import RunRecord
+from photonpano.values import FluxImage, Panorama
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,50 +42,22 @@ class RunFolder:
             _write_box(self.staging / "panorama.tiff", rendered.flux, tile, canvas)
             _write_box(self.staging / "coverage.tiff", rendered.weight, tile, canvas)
 
-    def write_picture(self, picture: NDArray[np.uint8]) -> None:
-        """Write panorama.png (8 bits, sRGB)."""
-        encoded, png = cv2.imencode(".png", picture)
+    def write_results(self, panorama: RenderedPanorama, motion: FrameMotion, record: RunRecord) -> None:
+        """Write panorama.png (8 bits, sRGB), trajectory.npz and run.json."""
+        encoded, png = cv2.imencode(".png", panorama.picture)
         if not encoded:
-            raise OutputError(f"OpenCV could not encode the panorama of {picture.shape} as PNG")
+            raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
         with _writing(self.directory):
             (self.staging / "panorama.png").write_bytes(png.tobytes())
-
-    def write_trajectory(
-        self,
-        homographies: FloatArray,
-        located: BoolArray,
-        std_px: FloatArray,
-        canvas: Homography,
-        frame_shape: tuple[int, int],
-        reference: int,
-    ) -> None:
-        """Write trajectory.npz.
-
-        Convention:
-            Homographies map frame pixels to reference pixels, the canvas maps reference pixels to panorama pixels; points are
-            (x, y), integers are pixel centres.
-
-        Args:
-            homographies: (T, 3, 3) float64.
-            located: (T,), False where a frame lies outside what was located.
-            std_px: (T,) the expected corner error, infinite where a frame lies outside what was located.
-            canvas: (3, 3) float64.
-            frame_shape: (height, width) of a frame.
-            reference: the frame whose homography is the identity.
-        """
-        with _writing(self.directory):
             np.savez(
                 self.staging / "trajectory.npz",
-                homographies=homographies,
-                canvas=canvas,
-                frame_shape=np.array(frame_shape),
-                reference=np.array(reference),
-                located=located,
-                std_px=std_px,
+                homographies=motion.homographies,
+                canvas=panorama.canvas.transform,
+                frame_shape=np.array(motion.frame_shape),
+                reference=np.array(motion.reference),
+                located=motion.located,
+                std_px=motion.std_px,
             )
-
-    def write_record(self, record: Mapping[str, Any]) -> None:
-        """Write run.json."""
         self._write_text("run.json", json.dumps(record, indent=2, allow_nan=False) + "\n")
 
     def write_report(self, page: str) -> None:

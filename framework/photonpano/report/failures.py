@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from photonpano.report.record import FailureRecord, LevelRecord
+from photonpano.record.schema import FailureRecord, LevelRecord
 
 MAX_EXAMPLES = 3
 """So many pairs of a group are named."""

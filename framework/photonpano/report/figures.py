@@ -6,19 +6,24 @@ import importlib
 import io
 import re
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from photonpano.geometry import apply, corners
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.record.schema import LevelRecord, PanoramaRecord
 from photonpano.report.pictures import shrunk
-from photonpano.report.record import LevelRecord, PanoramaRecord, RunArrays
 from photonpano.report.wording import duration
 from photonpano.values import FloatArray, FluxImage, true_spans
+
+if TYPE_CHECKING:  # importing matplotlib takes a second
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MAX_INSTANTS = 1500
 """The trajectory is drawn at so many instants at most, evenly spaced."""
@@ -68,19 +73,21 @@ _STYLE: Any = {
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
 
 
-def load_figures() -> None:
-    """Import what figures are drawn with, which takes a second: another thread can do it while frames are merged."""
-    importlib.import_module("matplotlib.figure")
-    importlib.import_module("matplotlib.backends.backend_svg")
+@contextmanager
+def loading_figures() -> Iterator[None]:
+    """Import matplotlib in another thread while the block runs: it takes a second that nothing waits for."""
+    with ThreadPoolExecutor(1) as aside:
+        aside.submit(lambda: [importlib.import_module(f"matplotlib.{name}") for name in ("figure", "backends.backend_svg")])
+        yield
 
 
-def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
+def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
     """Draw where the centre of the frame is, how fast it moves, and how far its corners may be off, over time."""
     from matplotlib.ticker import LogLocator
 
-    instants = _instants(len(arrays.homographies))
-    centre = _centre(arrays.frame_shape)
-    path = apply(arrays.homographies[instants], centre)[:, 0] - centre[0]
+    instants = _instants(len(motion.homographies))
+    centre = _centre(motion.frame_shape)
+    path = apply(motion.homographies[instants], centre)[:, 0] - centre[0]
     with _figure(WIDTH_IN, 6.0) as figure:
         position, speed, error = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
         for values, name, colour in zip(path.T, ("x", "y"), SERIES, strict=False):
@@ -95,7 +102,7 @@ def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
             speed.plot((instants[:-1] + instants[1:]) / 2, steps, color=SERIES[2])
         speed.set_ylim(bottom=0)
         speed.set_ylabel("speed (px/frame)")
-        known = np.where(np.isfinite(arrays.std_px), arrays.std_px, np.nan)
+        known = np.where(np.isfinite(motion.std_px), motion.std_px, np.nan)
         error.plot(instants, known[instants], color=INK)
         error.set_yscale("log")
         error.yaxis.set_major_formatter("{x:g}")
@@ -103,27 +110,27 @@ def path_over_time(arrays: RunArrays, frame_rate_hz: float | None) -> str:
         error.yaxis.set_minor_formatter("{x:g}")
         error.set_ylabel("expected error (px)")
         error.set_xlabel("frame")
-        error.set_xlim(-0.5, len(arrays.homographies) - 0.5)
+        error.set_xlim(-0.5, len(motion.homographies) - 0.5)
         error.xaxis.set_major_formatter("{x:,.0f}")
         for axes in (position, speed, error):
-            _shade_not_located(axes, arrays)
+            _shade_not_located(axes, motion)
         if frame_rate_hz is not None and len(instants) > 1:
-            _add_time_axis(position, len(arrays.homographies), frame_rate_hz)
+            _add_time_axis(position, len(motion.homographies), frame_rate_hz)
         figure.align_ylabels()
         return _svg(figure, "path-over-time")
 
 
-def path_on_panorama(arrays: RunArrays) -> str:
+def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
     """Draw the way of the frame centre over the panorama, with the outlines of the first, the reference and the last frame."""
-    instants = _instants(len(arrays.homographies))
-    to_canvas = arrays.canvas @ arrays.homographies
-    path = apply(to_canvas[instants], _centre(arrays.frame_shape))[:, 0]
-    height, width = arrays.coverage.shape
+    instants = _instants(len(motion.homographies))
+    to_canvas = panorama.thumbnail.canvas @ motion.homographies
+    path = apply(to_canvas[instants], _centre(motion.frame_shape))[:, 0]
+    height, width = panorama.picture.shape
     with _map_figure(height, width) as (figure, axes):
-        picture = shrunk(arrays.preview, MAP_PIXELS)
+        picture = shrunk(panorama.picture, MAP_PIXELS)
         axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=_extent(height, width), alpha=0.55)
-        for index, style in ((arrays.reference, "-"), (0, ":"), (-1, ":")):
-            outline = apply(to_canvas[index], corners(arrays.frame_shape))
+        for index, style in ((motion.reference, "-"), (0, ":"), (-1, ":")):
+            outline = apply(to_canvas[index], corners(motion.frame_shape))
             axes.plot(*np.vstack([outline, outline[:1]]).T, color=INK, linewidth=0.9, linestyle=style)
         axes.plot(*path.T, color=PAPER, linewidth=3.5)
         axes.plot(*path.T, color=SERIES[1], linewidth=1.6)
@@ -184,8 +191,8 @@ def _extent(height: int, width: int) -> tuple[float, float, float, float]:
     return -0.5, width - 0.5, height - 0.5, -0.5
 
 
-def _shade_not_located(axes: Axes, arrays: RunArrays) -> None:
-    for span in true_spans(~arrays.located):
+def _shade_not_located(axes: Axes, motion: FrameMotion) -> None:
+    for span in true_spans(~motion.located):
         axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)
 
 

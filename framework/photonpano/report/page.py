@@ -8,10 +8,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.record.schema import RunRecord
 from photonpano.report import figures, wording
 from photonpano.report.failures import failure_groups
 from photonpano.report.pictures import jpeg_uri, shrunk
-from photonpano.report.record import RunArrays, RunRecord
 from photonpano.values import true_spans
 
 PICTURE_PIXELS = 1600
@@ -21,12 +23,13 @@ MAX_SPANS = 12
 """So many spans of frames are named."""
 
 
-def render_report(record: RunRecord, arrays: RunArrays | None) -> str:
+def render_report(record: RunRecord, motion: FrameMotion | None, panorama: RenderedPanorama | None) -> str:
     """Return the report of a run as one HTML page that needs no other file, no network and no script.
 
     Args:
         record: the content of `run.json`.
-        arrays: what the figures show; None for a run that made no panorama, whose page then has no figures of it.
+        motion: the motion of every frame; None for a run that failed, whose page has no figures of it.
+        panorama: the panorama; None for a run that failed.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -48,23 +51,23 @@ def render_report(record: RunRecord, arrays: RunArrays | None) -> str:
         failures=failure_groups(record["levels"]),
         spec_yaml=_yaml(record["spec"]),
         stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
-        **_motion(record, arrays),
+        **_motion(record, motion, panorama),
     )
     return page
 
 
-def _motion(record: RunRecord, arrays: RunArrays | None) -> dict[str, Any]:
-    if arrays is None:
+def _motion(record: RunRecord, motion: FrameMotion | None, panorama: RenderedPanorama | None) -> dict[str, Any]:
+    if motion is None or panorama is None:
         return {"picture": None}
-    not_located = true_spans(~arrays.located)
+    not_located = true_spans(~motion.located)
     return {
-        "picture": jpeg_uri(shrunk(arrays.preview, PICTURE_PIXELS)),
-        "picture_is_smaller": max(arrays.preview.shape) > PICTURE_PIXELS,
-        "path_on_panorama": figures.path_on_panorama(arrays),
-        "path_over_time": figures.path_over_time(arrays, record["source"]["frame_rate_hz"]),
-        "coverage_map": figures.coverage_map(arrays.coverage),
-        "reference": arrays.reference,
-        "n_not_located": int((~arrays.located).sum()),
+        "picture": jpeg_uri(shrunk(panorama.picture, PICTURE_PIXELS)),
+        "picture_is_smaller": max(panorama.picture.shape) > PICTURE_PIXELS,
+        "path_on_panorama": figures.path_on_panorama(motion, panorama),
+        "path_over_time": figures.path_over_time(motion, record["source"]["frame_rate_hz"]),
+        "coverage_map": figures.coverage_map(panorama.thumbnail.weight),
+        "reference": motion.reference,
+        "n_not_located": int((~motion.located).sum()),
         "not_located": not_located[:MAX_SPANS],
         "more_not_located": len(not_located[MAX_SPANS:]),
     }

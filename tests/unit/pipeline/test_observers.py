@@ -50,9 +50,9 @@ def log(told: list[Any]) -> ModuleType:
 
 def test_a_run_that_ends_well(told: list[Any], log: ModuleType) -> None:
     observers = watching(log)
-    with observers.run({"version": 1}):
+    with observers.watching({"version": 1}) as finished:
         observers.rendered(Canvas(30, 40, np.eye(3)), 2.5)
-    observers.run_finished({"status": "done"})
+        finished({"status": "done"})
     assert told == [
         (DIRECTORY, {"version": 1}),
         (None, "render", 2.5, {"height": 30, "width": 40}),
@@ -70,7 +70,7 @@ def test_a_run_that_ends_well(told: list[Any], log: ModuleType) -> None:
     ids=repr,
 )
 def test_a_run_that_fails_raises_what_it_raised(told: list[Any], log: ModuleType, error: BaseException, message: str) -> None:
-    with pytest.raises(type(error)) as caught, watching(log).run({}):
+    with pytest.raises(type(error)) as caught, watching(log).watching({}):
         raise error
     assert caught.value is error
     assert told[1:] == [(DIRECTORY, None, message)]
@@ -117,9 +117,9 @@ def test_what_an_observer_raises_is_logged_with_its_name_and_the_others_go_on(
         raise error
 
     observers = watching(plugin("clumsy", run_started=fail, stage_finished=fail, run_finished=fail), log)
-    with observers.run({}):
+    with observers.watching({}) as finished:
         observers.rendered(Canvas(30, 40, np.eye(3)), 2.5)
-    observers.run_finished({})
+        finished({})
     assert len(told) == 3
     assert caplog.messages == [
         f"photonpano_{hook} of clumsy unreleased (given in Python) raised {type(error).__name__}: {error}; the run goes on"
@@ -132,7 +132,7 @@ def test_an_observer_that_fails_does_not_hide_what_ended_the_run(caplog: pytest.
     def fail(error: str) -> None:
         raise RuntimeError("and now this")
 
-    with pytest.raises(LocationError, match=r"^lost$"), watching(plugin(run_finished=fail)).run({}):
+    with pytest.raises(LocationError, match=r"^lost$"), watching(plugin(run_finished=fail)).watching({}):
         raise LocationError("lost")
     assert len(caplog.messages) == 1
 

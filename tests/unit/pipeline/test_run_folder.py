@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from photonpano import OutputError, Panorama
+from photonpano import FrameSpan, OutputError, Panorama
 from photonpano.geometry import Canvas, translation
-from photonpano.merging.panorama import Tile
+from photonpano.merging.panorama import RenderedPanorama, Tile
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.run_folder import RunFolder, run_folder
+from photonpano.testing import KnownMotion
 
 FLUX = np.random.default_rng(0).random((60, 90), np.float32)
 FLUX[:, :5] = np.nan
@@ -24,25 +26,31 @@ PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
 FILES = {"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
 
 
+MOTION = FrameMotion(
+    KnownMotion(lambda _: np.eye(3)),
+    FrameSpan(0, 500),
+    np.random.default_rng(0).random((500, 3, 3)),
+    np.ones(500, bool),
+    np.ones(500),
+    250,
+    (48, 64),
+)
+RENDERED = RenderedPanorama(CANVAS, PANORAMA, 1, PICTURE, 1.0, 0.9, 2.0)
+
+
 def write_panorama(folder: RunFolder) -> None:
     folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, CANVAS)
-    folder.write_picture(PICTURE)
 
 
-def write_trajectory(folder: RunFolder) -> None:
-    homographies = np.random.default_rng(0).random((500, 3, 3))
-    folder.write_trajectory(homographies, np.ones(500, bool), np.ones(500), PANORAMA.canvas, (48, 64), 250)
-
-
-def write_record(folder: RunFolder) -> None:
-    folder.write_record({"warnings": ["a line"] * 2000})
+def write_results(folder: RunFolder) -> None:
+    folder.write_results(RENDERED, MOTION, {"warnings": ["a line"] * 2000})
 
 
 def write_report(folder: RunFolder) -> None:
     folder.write_report("<html>µ</html>" * 2000)
 
 
-WRITERS = (write_panorama, write_trajectory, write_record, write_report)
+WRITERS = (write_panorama, write_results, write_report)
 
 
 def write_all(folder: RunFolder) -> None:

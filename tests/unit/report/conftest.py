@@ -5,15 +5,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonpano import FrameSpan, Panorama
 from photonpano.geometry import canvas_of, normalised, translation
-from photonpano.report import RunArrays
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.testing import KnownMotion
 
 FRAME_SHAPE = (254, 496)
 N_FRAMES = 10_000
 
 
-def make_arrays(n_frames: int = N_FRAMES) -> RunArrays:
-    """Make the arrays of a pan of 750 px with a hand shake, whose first and last frames were not located."""
+def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanorama]:
+    """Make the motion and the panorama of a pan of 750 px with a hand shake, whose first and last frames were not located."""
     frame = np.arange(n_frames)
     time = frame / n_frames
     rng = np.random.default_rng(3)
@@ -35,21 +38,19 @@ def make_arrays(n_frames: int = N_FRAMES) -> RunArrays:
     coverage[coverage < 60] = 0
     picture[coverage == 0] = 0
     located = (frame >= n_frames // 80) & (frame < n_frames - n_frames // 80)
-    return RunArrays(
-        preview=np.clip(picture, 0, 255).astype(np.uint8),
-        coverage=coverage.astype(np.float32),
-        homographies=homographies,
-        located=located,
-        std_px=np.where(located, 0.05 + 0.6 * (2 * time - 1) ** 8, np.inf),
-        canvas=canvas.transform,
-        frame_shape=FRAME_SHAPE,
-        reference=reference,
-    )
+    std_px = np.where(located, 0.05 + 0.6 * (2 * time - 1) ** 8, np.inf)
+    known = np.flatnonzero(located)
+    span = FrameSpan(int(known[0]), int(known[-1]) + 1)
+    trajectory = KnownMotion(lambda frame: homographies[round(frame)])
+    motion = FrameMotion(trajectory, span, homographies, located, std_px, reference, FRAME_SHAPE)
+    preview, weight = np.clip(picture, 0, 255).astype(np.uint8), coverage.astype(np.float32)
+    thumbnail = Panorama(weight, weight, canvas.transform)
+    return motion, RenderedPanorama(canvas, thumbnail, 1, preview, 1.8342, float((weight > 0).mean()), 4.18)
 
 
-def make_record(arrays: RunArrays) -> dict[str, Any]:
+def make_record(n_frames: int, panorama: RenderedPanorama) -> dict[str, Any]:
     """Make the record of a run whose second level lost many pairs."""
-    height, width = arrays.coverage.shape
+    height, width = panorama.canvas.shape
     failures = [
         {
             "moving": [250 * k, 250 * k + 250],
@@ -71,6 +72,7 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             "pairs": groups - 1,
             "located": groups - (number == 2),
             "located_by": {"opencv-sift": groups - 1 - (10 if number == 2 else 0)},
+            "rescued": [],
             "failures": failures if number == 2 else [],
             "revisits": {"pairs": 12 * (number - 1), "located": 11 * (number - 1)},
             "contradictions": [{"moving": [4000, 4250], "fixed": [1500, 1750]}] if number == 3 else [],
@@ -104,7 +106,7 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
         "spec_file": "examples/pipelines/corridor-pan.yaml",
         "seed": 0,
         "source": {
-            "n_frames": len(arrays.homographies),
+            "n_frames": n_frames,
             "height": 254,
             "width": 496,
             "frame_rate_hz": 96800.0,
@@ -124,7 +126,7 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
             "scale": 1.0,
             "picture_reduction": 1,
             "white_flux": 1.8342,
-            "coverage_share": float((arrays.coverage > 0).mean()),
+            "coverage_share": panorama.coverage_share,
             "seconds": 4.18,
         },
         "warnings": ["level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it"],
@@ -134,10 +136,20 @@ def make_record(arrays: RunArrays) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def arrays() -> RunArrays:
-    return make_arrays()
+def results() -> tuple[FrameMotion, RenderedPanorama]:
+    return make_results()
+
+
+@pytest.fixture(scope="session")
+def motion(results: tuple[FrameMotion, RenderedPanorama]) -> FrameMotion:
+    return results[0]
+
+
+@pytest.fixture(scope="session")
+def panorama(results: tuple[FrameMotion, RenderedPanorama]) -> RenderedPanorama:
+    return results[1]
 
 
 @pytest.fixture
-def record(arrays: RunArrays) -> dict[str, Any]:
-    return make_record(arrays)
+def record(motion: FrameMotion, panorama: RenderedPanorama) -> dict[str, Any]:
+    return make_record(len(motion.homographies), panorama)

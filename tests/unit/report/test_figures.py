@@ -13,17 +13,19 @@ from photonpano.report import figures
 
 
 @pytest.fixture
-def small(arrays):
+def small(motion):
     """Return two hundred frames that move 3 px to the right and 1 px down each."""
     frame = np.arange(200)
     return replace(
-        arrays,
+        motion,
         homographies=np.array([translation(3.0 * (t - 100), 1.0 * (t - 100)) for t in frame]),
         located=frame >= 20,
         reference=100,
-        preview=np.full((30, 90), 128, np.uint8),
-        coverage=np.ones((30, 90), np.float32),
     )
+
+
+def of_shape(panorama, shape):
+    return replace(panorama, picture=np.full(shape, 128, np.uint8))
 
 
 def lines(svg: str, colour: str) -> list[np.ndarray]:
@@ -32,11 +34,11 @@ def lines(svg: str, colour: str) -> list[np.ndarray]:
     return [np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", path), dtype=float) for path in paths]
 
 
-def test_colours_are_left_to_the_page(record, arrays):
+def test_colours_are_left_to_the_page(record, motion, panorama):
     svgs = [
-        figures.path_over_time(arrays, 96_800.0),
-        figures.path_on_panorama(arrays),
-        figures.coverage_map(arrays.coverage),
+        figures.path_over_time(motion, 96_800.0),
+        figures.path_on_panorama(motion, panorama),
+        figures.coverage_map(panorama.thumbnail.weight),
         figures.stage_times(record["levels"], record["panorama"]),
     ]
     for svg in svgs:
@@ -55,10 +57,10 @@ def test_the_path_is_a_straight_line_at_a_constant_speed(small):
     assert np.ptp(speed[:, 1]) < 1e-3
 
 
-def test_long_captures_are_drawn_at_a_bounded_number_of_instants(arrays):
+def test_long_captures_are_drawn_at_a_bounded_number_of_instants(motion):
     # Points that lie on the line between others would be left out of the drawing.
     with mpl.rc_context({"path.simplify": False}):
-        svg = figures.path_over_time(arrays, 96_800.0)
+        svg = figures.path_over_time(motion, 96_800.0)
     assert figures.MAX_INSTANTS / 2 < len(lines(svg, "var(--series-1)")[0]) <= figures.MAX_INSTANTS
 
 
@@ -73,16 +75,16 @@ def test_time_has_the_unit_that_fits(small, rate, label):
     assert label in figures.path_over_time(small, rate)
 
 
-def test_a_single_frame_can_be_drawn(small):
+def test_a_single_frame_can_be_drawn(small, panorama):
     single = replace(small, homographies=np.eye(3)[None], located=np.ones(1, bool), std_px=np.ones(1), reference=0)
-    for svg in (figures.path_over_time(single, 100.0), figures.path_on_panorama(single)):
+    for svg in (figures.path_over_time(single, 100.0), figures.path_on_panorama(single, of_shape(panorama, (30, 90)))):
         ElementTree.fromstring(svg)
 
 
 @pytest.mark.parametrize("shape", [(20, 9000), (3000, 20), (1, 1)])
-def test_panoramas_of_any_proportions_can_be_drawn(small, shape):
-    odd = replace(small, preview=np.zeros(shape, np.uint8), coverage=np.zeros(shape, np.float32))
-    for svg in (figures.path_on_panorama(odd), figures.coverage_map(odd.coverage)):
+def test_panoramas_of_any_proportions_can_be_drawn(small, panorama, shape):
+    drawings = figures.path_on_panorama(small, of_shape(panorama, shape)), figures.coverage_map(np.zeros(shape, np.float32))
+    for svg in drawings:
         _, _, width, height = map(float, re.search(r'viewBox="([^"]*)"', svg).group(1).split())
         assert 90 < width <= 721
         assert 90 < height <= 430

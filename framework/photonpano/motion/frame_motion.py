@@ -1,0 +1,53 @@
+"""The motion of every frame of a capture, as the loop leaves it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonpano.motion.loop import LevelResult
+from photonpano.protocols import Trajectory
+from photonpano.values import BoolArray, FloatArray, FrameSpan, StreamInfo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMotion:
+    """The motion of T frames.
+
+    Convention:
+        Homographies map frame pixels to reference pixels; points are (x, y), integers are pixel centres.
+
+    Attributes:
+        trajectory: the homography of any instant.
+        span: the frames from the first to the last that a located exposure holds.
+        homographies: (T, 3, 3), one for each frame.
+        located: (T,), False outside `span`.
+        std_px: (T,) expected corner error, infinite outside `span`.
+        reference: the frame whose homography is the identity.
+        frame_shape: (height, width) of a frame.
+    """
+
+    trajectory: Trajectory
+    span: FrameSpan
+    homographies: FloatArray
+    located: BoolArray
+    std_px: FloatArray
+    reference: int
+    frame_shape: tuple[int, int]
+
+
+def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, reference: int) -> FrameMotion:
+    """Evaluate the result of the last level at every frame.
+
+    Args:
+        levels: the results of the loop, at least one.
+        stream: the capture.
+        reference: the frame whose homography is the identity.
+    """
+    last = levels[-1]
+    frames, span = np.arange(stream.n_frames), last.located.covered
+    located = (span.start <= frames) & (frames < span.stop)
+    std_px = np.where(located, last.uncertainty.at(frames), np.inf)
+    return FrameMotion(last.trajectory, span, last.trajectory.at(frames), located, std_px, reference, stream.frame_shape)

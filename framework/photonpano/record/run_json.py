@@ -1,0 +1,273 @@
+"""Write and read the content of `run.json`: enough to repeat a run, and to see where it is weak."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from photonpano.errors import InputError
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.record.memory import peak_memory_bytes
+from photonpano.record.schema import (
+    DecisionRecord,
+    FailureRecord,
+    LevelRecord,
+    MotionRecord,
+    PairRecord,
+    PluginRecord,
+    RescuedRecord,
+    RunRecord,
+)
+from photonpano.specs.plan import Choice, Plan
+from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, StreamInfo, true_spans
+
+UNCERTAIN_PX = 0.5
+"""A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible."""
+SHOWN_SPANS = 4
+"""Spans of uncertain frames that a warning names, the worst first."""
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "scipy", "pydantic", "pluggy", "tifffile")
+
+
+def record_of(
+    plan: Plan,
+    stream: StreamInfo,
+    decisions: Sequence[Decision],
+    levels: Sequence[LevelResult],
+    motion: FrameMotion,
+    panorama: RenderedPanorama,
+    seconds: float,
+) -> RunRecord:
+    """Return the record of a finished run.
+
+    Args:
+        plan: what was run.
+        stream: the capture.
+        decisions: the choices that the spec left open.
+        levels: the results of the loop.
+        motion: the motion of every frame.
+        panorama: the panorama.
+        seconds: time that the run took.
+    """
+    if plan.until_converged:
+        decisions = [*decisions, levels_decision(levels)]
+    return {
+        "photonpano": importlib.metadata.version("photonpano"),
+        "status": "done",
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "spec": plan.document,
+        "spec_file": None if plan.file is None else str(plan.file),
+        "seed": plan.run.seed,
+        "source": {
+            "n_frames": stream.n_frames,
+            "height": stream.height,
+            "width": stream.width,
+            "frame_rate_hz": stream.frame_rate_hz,
+            "kind": stream.kind,
+        },
+        "plugins": plugin_records(plan),
+        "libraries": library_versions(plan),
+        "decisions": [DecisionRecord(what=each.what, value=each.value, reason=each.reason) for each in decisions],
+        "levels": [level_record(result) for result in levels],
+        "panorama": {
+            "height": panorama.canvas.height,
+            "width": panorama.canvas.width,
+            "scale": plan.render.scale,
+            "picture_reduction": panorama.reduction,
+            "white_flux": panorama.white_flux,
+            "coverage_share": panorama.coverage_share,
+            "seconds": round(panorama.seconds, 3),
+        },
+        "motion": motion_record(motion.std_px),
+        "warnings": [*level_warnings(levels), *motion_warnings(motion)],
+        "seconds": round(seconds, 3),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+
+
+def read_record(run_folder: Path) -> RunRecord:
+    """Read the `run.json` of a run folder.
+
+    Raises:
+        InputError: there is none, or it is no record of a run.
+    """
+    file = run_folder / "run.json"
+    if not file.is_file():
+        raise InputError(f"{run_folder} has no run.json, so no run finished in it; give the run folder of one that did")
+    try:
+        record: RunRecord = json.loads(file.read_text(encoding="utf-8"))
+        record["spec"]  # what everything else can be made from
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{file}: cannot be read as the record of a run ({error}); give the folder of a finished run"
+        ) from error
+    return record
+
+
+def plugin_records(plan: Plan) -> list[PluginRecord]:
+    """List the components of a plan, each once."""
+    seen: dict[tuple[str, str], PluginRecord] = {}
+    for stage, choice in _choices(plan):
+        name = choice.contribution.name
+        seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.origin.plugin, "version": choice.origin.version}
+    return list(seen.values())
+
+
+def library_versions(plan: Plan) -> dict[str, str]:
+    """Return the versions of Python and of the libraries that the result depends on."""
+    versions = {"python": sys.version.split()[0]}
+    required = [requirement.module for _, choice in _choices(plan) for requirement in choice.contribution.requires]
+    for name in dict.fromkeys((*_LIBRARIES, *required)):
+        # The distribution may have another name than the module.
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
+
+
+def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
+    """Yield the sections of a spec with the component that each chooses, level by level."""
+    yield "source", plan.source
+    for level in plan.levels:
+        yield from (("resample", level.resample), ("merge", level.merge), ("locate", level.locate))
+        yield from (("locate", choice) for choice in level.fallbacks)
+        yield "interpolate", level.interpolate
+
+
+def level_record(result: LevelResult) -> LevelRecord:
+    """Describe one level."""
+    located, groups = result.located, result.groups
+    first, *_ = result.level.locators
+    mean_px = result.uncertainty.mean_px
+    return {
+        "level": result.level.number,
+        "scale": result.level.scale,
+        "groups": len(groups),
+        "group_frames": int(np.median([len(group.span) for group in groups])),
+        "pairs": len(located.edges),
+        "located": located.n_located,
+        "located_by": {
+            locator.name: sum(edge.locator == locator.name for edge in located.edges) for locator in result.level.locators
+        },
+        "rescued": [
+            RescuedRecord(**_pair(groups, edge), by=edge.locator)
+            for edge in located.edges
+            if edge.locator not in ("", first.name)
+        ],
+        "failures": [
+            FailureRecord(
+                **_pair(groups, edge),
+                reason=edge.motion.reason,
+                evidence={key: _number(value) for key, value in edge.motion.evidence.items()},
+            )
+            for edge in located.failures
+            if isinstance(edge.motion, NotLocated)
+        ],
+        "revisits": {
+            "pairs": located.n_revisits,
+            "located": sum(isinstance(edge.motion, Located) for edge in located.revisits),
+        },
+        "contradictions": [_pair(groups, located.edges[index]) for index in located.solution.contradictions],
+        "change_px": result.change_px,
+        "std_px": mean_px if np.isfinite(mean_px) else None,
+        "residual_px": located.solution.residual_px,
+        "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
+    }
+
+
+def motion_record(std_px: FloatArray) -> MotionRecord | None:
+    """Describe the expected error of the motion; None where no motion is known, as with a single exposure.
+
+    Args:
+        std_px: (T,) expected corner error, infinite where nothing was located.
+    """
+    known = np.flatnonzero(np.isfinite(std_px))
+    if not len(known):
+        return None
+    worst = int(known[np.argmax(std_px[known])])
+    return {"std_px": float(std_px[known].mean()), "worst_std_px": float(std_px[worst]), "worst_frame": worst}
+
+
+def levels_decision(results: Sequence[LevelResult]) -> Decision:
+    """Return the number of levels after which the motion converged, and why."""
+    last = results[-1]
+    if last.change_px is None or not np.isfinite(last.uncertainty.mean_px):
+        reason = "a single exposure has no motion"
+    else:
+        compared = "less" if last.converged else "still more"
+        reason = (
+            f"the last level changed the motion by {last.change_px:.2g} px, {compared} than its expected error of "
+            f"{last.uncertainty.mean_px:.2g} px"
+        )
+    return Decision("levels", len(results), reason)
+
+
+def level_warnings(results: Sequence[LevelResult]) -> list[str]:
+    """Warn of exposures that were not located, and of pairs that were dropped as outliers."""
+    warnings = []
+    for result in results:
+        located, groups = result.located, result.groups
+        lost = [group for group, tied in zip(groups, located.solution.located, strict=True) if not tied]
+        if lost:
+            between = [group for group in lost if located.instants[0] < group.reference < located.instants[-1]]
+            across = f"; the motion is interpolated across {len(between)} of them" if between else ""
+            warnings.append(
+                f"level {result.level.number}: {len(lost)} of {len(groups)} exposures are not located "
+                f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
+            )
+        if located.solution.contradictions:
+            dropped = [located.edges[index] for index in located.solution.contradictions]
+            first = f"{groups[dropped[0].moving]} onto {groups[dropped[0].fixed]}"
+            warnings.append(
+                f"level {result.level.number}: {len(dropped)} of {len(located.edges)} pairs contradict the others and were "
+                f"dropped ({first}{' and others' if len(dropped) > 1 else ''})"
+            )
+    return warnings
+
+
+def motion_warnings(motion: FrameMotion) -> list[str]:
+    """Warn of frames whose motion is uncertain, and of frames that are left out."""
+    warnings = uncertain_frames(motion.std_px)
+    if not motion.located.all():
+        n_left_out, n_frames = int(np.sum(~motion.located)), len(motion.located)
+        warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
+    return warnings
+
+
+def uncertain_frames(std_px: FloatArray) -> list[str]:
+    """Warn of the frames whose expected error exceeds `UNCERTAIN_PX`.
+
+    Args:
+        std_px: (T,) expected corner error, infinite where nothing was located.
+    """
+    if not np.isfinite(std_px).any():
+        return ["only one exposure was located, so no motion is known: its frames are summed without motion compensation"]
+    uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
+    if not uncertain.any():
+        return []
+    worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
+    spans = sorted(worst_px, key=lambda span: -worst_px[span])
+    named = [f"{span} (up to {worst_px[span]:.1f} px)" for span in spans[:SHOWN_SPANS]]
+    more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
+    return [
+        f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "
+        f"{UNCERTAIN_PX:g} px in {', '.join(named)}{more}"
+    ]
+
+
+def _pair(groups: Sequence[Group], edge: Edge) -> PairRecord:
+    moving, fixed = groups[edge.moving].span, groups[edge.fixed].span
+    return {"moving": [moving.start, moving.stop], "fixed": [fixed.start, fixed.stop]}
+
+
+def _number(value: float) -> float | None:
+    """Convert a number to what JSON can hold: a number of Python, None if it is not finite."""
+    plain: float = value.item() if isinstance(value, np.generic) else value
+    return plain if np.isfinite(plain) else None

@@ -1,0 +1,134 @@
+"""The schema of `run.json`. Keys may be added; those that are here keep their meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
+
+
+class SourceRecord(TypedDict):
+    """The capture."""
+
+    n_frames: int
+    height: int
+    width: int
+    frame_rate_hz: float | None
+    kind: str
+
+
+class PluginRecord(TypedDict):
+    """Who provided a stage: the component's name, its distribution and version."""
+
+    stage: str
+    use: str
+    plugin: str
+    version: str
+
+
+class PairRecord(TypedDict):
+    """A pair of exposures, as half-open frame spans [start, stop)."""
+
+    moving: Sequence[int]
+    fixed: Sequence[int]
+
+
+class RescuedRecord(PairRecord):
+    """A pair that the first locator lost, and the fallback that located it."""
+
+    by: str
+
+
+class FailureRecord(PairRecord):
+    """A pair that was not located: the reason, and the numbers behind it (None where one is not finite)."""
+
+    reason: str
+    evidence: Mapping[str, float | None]
+
+
+class ClosureRecord(TypedDict):
+    """Loop closures: pairs of exposures that may show one place at different times, and how many of them were located."""
+
+    pairs: int
+    located: int
+
+
+class LevelRecord(TypedDict):
+    """One level.
+
+    `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them; `located_by` counts located pairs by
+    locator. `revisits` are loop closures. `contradictions` are located pairs that were dropped as outliers. `change_px` is the
+    mean distance by which the level moved the corners of the frames, None at the first level; `std_px` is the expected corner
+    error, None where a single exposure was located. `seconds` has an entry for each stage.
+    """
+
+    level: int
+    scale: float
+    groups: int
+    group_frames: int
+    pairs: int
+    located: int
+    located_by: Mapping[str, int]
+    rescued: Sequence[RescuedRecord]
+    failures: Sequence[FailureRecord]
+    revisits: ClosureRecord
+    contradictions: Sequence[PairRecord]
+    change_px: float | None
+    std_px: float | None
+    residual_px: float
+    seconds: Mapping[str, float]
+
+
+class MotionRecord(TypedDict):
+    """The expected corner error of the located frames, in px: its mean, the largest, and the frame that has it."""
+
+    std_px: float
+    worst_std_px: float
+    worst_frame: int
+
+
+class DecisionRecord(TypedDict):
+    """A value that the spec left open: what was chosen, and why."""
+
+    what: str
+    value: bool | int | float | str
+    reason: str
+
+
+class PanoramaRecord(TypedDict):
+    """The panorama: `coverage_share` is the share of pixels that were seen, `white_flux` the flux that is white in the PNG.
+
+    `picture_reduction` is the factor by which the PNG is smaller than the panorama, 1 unless that was rendered in tiles.
+    """
+
+    height: int
+    width: int
+    scale: float
+    picture_reduction: int
+    white_flux: float
+    coverage_share: float
+    seconds: float
+
+
+class RunRecord(TypedDict):
+    """The content of `run.json`.
+
+    `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none; `peak_memory_bytes` is None where the
+    system does not report it.
+    """
+
+    photonpano: str
+    status: str
+    created: str
+    spec: Mapping[str, Any]
+    spec_file: str | None
+    seed: int
+    source: SourceRecord
+    plugins: Sequence[PluginRecord]
+    libraries: Mapping[str, str]
+    decisions: Sequence[DecisionRecord]
+    levels: Sequence[LevelRecord]
+    motion: MotionRecord | None
+    panorama: PanoramaRecord | None
+    warnings: Sequence[str]
+    seconds: float
+    peak_memory_bytes: int | None
