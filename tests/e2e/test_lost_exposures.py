@@ -89,7 +89,7 @@ def test_the_largest_part_is_shown_if_the_spec_asks_for_it(run: Callable, with_a
     warnings = outcome.record["warnings"]
     assert warnings[0] == "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others)"
     assert all("is uncertain: its expected error exceeds" in warning for warning in warnings[1:-1])
-    assert warnings[-1] == "150 of 300 frames lie outside what was located and are left out"
+    assert warnings[-1] == "150 of 300 frames lie outside the located exposures and are left out"
     np.testing.assert_allclose(outcome.homographies[150], np.eye(3), atol=1e-12)
 
 
