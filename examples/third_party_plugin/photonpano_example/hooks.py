@@ -1,4 +1,4 @@
-"""What this plugin offers; photonpano imports it whenever plugins are listed, so it imports nothing heavy."""
+"""Hooks of the plugin. Listing plugins imports this module, so it imports nothing heavy."""
 
 from collections.abc import Iterator
 
@@ -8,25 +8,25 @@ from photonpano import Config, Locator, LocatorContribution, Merger, MergerContr
 
 
 class ShortExposureConfig(Config):
-    """What specs may say of the merger, under `with`."""
+    """Keys of the merger, under `with` in a spec."""
 
     max_motion_px: float = Field(
         1.0,
         gt=0,
         le=16,
-        description="frames count while no corner is further than this from where it is at the reference, in px",
+        description="frames are left out if a corner lies further than this from its place at the reference instant, in px",
     )
 
 
 class ProfileShiftConfig(Config):
-    """What specs may say of the locator, under `with`."""
+    """Keys of the locator, under `with` in a spec."""
 
-    blur_px: float = Field(1.5, ge=0, le=10, description="standard deviation of the Gaussian that quiets photon noise, in px")
+    blur_px: float = Field(1.5, ge=0, le=10, description="standard deviation of the Gaussian blur against photon noise, in px")
     reach: float = Field(
         0.3,
         gt=0,
         le=0.5,
-        description="largest shift between two exposures, beyond the one that is known, as a share of their sides",
+        description="search range around the motion known so far, as a fraction of the longer side",
     )
 
 
@@ -46,7 +46,7 @@ def build_profile_shift(config: ProfileShiftConfig, context: StageContext) -> Lo
 
 SHORT_EXPOSURE = MergerContribution(
     name="short-exposure",
-    summary="Only the frames during which the camera hardly moved, as they lie",
+    summary="Sums only the frames during which the camera hardly moved, without warping",
     config=ShortExposureConfig,
     build=build_short_exposure,
     api_version=1,

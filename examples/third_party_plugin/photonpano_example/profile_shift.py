@@ -1,4 +1,4 @@
-"""Locator `profile-shift`: two exposures are shifted by as much as their profiles are."""
+"""Locator `profile-shift`: estimate a shift from the row and column profiles of two exposures."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +12,21 @@ ROUNDS = 8
 NEAR_PX = 2
 CONVERGED_PX = 0.01
 TRANSLATION = (4, 5)
-"""A shift changes these of the parameters p1 to p8, counted from 0."""
+"""Indices, from 0, of the parameters p1 to p8 that a shift changes."""
 
 
 class ProfileShift:
-    """Reduces images to the means of their columns and of their rows, in which there is little photon noise left."""
+    """Compares the column means, and the row means, of two images: they hold little photon noise."""
 
     def __init__(self, blur_px: float, reach: float) -> None:
         self.blur_px, self.reach = blur_px, reach
 
     def describe(self, exposure: VirtualExposure) -> View:
-        """Return the exposure on the scale on which photon noise is uniform, blurred, with weights."""
+        """Return the exposure as a blurred, variance-stabilised image with weights."""
         return view_of(exposure, self.blur_px)
 
     def register(self, moving: View, fixed: View, initial: NDArray[np.float64] | None) -> Located | NotLocated:
-        """Shift `moving` onto `fixed`, from where `initial` puts its middle; see `photonpano.Locator`."""
+        """Estimate the shift of `moving` onto `fixed`, starting from `initial`; see `photonpano.Locator`."""
         middle = (np.array([moving.shape[::-1]]) - 1) / 2
         x, y = (0.0, 0.0) if initial is None else (apply(initial, middle) - middle)[0]
         furthest = int(self.reach * max(moving.shape))

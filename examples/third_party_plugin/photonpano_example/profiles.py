@@ -1,4 +1,4 @@
-"""Profiles of images, and how far one curve is shifted against another: numpy, and nothing of photonpano."""
+"""Profiles of images, and the shift between two curves; needs numpy only."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ def profile(image: NDArray[np.float32], seen: NDArray[np.bool_], axis: int) -> N
 
 
 def offset(moving: NDArray[np.float64], fixed: NDArray[np.float64], furthest: int) -> float:
-    """Return by how many samples, up to `furthest`, a curve has to be shifted so that it is most like another one.
+    """Return the shift in samples, at most `furthest`, that maximises the correlation of two curves.
 
-    Between samples it is the top of a parabola through the best correlation and its neighbours.
+    A parabola through the best correlation and its neighbours gives the fraction of a sample.
     """
     size = len(moving)
     furthest = min(furthest, size - 1)
@@ -34,7 +34,7 @@ def offset(moving: NDArray[np.float64], fixed: NDArray[np.float64], furthest: in
 
 
 def correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return how alike two curves are where both are known, from -1 to 1; 0 where one of them is flat."""
+    """Return the correlation of two curves where both are known; 0 if one of them is flat."""
     known = np.isfinite(first) & np.isfinite(second)
     if not known.any():
         return 0.0

@@ -1,4 +1,4 @@
-"""Merger `short-exposure`: the frames during which the camera hardly moved, as they lie."""
+"""Merger `short-exposure`: sum only the frames during which the camera hardly moved."""
 
 import numpy as np
 
@@ -26,13 +26,13 @@ class ShortExposure:
 
 
 def steady_part(group: Group, trajectory: Trajectory, frame_shape: tuple[int, int], max_motion_px: float) -> FrameSpan:
-    """Return the frames around the reference instant up to where a corner has moved too far.
+    """Return the frames around the reference instant during which no corner moves too far.
 
     Args:
-        group: the frames to choose from, and the instant that the exposure is seen from.
+        group: the frames to choose from, and the reference instant.
         trajectory: the motion known so far.
         frame_shape: (height, width) of a frame.
-        max_motion_px: how far a corner may be from where it is at the reference instant, in px.
+        max_motion_px: largest distance of a corner from its place at the reference instant, in px.
     """
     frames = np.arange(group.span.start, group.span.stop)
     to_reference = inverse(trajectory.at([group.reference])[0]) @ trajectory.at(frames)
