@@ -91,7 +91,7 @@ def view(scene: np.ndarray, to_scene: np.ndarray, instant: float, moving: bool) 
 
 def psnrs(folder: Path) -> list[str]:
     """Return the rows of the table of PSNR."""
-    rows = ["| Flux | Merger | Nothing moves | Where something moves by itself |", "| --- | --- | --- | --- |"]
+    rows = ["| Flux | Merger | Static scene | Moving square |", "| --- | --- | --- | --- |"]
     to_scene = translation(200, 150)
     motion = panning(0.15, SEEN_FRAMES)
     group = Group(FrameSpan(0, SEEN_FRAMES), (SEEN_FRAMES - 1) / 2)
