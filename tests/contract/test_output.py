@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ import tifffile
 from photonpano.geometry import apply, corners
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.run import RunResult
+from photonpano.record.schema import LevelRecord, RunRecord
 from photonpano.specs import parse_spec
 
 N_FRAMES, SHAPE = 300, (128, 160)
@@ -153,3 +156,41 @@ def test_the_report_needs_nothing_else(folder: Path) -> None:
     assert re.findall(r"""(?:src|href)=["'](?!data:|#)[^"']*""", page) == []
     assert "<script" not in page
     assert "data:image/png;base64," in page
+
+
+def mismatches(value: Any, expected: Any, where: str = "run.json") -> list[str]:
+    """Return where plain data differs from a TypedDict, a sequence, a mapping, a union, or a plain type."""
+    if is_typeddict(expected):
+        hints = get_type_hints(expected)
+        if set(value) != set(hints):
+            return [f"{where}: {sorted(set(value) ^ set(hints))}"]
+        return [each for key, hint in hints.items() for each in mismatches(value[key], hint, f"{where}.{key}")]
+    origin, arguments = get_origin(expected), get_args(expected)
+    if origin is UnionType:
+        found = [mismatches(value, each, where) for each in arguments]
+        return [] if [] in found else min(found, key=len)
+    if origin is Sequence:
+        return [each for index, item in enumerate(value) for each in mismatches(item, arguments[0], f"{where}.{index}")]
+    if origin is Mapping:
+        return [each for key, item in value.items() for each in mismatches(item, arguments[1], f"{where}.{key}")]
+    allowed = (int, float) if expected is float else object if expected is Any else expected
+    return [] if isinstance(value, allowed) else [f"{where}: {value!r} is no {expected}"]
+
+
+def test_record_has_the_keys_and_types_of_its_schema(record: dict[str, Any]) -> None:
+    assert mismatches(record, RunRecord) == []
+
+
+def test_schema_check_finds_missing_unknown_and_mistyped_values(record: dict[str, Any]) -> None:
+    level = dict(record["levels"][0])
+    del level["rescued"]
+    assert mismatches(record | {"levels": [level]}, RunRecord) == ["run.json.levels.0: ['rescued']"]
+    assert mismatches(record | {"seconds": None}, RunRecord) == ["run.json.seconds: None is no <class 'float'>"]
+    assert mismatches(record | {"extra": 1}, RunRecord) == ["run.json: ['extra']"]
+
+
+@pytest.mark.parametrize("schema", [RunRecord, LevelRecord])
+def test_page_on_the_run_folder_lists_every_key(schema: type) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "run-folder.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE))
+    assert set(get_type_hints(schema)) <= listed

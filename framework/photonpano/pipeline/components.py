@@ -1,4 +1,4 @@
-"""From a plan to components: each built once, with errors that name the plugin."""
+"""Build the components of a plan, each once, with errors that name the plugin."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from photonpano.threads import thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
 
 HALVED_LEVELS = 2
-"""So many levels, at most, are located at half size unless the spec says otherwise."""
+"""With `scale: auto`, the first two levels are located at half size."""
 LARGE_FRAME_PX = 192
-"""Smaller sides than this are not halved: a pyramid needs pixels."""
+"""Frames whose shorter side is below this are not halved: the pyramids of locators need pixels."""
 
 
 @contextmanager
@@ -56,31 +56,31 @@ def build_source(plan: Plan) -> Source:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
             raise
-        # Nobody named this source, so it is said why it was asked.
+        # The spec says `auto`, so the message explains how this source was chosen.
         raise InputError(f"{error} (source {found.value}: {found.reason})") from error
     if not plan.corrections:
         return source
 
-    def blame(index: int, message: str) -> SpecError:
+    def located(index: int, message: str) -> SpecError:
         where = f"corrections.{index}"
         return SpecError([plan.places.get(where, Place(where)).problem(message)])
 
     try:
-        return corrected_source(source, plan.corrections, blame)
+        return corrected_source(source, plan.corrections, located)
     except BaseException:
         source.close()
         raise
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
-    """Build the components of all levels; levels that choose alike share one component.
+    """Build the components of all levels. Levels that choose the same component with the same config share one.
 
     Args:
         plan: which components.
         source: the capture.
-        decisions: what the components choose because of what the capture shows is added here, once they are at work.
+        decisions: receives the decisions that components take from the capture while they work, such as a group size.
     """
-    from photonpano.captures.summary import summarise  # imports OpenCV, which checking a spec does not need
+    from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     threads = thread_count(plan.run.threads)
     capture = cache(lambda: summarise(source, threads))
@@ -114,12 +114,12 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:
     """Return the scale of a level's exposures.
 
-    Where the spec leaves it open, the first two levels are located at half size, as long as frames are large and a later level
-    refines what they find: a quarter of the pixels tells nearly as much of motion that is still known to a pixel or so.
+    With `scale: auto`, the first two levels are located at half size if frames are large and a later level refines the motion.
+    While the motion is known to about a pixel only, a quarter of the pixels locates it nearly as well.
 
     Args:
-        plan: which levels there are.
-        number: of the level, from 1.
+        plan: the levels.
+        number: the number of the level, from 1.
         frame_shape: (height, width) of a frame.
     """
     scale = plan.levels[number - 1].scale
@@ -130,7 +130,7 @@ def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:
 
 
 def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]:
-    """Return the groups of each level; where they depend on what the frames show, a clause that says so. Reads no frames."""
+    """Return the groups of each level, or a clause that explains why they depend on the frames. Reads no frames."""
     context = StageContext(source.info, source.response, plan.run.seed)
     foreseen: list[tuple[Group, ...] | str] = []
     for number, level in enumerate(plan.levels, start=1):
@@ -144,10 +144,10 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
 
 
 def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
-    """Return what the resampler of the first level chooses for a capture that looks like this, such as its group size.
+    """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary.
 
     Raises:
-        InputError: the capture is too short for it.
+        InputError: the capture is too short for the resampler.
     """
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
@@ -169,7 +169,7 @@ def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], 
 
 
 def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:
-    """Give each choice its name, with a number from the second of the same name on."""
+    """Yield each choice with its name; the second of the same name is numbered, such as "opencv-sift 2"."""
     seen: Counter[str] = Counter()
     for choice in choices:
         name = choice.contribution.name

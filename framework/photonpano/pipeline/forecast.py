@@ -1,4 +1,4 @@
-"""How long a run will take, and how much memory: a trial on a part of the capture, multiplied."""
+"""Forecast the time and memory of a run from a trial on a part of the capture."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan, StreamInfo
 
 TRIAL_GROUPS = 12
-"""So many groups of the first level, from the middle of the capture, are run through all levels."""
+"""Length of the trial, in groups of the first level. It is taken from the middle of the capture."""
 _WARM_UP_GROUPS = 3
-"""So many are run before, so that what is done once, such as to compile loops, does not count."""
+"""Length of an untimed trial before it, in groups, so that work that is done once, such as compiling, does not count."""
 BYTES_PER_FRAME = 1200
-"""What is kept of the motion of each frame, as measured in the benchmarks."""
+"""Memory for the motion of one frame, as measured in the benchmarks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run is expected to take.
+    """The expected time and memory of a run.
 
     Attributes:
         tried: the frames of the trial.
-        threads: how many threads it ran with.
-        seconds: of each level, and of the panorama.
-        memory_bytes: the peak of the process, as far as the system tells it.
-        canvas: (height, width) of the panorama, if the camera goes on as in the trial and never comes back.
+        threads: the number of threads of the trial.
+        seconds: expected time of each level, and of the panorama.
+        memory_bytes: expected peak memory of the process.
+        canvas: (height, width) of the panorama if the camera keeps moving as in the trial and never returns.
     """
 
     tried: FrameSpan
@@ -76,10 +76,10 @@ class PartOfSource(SourceWrapper):
 
 
 def forecast(plan: Plan, source: Source) -> Forecast:
-    """Run all levels on a part of the capture, and multiply: time grows with the number of frames.
+    """Run all levels on a part of the capture, and extrapolate: time is proportional to the number of frames.
 
     Raises:
-        PhotonpanoError: the run would fail there.
+        PhotonpanoError: the trial failed, as the run would.
     """
     threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
     groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch(threads))

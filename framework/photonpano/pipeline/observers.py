@@ -1,4 +1,4 @@
-"""Tell plugins what happens in a run: they look and touch nothing, and what they raise is logged."""
+"""Call the observation hooks of plugins during a run. They cannot change it, and their exceptions are logged."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Observers:
     """The observers of one run; by default there are none.
 
     Attributes:
-        observers: the plugins that watch.
+        observers: the plugins with observation hooks.
         directory: the run folder.
     """
 
@@ -33,19 +33,19 @@ class Observers:
 
     @contextmanager
     def watching(self, spec: Mapping[str, Any]) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-        """Call the observers when a run starts and when it ends; the block gives its record to what is yielded."""
-        self._tell("photonpano_run_started", spec=frozen(spec))
+        """Report the start of a run, and its end: an error, or the record that the block passes to the yielded function."""
+        self._call("photonpano_run_started", spec=frozen(spec))
         records: list[Mapping[str, Any]] = []
         try:
             yield records.append
         except BaseException as error:  # an interrupt ends a run as well
             message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            self._tell("photonpano_run_finished", record=None, error=message)
+            self._call("photonpano_run_finished", record=None, error=message)
             raise
-        self._tell("photonpano_run_finished", record=frozen(records[-1]), error=None)
+        self._call("photonpano_run_finished", record=frozen(records[-1]), error=None)
 
     def level_finished(self, result: LevelResult) -> None:
-        """Tell of the four stages of a level."""
+        """Report the four stages of a level."""
         located, std_px = result.located, result.uncertainty.mean_px
         summaries: dict[str, dict[str, float | None]] = {
             "resample": {"groups": len(result.groups)},
@@ -57,13 +57,13 @@ class Observers:
             self._stage_finished(result.level.number, stage, result.seconds.get(stage, 0.0), summary)
 
     def rendered(self, canvas: Canvas, seconds: float) -> None:
-        """Tell of the panorama."""
+        """Report the panorama."""
         self._stage_finished(None, "render", seconds, {"height": canvas.height, "width": canvas.width})
 
     def _stage_finished(self, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]) -> None:
-        self._tell("photonpano_stage_finished", level=level, stage=stage, seconds=seconds, summary=frozen(summary))
+        self._call("photonpano_stage_finished", level=level, stage=stage, seconds=seconds, summary=frozen(summary))
 
-    def _tell(self, hook: str, **values: Any) -> None:
+    def _call(self, hook: str, **values: Any) -> None:
         for observer in self.observers:
             try:
                 getattr(observer.hook, hook)(directory=self.directory, **values)
@@ -73,7 +73,7 @@ class Observers:
 
 
 def frozen(value: Any) -> Any:
-    """Return plain data that cannot be changed: mappings as read-only views of copies, lists as tuples."""
+    """Return a copy of plain data that cannot be changed: mappings become read-only views, lists become tuples."""
     if isinstance(value, Mapping):
         return MappingProxyType({key: frozen(item) for key, item in value.items()})
     return tuple(map(frozen, value)) if isinstance(value, list | tuple) else value
