@@ -65,7 +65,7 @@ def _forecast(plan: "Plan", source: "Source") -> list[str]:
     """Return what a run is expected to take, or why the trial failed."""
     from photonpano.errors import PhotonpanoError
     from photonpano.pipeline.forecast import forecast
-    from photonpano.report.wording import duration, memory
+    from photonpano.report.numbers import duration, memory
 
     try:
         found = forecast(plan, source)

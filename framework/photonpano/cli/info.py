@@ -141,7 +141,7 @@ def _from_here(value: Any) -> Any:
 
 def _rows(facts: Mapping[str, Any]) -> Iterator[list[str]]:
     from photonpano.cli.wording import capture_words
-    from photonpano.report.wording import duration
+    from photonpano.report.numbers import duration
     from photonpano.values import StreamInfo
 
     stream = StreamInfo(*(facts[key] for key in ("n_frames", "height", "width", "frame_rate_hz", "kind", "bit_depth")))

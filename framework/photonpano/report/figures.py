@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import importlib
 import io
 import re
@@ -17,14 +18,14 @@ from photonpano.geometry import apply, corners
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
-from photonpano.report.pictures import shrunk
-from photonpano.report.wording import duration
+from photonpano.report.numbers import duration
 from photonpano.values import FloatArray, FluxImage, true_spans
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+JPEG_QUALITY = 90
 MAX_INSTANTS = 1500
 """The trajectory is drawn at so many instants at most, evenly spaced."""
 
@@ -176,6 +177,27 @@ def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) 
         axes.set_xlabel("seconds")
         figure.legend(loc="outside upper left", ncols=5, handlelength=1, handleheight=1, columnspacing=1.4)
         return _svg(figure, "stage-times")
+
+
+def shrunk(image: NDArray[Any], max_pixels: int) -> NDArray[Any]:
+    """Average an image down until its longer side has at most `max_pixels`; smaller images stay as they are."""
+    import cv2
+
+    height, width = image.shape[:2]
+    scale = max_pixels / max(height, width)
+    if scale >= 1:
+        return image
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def jpeg_uri(image: NDArray[np.uint8]) -> str:
+    """Return an (H, W) grey or (H, W, 3) red-green-blue image as a data URI."""
+    import cv2
+
+    in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
+    _, encoded = cv2.imencode(".jpg", in_opencv_order, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def _instants(n_frames: int) -> NDArray[np.int64]:

@@ -11,9 +11,9 @@ from typing import Any
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import RunRecord
-from photonpano.report import figures, wording
+from photonpano.report import figures, numbers
 from photonpano.report.failures import failure_groups
-from photonpano.report.pictures import jpeg_uri, shrunk
+from photonpano.report.figures import jpeg_uri, shrunk
 from photonpano.values import true_spans
 
 PICTURE_PIXELS = 1600
@@ -41,7 +41,7 @@ def render_report(record: RunRecord, motion: FrameMotion | None, panorama: Rende
         lstrip_blocks=True,
     )
     for name in ("count", "counted", "duration", "memory", "pixels", "rate", "share", "span"):
-        environment.filters[name] = getattr(wording, name)
+        environment.filters[name] = getattr(numbers, name)
     page: str = environment.get_template("report.html").render(
         record=record,
         title=_title(record),

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from photonpano.report import wording
+from photonpano.report import numbers
 from photonpano.report.failures import failure_groups
 
 
@@ -22,19 +22,19 @@ from photonpano.report.failures import failure_groups
     ],
 )
 def test_durations(seconds, text):
-    assert wording.duration(seconds) == text
+    assert numbers.duration(seconds) == text
 
 
 @pytest.mark.parametrize(("hertz", "text"), [(96_800, "96.8 kHz"), (500, "500 Hz"), (1.5e6, "1.5 MHz"), (29.97, "30 Hz")])
 def test_rates(hertz, text):
-    assert wording.rate(hertz) == text
+    assert numbers.rate(hertz) == text
 
 
 @pytest.mark.parametrize(
     ("size", "text"), [(512, "512 B"), (812 * 2**20, "812 MiB"), (1023 * 2**20, "1 GiB"), (3 * 2**29, "1.5 GiB")]
 )
 def test_memory(size, text):
-    assert wording.memory(size) == text
+    assert numbers.memory(size) == text
 
 
 @pytest.mark.parametrize(
@@ -42,21 +42,21 @@ def test_memory(size, text):
     [(None, "\N{EN DASH}"), (0.0, "0"), (0.0631, "0.063"), (1.834, "1.83"), (12.34, "12.3"), (1234.5, "1,234")],
 )
 def test_pixels(value, text):
-    assert wording.pixels(value) == text
+    assert numbers.pixels(value) == text
 
 
 @pytest.mark.parametrize(
     ("value", "text"), [(1, "100 %"), (0.998, "over 99 %"), (0.934, "93 %"), (0.003, "under 1 %"), (0, "0 %")]
 )
 def test_shares(value, text):
-    assert wording.share(value) == text
+    assert numbers.share(value) == text
 
 
 def test_counts_and_spans():
-    assert wording.counted(1, "frame") == "1 frame"
-    assert wording.counted(12_000, "frame") == "12,000 frames"
-    assert wording.span(1000, 2000) == "1,000 to 1,999"
-    assert wording.span(7, 8) == "7"
+    assert numbers.counted(1, "frame") == "1 frame"
+    assert numbers.counted(12_000, "frame") == "12,000 frames"
+    assert numbers.span(1000, 2000) == "1,000 to 1,999"
+    assert numbers.span(7, 8) == "7"
 
 
 def failure(start: int, reason: str) -> dict:
