@@ -6,7 +6,12 @@ from typing import TYPE_CHECKING
 
 from photonpano import SourceContribution, hookimpl
 from photonpano_sensors.intensity.contributions import INTENSITY_SOURCES
-from photonpano_sensors.single_photon import SINGLE_PHOTON
+from photonpano_sensors.mat_parts import MAT_PARTS
+from photonpano_sensors.spad512 import SPAD512
+from photonpano_sensors.spad512_sparse import SPAD512_SPARSE
+from photonpano_sensors.swissspad import SWISSSPAD_FULL, SWISSSPAD_HALF
+from photonpano_sensors.ubicept import UBICEPT_H5
+from photonpano_sensors.visionsim import VISIONSIM
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -15,5 +20,5 @@ if TYPE_CHECKING:
 @hookimpl
 def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer captures as cameras and their programs write them."""
-    yield from SINGLE_PHOTON
+    yield from (SWISSSPAD_HALF, SWISSSPAD_FULL, SPAD512, SPAD512_SPARSE, MAT_PARTS, VISIONSIM, UBICEPT_H5)
     yield from INTENSITY_SOURCES

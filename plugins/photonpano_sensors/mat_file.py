@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import InputError
-from photonpano.reading import read_start
-from photonpano_sensors.damage import reading
+from photonpano.reading import read_start, reading
 from photonpano_sensors.mat5 import mat5_array
 
 _VARIABLE = "OUTPUT"
 _BLOCK_FRAMES = 64
+_DAMAGED = "cannot be read as a MATLAB file: it is damaged or something else; copy it again"
 
 
 class _Variable(NamedTuple):
@@ -41,7 +41,7 @@ class MatFrames:
         self._path = path
         start = read_start(path, 10)
         self._variable = _hdf_variable if start == b"MATLAB 7.3" or start.startswith(b"\x89HDF") else _mat5_variable
-        with reading(path, "a MATLAB file"), self._variable(path) as variable:
+        with reading(path, _DAMAGED), self._variable(path) as variable:
             self.shape = _frame_order(path, variable.shape)
 
     def packed(self) -> NDArray[np.uint8]:
@@ -52,7 +52,7 @@ class MatFrames:
         """
         n_frames, height, width = self.shape
         packed = np.empty((n_frames, height, -(-width // 8)), np.uint8)
-        with reading(self._path, "a MATLAB file"), self._variable(self._path) as variable:
+        with reading(self._path, _DAMAGED), self._variable(self._path) as variable:
             for start in range(0, n_frames, _BLOCK_FRAMES):
                 stop = min(start + _BLOCK_FRAMES, n_frames)
                 frames = variable.read(start, stop).swapaxes(1, 2)

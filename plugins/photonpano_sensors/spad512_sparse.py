@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, files_in, objections, read_start
+from photonpano.reading import BinarySource, FrameLayout, files_in, objections, read_start, reading
 
 _SIZE = 512
 _PIXELS = _SIZE**2
@@ -94,10 +94,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _words(path: Path, start: int, n_words: int = 1) -> NDArray[np.uint32]:
-    try:
+    with reading(path):
         return np.fromfile(path, _WORD, n_words, offset=start * _WORD.itemsize)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
 
 
 def _frame_ends(path: Path) -> NDArray[np.int64]:

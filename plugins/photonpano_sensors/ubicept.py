@@ -1,17 +1,23 @@
-"""Source `ubicept-h5`: the .ubi.h5 files of Ubicept; light enough to be imported when plugins are listed."""
+"""Source `ubicept-h5`: sums of binary frames in HDF5, one dataset a frame, with its number as its name, in one group."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from photonpano import Config, Recognised, Requirement, Source, SourceContext, SourceContribution, SpecPath
-from photonpano.reading import read_start
+from photonpano import Config, FrameSpan, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
+from photonpano.photometry import BinarySumResponse
+from photonpano.reading import Closing, missing_file, read_start, reading
 
 _SUFFIX = ".ubi.h5"
 _HDF = b"\x89HDF\r\n\x1a\n"
+_DAMAGED = "cannot be read as a .ubi.h5 file: it is damaged or something else; copy it again"
 
 
 class UbiceptConfig(Config):
@@ -26,17 +32,124 @@ class UbiceptConfig(Config):
     )
 
 
-def _build(config: UbiceptConfig, context: SourceContext) -> Source:
-    from photonpano_sensors.ubicept_file import UbiceptSource
+class UbiceptSource(Closing):
+    """Sums of binary frames, read one by one. The library reads one at a time, whatever the number of threads.
 
-    del context
-    return UbiceptSource(config)
+    Raises:
+        InputError: the file is missing or damaged, holds no frames, or does not say of how many binary frames they are sums.
+    """
+
+    def __init__(self, config: UbiceptConfig) -> None:
+        import h5py
+
+        self._path = config.path
+        with reading(self._path, _DAMAGED):
+            self._file = h5py.File(self._path)
+        try:
+            with reading(self._path, _DAMAGED):
+                self._describe(config)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _describe(self, config: UbiceptConfig) -> None:
+        self._group = self._find_group()
+        self._names = sorted((name for name in self._group if _is_number(name)), key=int)
+        first = self._group[self._names[0]]
+        if first.ndim < 2 or min(first.shape[:2]) < 1 or any(size != 1 for size in first.shape[2:]):
+            raise InputError(
+                f"{self._path} holds frames of shape {first.shape}; they are (height, width) or (height, width, 1, 1)"
+            )
+        if first.dtype not in (np.uint8, np.uint16):
+            raise InputError(f"{self._path} holds {first.dtype} values; sums of binary frames are uint8 or uint16")
+        said = json.loads(first.attrs.get("metadata", "{}"))
+        binary_frames = config.binary_frames or _binary_frames(said)
+        if binary_frames is None:
+            raise InputError(f"{self._path} does not say of how many binary frames each frame is the sum; set binary_frames")
+        height, width = first.shape[:2]
+        self._dtype = first.dtype
+        self.info = StreamInfo(
+            n_frames=len(self._names),
+            height=int(height),
+            width=int(width),
+            frame_rate_hz=config.frame_rate_hz or _frame_rate_hz(said, binary_frames),
+            kind="intensity",
+            bit_depth=binary_frames.bit_length(),
+        )
+        self.response = BinarySumResponse(binary_frames)
+        self.valid = np.ones(self.info.frame_shape, np.bool_)
+
+    def _find_group(self) -> Any:
+        """Return the group of the first dataset whose name is a number."""
+        found = self._file.visititems(lambda name, item: item.parent if _is_frame(name, item) else None)
+        if found is None:
+            raise InputError(
+                f"{self._path} has no group of frames, that is, datasets with numbers as names; choose another source"
+            )
+        return found
+
+    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        for index in range(span.start, span.stop):
+            counts += self._frame(index)
+        return counts
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """Return the frames of a span: (n, H, W), each the sum of binary frames."""
+        self.info.require(span)
+        frames = np.empty((len(span), *self.info.frame_shape), self._dtype)
+        for place, index in enumerate(range(span.start, span.stop)):
+            frames[place] = self._frame(index)
+        return frames
+
+    def _frame(self, index: int) -> NDArray[Any]:
+        name = self._names[index]
+        with reading(self._path, _DAMAGED):
+            values: NDArray[Any] = self._group[name][()].reshape(self.info.frame_shape)
+        if values.dtype != self._dtype or values.max() > self.response.n:
+            raise InputError(
+                f"{self._path} holds {values.dtype} values up to {values.max()} in frame {name}, which cannot be the sum of "
+                f"{self.response.n} binary frames, as {self._dtype}; correct binary_frames, or copy the file again"
+            )
+        return values
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()
+
+
+def _is_number(name: str) -> bool:
+    return name.isascii() and name.isdigit()
+
+
+def _is_frame(name: str, item: object) -> bool:
+    import h5py
+
+    return isinstance(item, h5py.Dataset) and _is_number(name.rpartition("/")[2])
+
+
+def _binary_frames(said: dict[str, Any]) -> int | None:
+    """Return how many binary frames the metadata of a frame says it is the sum of."""
+    key = "num_integrated_binary_frames"
+    number = said.get("polycam_metadata", {}).get(key, said.get(key))
+    return int(number) if number is not None and 1 <= int(number) <= 65535 else None
+
+
+def _frame_rate_hz(said: dict[str, Any], binary_frames: int) -> float | None:
+    """Return the rate of the sums, if the metadata tells that of the binary frames."""
+    for node in said.get("node_history", [])[:1]:
+        rate = node.get("schedule", {}).get("base_schedule", {}).get("binary_frame_rate_fps")
+        if rate is not None and 0 < float(rate) < float("inf"):
+            return float(rate) / binary_frames
+    return None
 
 
 def _check(config: UbiceptConfig) -> Sequence[str]:
     """Look whether it is HDF5; what is in it takes a library."""
     if not config.path.is_file():
-        return (f"there is no file {config.path}; check the path",)
+        return (missing_file(config.path),)
     if read_start(config.path, len(_HDF)) != _HDF:
         return (f"{config.path} is not an HDF5 file, by its first bytes; copy it again, or choose another source",)
     return ()
@@ -52,7 +165,7 @@ UBICEPT_H5 = SourceContribution(
     name="ubicept-h5",
     summary="Sums of binary frames in the .ubi.h5 files of Ubicept",
     config=UbiceptConfig,
-    build=_build,
+    build=lambda config, _: UbiceptSource(config),
     check=_check,
     recognise=_recognise,
     suffixes=(".h5",),

@@ -1,14 +1,14 @@
-"""Arrays that a config names: read without pickle, refused with a sentence."""
+"""Arrays that a config names: homographies, rates and masks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import InputError
+from photonpano.reading import read_array
 
 
 def read_homographies(path: Path, n_frames: int) -> NDArray[np.float64]:
@@ -17,7 +17,7 @@ def read_homographies(path: Path, n_frames: int) -> NDArray[np.float64]:
     Raises:
         InputError: the file is missing, is something else, or has another number of homographies.
     """
-    homographies = _read(path, "homographies")
+    homographies = read_array(path, "a file of homographies", "homographies")
     if homographies.ndim != 3 or homographies.shape[1:] != (3, 3) or homographies.dtype.kind not in "fiu":
         raise InputError(f"{path} holds {homographies.dtype} of shape {homographies.shape}; homographies are (n_frames, 3, 3)")
     if len(homographies) != n_frames:
@@ -35,7 +35,7 @@ def read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
     Raises:
         InputError: the file is missing, is something else, or holds rates that are negative or not finite.
     """
-    rates = _read(path, None)
+    rates = read_array(path, "a file of rates")
     if rates.shape != frame_shape or rates.dtype.kind not in "fiu":
         raise InputError(
             f"{path} holds {rates.dtype} of shape {rates.shape}; rates are numbers of the frame's shape {frame_shape}"
@@ -51,25 +51,7 @@ def read_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
     Raises:
         InputError: the file is missing or is something else.
     """
-    mask = _read(path, None)
+    mask = read_array(path, "a mask")
     if mask.shape != frame_shape or mask.dtype != np.bool_:
         raise InputError(f"{path} holds {mask.dtype} of shape {mask.shape}; a mask is bool of the frame's shape {frame_shape}")
     return mask
-
-
-def _read(path: Path, key: str | None) -> NDArray[Any]:
-    """Read a .npy file or, where `key` is given, that array of an .npz archive."""
-    try:
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            return content
-        with content:
-            if key in content:
-                return np.asarray(content[key])
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except Exception as error:  # a damaged file makes numpy's and zipfile's parsers raise nearly anything
-        raise InputError(f"{path} is not a .npy or .npz file of plain numbers") from error
-    raise InputError(f"{path} is an archive without an array {key!r}" if key else f"{path} is an archive; name a .npy file")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from photonpano import InputError, SourceContribution, hookimpl
+from photonpano.reading import missing_file
 from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig, StreetScene
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
         files.append(config.scene.file)
     if isinstance(config.path, FilePath):
         files.append(config.path.file)
-    problems = [f"there is no file {file}; check the path" for file in files if file is not None and not file.is_file()]
+    problems = [missing_file(file) for file in files if file is not None and not file.is_file()]
     if isinstance(config.scene, StreetScene) and not isinstance(config.path, FilePath):
         from photonpano_simulator.paths import camera_path
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
+from photonpano.reading import read_picture
 from photonpano_simulator.config import PhotoScene, StreetScene
 from photonpano_simulator.street import street
 
@@ -38,23 +39,13 @@ def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float
 
 def _photo(path: Path, width: int | None) -> NDArray[np.float32]:
     """Return the linear luminance of a photograph, from 0 to 1."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise InputError(f"{path} is not an image that OpenCV reads; save it as PNG or JPEG")
+    otherwise = "is not an image that OpenCV reads; save it as PNG or JPEG"
+    image = read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path} holds {image.dtype} values; a photograph has 8 or 16 bits: save it as PNG")
     # A table of all grey levels spares the conversion of every pixel.
     linear_of = srgb_to_linear(np.linspace(0, 1, 256**image.dtype.itemsize, dtype=np.float32))
-    linear = np.zeros(image.shape[:2], np.float32)
+    linear: NDArray[np.float32] = np.zeros(image.shape[:2], np.float32)
     for channel, share in enumerate(_LUMINANCE):
         linear += (np.float32(share) * linear_of)[image[..., channel]]
     if width is not None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, inverse
+from photonpano.reading import Closing
 from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, SimulatorConfig
 from photonpano_simulator.intensity import IntensityCamera
@@ -18,7 +17,7 @@ from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.sensor import SpadSensor
 
 
-class SimulatorSource:
+class SimulatorSource(Closing):
     """A camera that turns before a scene (paper, section 5, "Simulation Details").
 
     A frame depends on the config, the seed and its index alone: spans may be asked for in any order and from any thread.
@@ -80,15 +79,6 @@ class SimulatorSource:
             "seed": np.array(self._seed),
             **self._sensor.truth(),
         }
-
-    def close(self) -> None:
-        """Do nothing: there is no file to let go of."""
-
-    def __enter__(self) -> SimulatorSource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
     def _frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
         views = [self._view(homography) for homography in self._while_open(index)]

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from photonpano.contributions import SpecPath
-from photonpano.corrections.files import read_arrays
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
+from photonpano.reading import read_arrays
 from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def read_dark(path: Path) -> DarkFrames:
     Raises:
         InputError: the file is missing, is something else, or holds rates that are negative or not finite.
     """
-    arrays = read_arrays(path, "a file of dark counts")
+    arrays = read_arrays(path, "a file of dark counts", ("rates", "n_frames"))
     rates, n_frames = arrays.get("rates", arrays.get("")), arrays.get("n_frames")
     if rates is None:
         raise InputError(f"{path} is an archive without `rates`; name what `photonpano dark` wrote, or a .npy file of rates")

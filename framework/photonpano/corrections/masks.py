@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from photonpano.contributions import SpecPath
-from photonpano.corrections.files import is_picture, read_arrays, read_picture
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
+from photonpano.reading import read_array, read_picture
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -95,21 +95,34 @@ def _of_colours(pattern: NDArray[np.uint8], colours: Iterable[Colour]) -> BoolAr
 
 def _read_mask(path: Path) -> BoolArray:
     expected = "a mask of bad pixels"
-    if is_picture(path):
-        return np.asarray(read_picture(path, expected).any(axis=-1))
-    mask: BoolArray | None = read_arrays(path, expected).get("")
-    if mask is None or mask.dtype != np.bool_:
-        found = "is an archive" if mask is None else f"holds {mask.dtype} values"
-        raise InputError(f"{path} {found}; a mask is a .npy file of bool, true for pixels that must not be used")
+    if _is_picture(path):
+        return np.asarray(_read_picture(path, expected).any(axis=-1))
+    mask = read_array(path, expected)
+    if mask.dtype != np.bool_:
+        raise InputError(
+            f"{path} holds {mask.dtype} values; a mask is a .npy file of bool, true for pixels that must not be used"
+        )
     return mask
 
 
 def _read_pattern(path: Path) -> NDArray[np.uint8]:
     expected = "the pattern of a colour filter"
-    if is_picture(path):
-        return read_picture(path, expected)
-    pattern = read_arrays(path, expected).get("")
-    if pattern is None or pattern.dtype != np.uint8 or pattern.ndim != 3 or pattern.shape[2] != 3:
-        found = "is an archive" if pattern is None else f"holds {pattern.dtype} values of shape {pattern.shape}"
-        raise InputError(f"{path} {found}; a pattern is a .npy file of uint8 (height, width, 3)")
+    if _is_picture(path):
+        return _read_picture(path, expected)
+    pattern = read_array(path, expected)
+    if pattern.dtype != np.uint8 or pattern.ndim != 3 or pattern.shape[2] != 3:
+        found = f"{pattern.dtype} values of shape {pattern.shape}"
+        raise InputError(f"{path} holds {found}; a pattern is a .npy file of uint8 (height, width, 3)")
     return pattern
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() == ".png"
+
+
+def _read_picture(path: Path, expected: str) -> NDArray[np.uint8]:
+    """Read a picture: (H, W, 3) uint8, red first."""
+    import cv2
+
+    picture = read_picture(path, f"is not {expected}: it is no picture that can be read", cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.geometry import normalised
+from photonpano.reading import read_arrays
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
 
@@ -60,7 +59,7 @@ def load_truth(path: Path) -> Truth:
     Raises:
         InputError: the file is missing, is no such archive, lacks an array, or holds something else under its name.
     """
-    arrays = _read_archive(path, "a truth, as `photonpano simulate` writes it,", ("homographies", "frame_shape"), ("scene",))
+    arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), ("scene",))
     scene = arrays.get("scene")
     if scene is not None and (scene.ndim != 2 or not scene.size):
         raise InputError(f"{path}: scene must be an image (height, width), got the shape {scene.shape}")
@@ -124,35 +123,18 @@ def _read_tiff(path: Path) -> FluxImage:
 
 def _read_archive(path: Path, content: str, required: tuple[str, ...], optional: tuple[str, ...]) -> Mapping[str, NDArray[Any]]:
     """Read named arrays; a pickle is never loaded."""
-    if not path.is_file():
-        raise InputError(f"{path} does not exist")
-    if not zipfile.is_zipfile(path):
-        raise InputError(f"{path} is not an .npz archive, or it is cut off")
-    with np.load(path, allow_pickle=False) as archive:
-        missing = [name for name in required if name not in archive]
-        if missing:
-            raise InputError(
-                f"{path} lacks {' and '.join(missing)}; {content} holds {', '.join((*required, *optional))}, "
-                f"and this file holds {', '.join(archive.files) or 'nothing'}"
-            )
-        names = (*required, *(name for name in optional if name in archive))
-        return {name: _read_array(path, archive, name) for name in names}
-
-
-def _read_array(path: Path, archive: Mapping[str, Any], name: str) -> NDArray[Any]:
-    try:
-        array = archive[name]
-    except ValueError as error:
-        if "allow_pickle" in str(error):
-            raise InputError(
-                f"{path}: {name} holds pickled Python objects, which are never loaded; save plain numbers"
-            ) from error
-        raise InputError(f"{path}: {name} is damaged: {error}") from error
-    except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: {name} is damaged: {error}") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-        raise InputError(f"{path}: {name} does not hold numbers")
-    return array
+    arrays = read_arrays(path, content)
+    missing = [name for name in required if name not in arrays]
+    if missing:
+        held = ", ".join(name or "an array without a name" for name in arrays) or "nothing"
+        raise InputError(
+            f"{path} lacks {' and '.join(missing)}; {content} holds {', '.join((*required, *optional))}, "
+            f"and this file holds {held}"
+        )
+    for name in (*required, *optional):
+        if name in arrays and arrays[name].dtype.kind not in "biuf":
+            raise InputError(f"{path}: {name} does not hold numbers")
+    return arrays
 
 
 def _homographies(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +11,11 @@ from numpy.typing import NDArray
 from photonpano.photometry import BinaryResponse
 from photonpano.reading.files import OpenFiles
 from photonpano.reading.packed_layout import FrameLayout
+from photonpano.source_wrapper import Closing
 from photonpano.values import Counts, FrameSpan, StreamInfo
 
 
-class BinarySource(ABC):
+class BinarySource(Closing, ABC):
     """Binary frames, eight pixels to a byte: a `photonpano.PackedSource`. A subclass says where the bytes come from.
 
     Attributes:
@@ -75,9 +74,3 @@ class BinarySource(ABC):
     def close(self) -> None:
         """Let go of the files."""
         self.files.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

@@ -1,25 +1,72 @@
-"""Files of a capture: which there are, and pieces of them read by any number of threads."""
+"""Files: which belong to a capture, errors of reading them in words, and pieces of them read by any number of threads."""
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from photonpano.errors import InputError
+from photonpano.errors import InputError, PhotonpanoError
 
 Model = TypeVar("Model", bound=BaseModel)
+P = ParamSpec("P")
 
 _MOST_OPEN = 16
-"""Files that are kept open; a capture may consist of hundreds, and a process is often allowed 1024."""
-
+"""Files that are kept open: a capture may consist of hundreds, and a process may often open 1024."""
 _TEXT_AND_NUMBER = re.compile("([^0-9]*)([0-9]*)")
+
+
+def missing_file(path: Path, kind: str = "file") -> str:
+    """Return the message that there is no such file, or no such "file or folder"."""
+    return f"there is no {kind} {path}; check the path"
+
+
+@contextmanager
+def reading(path: Path, otherwise: str | None = None) -> Iterator[None]:
+    """Turn what reading a file raises into an `InputError`.
+
+    Args:
+        path: the file.
+        otherwise: follows the path in the message for errors that do not come from the system, such as "is not a MATLAB file".
+            Parsers raise nearly anything for a damaged file. By default such errors pass.
+
+    Example:
+        ```python
+        with reading(path, "is not a picture; save it as PNG"):
+            return decode(path.read_bytes())
+        ```
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(missing_file(path)) from error
+    except MemoryError as error:
+        raise InputError(f"{path} needs more memory than there is: it is too large, or damaged") from error
+    except PhotonpanoError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.strerror:
+            raise InputError(f"cannot read {path}: {error.strerror}") from error
+        if otherwise is None:
+            raise
+        raise InputError(f"{path} {otherwise}") from error
+
+
+def objections(read: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> tuple[str, ...]:
+    """Call a function for the `check` of a source, and return the message of the `InputError` that it raises, if any."""
+    try:
+        read(*args, **kwargs)
+    except InputError as error:
+        return (str(error),)
+    return ()
 
 
 def files_in(path: Path, suffix: str) -> list[Path]:
@@ -37,7 +84,7 @@ def files_in(path: Path, suffix: str) -> list[Path]:
     if path.is_file():
         return [path]
     if not path.is_dir():
-        raise InputError(f"there is no file or folder {path}; check the path")
+        raise InputError(missing_file(path, "file or folder"))
     found = [
         file.relative_to(path)
         for file in path.rglob("*")
@@ -45,26 +92,24 @@ def files_in(path: Path, suffix: str) -> list[Path]:
     ]
     if not found:
         raise InputError(f"there is no {suffix} file in the folder {path}; check the path")
-    return [path / file for file in sorted(found, key=_natural)]
+    return [path / file for file in sorted(found, key=natural_order)]
 
 
-def _natural(path: Path) -> list[tuple[list[tuple[str, int]], str]]:
-    """Compare numbers as numbers, so that 10 comes after 2."""
+def natural_order(path: Path) -> list[tuple[list[tuple[str, int]], str]]:
+    """Return a key that sorts paths with their numbers as numbers, so that 10 comes after 2."""
     return [([(text, int(digits or 0)) for text, digits in _TEXT_AND_NUMBER.findall(part)], part) for part in path.parts]
 
 
 def read_json(path: Path, model: type[Model]) -> Model:
-    """Return what a JSON file says.
+    """Read a JSON file as a pydantic model.
 
     Raises:
-        InputError: it is missing, or does not fit the model.
+        InputError: the file is missing, or does not fit the model.
     """
+    with reading(path):
+        content = path.read_bytes()
     try:
-        return model.model_validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
+        return model.model_validate_json(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
@@ -72,7 +117,7 @@ def read_json(path: Path, model: type[Model]) -> Model:
 
 
 def read_start(path: Path, n_bytes: int) -> bytes:
-    """Return the first bytes of a file; none where it cannot be read."""
+    """Return the first bytes of a file; none if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(n_bytes)
@@ -81,18 +126,18 @@ def read_start(path: Path, n_bytes: int) -> bytes:
 
 
 class OpenFiles:
-    """Reads pieces of files from any thread. A file is opened when it is first read, and few are kept open."""
+    """Reads pieces of files from any thread. A file is opened when it is first read, and at most 16 stay open."""
 
     def __init__(self) -> None:
         self._opened = lru_cache(_MOST_OPEN)(_OpenFile)
 
     def read(self, path: Path, position: int, target: NDArray[np.uint8]) -> None:
-        """Fill a contiguous array with what a file holds from a position on.
+        """Fill a contiguous array with the bytes of a file from a position on.
 
         Raises:
-            InputError: it cannot be read, or has become shorter.
+            InputError: the file cannot be read, or has become shorter.
         """
-        try:
+        with reading(path):
             file = self._opened(path)
             left = target.reshape(-1).data
             while left:
@@ -100,16 +145,14 @@ class OpenFiles:
                 if not done:
                     raise InputError(f"{path} has become shorter while it was read; copy or record it again")
                 left, position = left[done:], position + done
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror}") from error
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self._opened.cache_clear()
 
 
 class _OpenFile:
-    """A file that is closed when nobody holds it: neither the few that are kept, nor a thread that reads it."""
+    """A file that is closed when neither the cache nor a thread that reads it refers to it."""
 
     def __init__(self, path: Path) -> None:
         self.descriptor = os.open(path, os.O_RDONLY)

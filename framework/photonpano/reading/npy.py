@@ -10,6 +10,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from photonpano.errors import InputError
+from photonpano.reading.files import reading
 
 
 class NpyHeader(NamedTuple):
@@ -39,15 +40,10 @@ def npy_header(path: Path) -> NpyHeader:
     Raises:
         InputError: it cannot be read, or is something else.
     """
-    try:
-        with path.open("rb") as file:
-            header = read_npy_header(file)
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{path} is a folder; name the .npy file in it") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name the .npy file in it")
+    with reading(path), path.open("rb") as file:
+        header = read_npy_header(file)
     if header is None:
         raise InputError(f"{path} is not a .npy file{_guess(path)}")
     return header

@@ -9,6 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from photonpano.contributions import SourceContribution
+from photonpano.reading import missing_file
 from photonpano.registry.auto import AUTO, AutoConfig, ask_sources
 from photonpano.registry.kinds import KINDS
 from photonpano.specs.checks import complaints
@@ -76,7 +77,7 @@ def found_source(keys: Value, catalog: Catalog, directory: Path, problems: list[
         return None
     path, place = config.path, own["path"].place
     if not path.exists():
-        problems.append(place.problem(f"there is no file or folder {path}; check the path"))
+        problems.append(place.problem(missing_file(path, "file or folder")))
         return None
     answers = ask_sources(catalog, path)
     if len(answers.recognised) != 1:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from photonpano.corrections import CORRECTIONS
+from photonpano.reading import missing_file
 from photonpano.specs.tree import Value, given, joined
 from photonpano.specs.validation import validate
 from photonpano.text import suggestion
@@ -86,5 +87,5 @@ def _resolved(item: Value, directory: Path, problems: list[Problem]) -> Correcti
     for key, file in correction or ():
         if isinstance(file, Path) and not file.exists():
             place = settings.content[key].place if isinstance(settings.content, dict) else at
-            problems.append(place.problem(f"there is no file {file}; check the path"))
+            problems.append(place.problem(missing_file(file)))
     return correction

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import TracebackType
 from typing import TypeVar
 
 import numpy as np
@@ -11,13 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from photonpano.photometry import BinaryResponse
 from photonpano.protocols import Trajectory
+from photonpano.source_wrapper import Closing
 from photonpano.testing.scenes import Scene
 from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Group, Homography, StreamInfo, VirtualExposure
 
 Number = TypeVar("Number", bound=np.generic)
 
 
-class MemorySource:
+class MemorySource(Closing):
     """Binary frames held in memory: a `photonpano.Source`."""
 
     def __init__(self, frames: ArrayLike, valid: BoolArray | None = None) -> None:
@@ -37,15 +37,6 @@ class MemorySource:
         """Return the frames of a span: (n, H, W) of zeros and ones."""
         self.info.require(span)
         return self._frames[span.start : span.stop].copy()
-
-    def close(self) -> None:
-        """Do nothing: there is no file to let go of."""
-
-    def __enter__(self) -> MemorySource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 class ReadOnlySource(MemorySource):

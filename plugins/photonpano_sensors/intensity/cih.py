@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from photonpano import InputError
+from photonpano.reading import reading
 from photonpano_sensors.intensity.levels import Encoding
 
 _MOST_BYTES = 4 * 1024**2
@@ -62,13 +63,8 @@ def read_header(path: Path) -> Header:
     Raises:
         InputError: it is missing, is something else, or tells of frames that cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    with reading(path), path.open("rb") as file:
+        content = file.read(_MOST_BYTES + 1)
     if len(content) > _MOST_BYTES:
         raise InputError(f"{path} is too large for a header of a Photron camera")
     return _header(path, _of_xml(path, content) if path.suffix.lower() == ".cihx" else _of_text(content))

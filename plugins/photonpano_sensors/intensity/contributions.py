@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from photonpano import Requirement, SourceContribution
-from photonpano.reading import objections
+from photonpano.reading import missing_file, objections
 from photonpano_sensors.intensity.configs import FastcamMrawConfig, ImageFolderConfig, VideoConfig
 from photonpano_sensors.intensity.recognition import (
     PICTURES,
@@ -32,7 +32,7 @@ def _check_video(config: VideoConfig) -> Sequence[str]:
     """Look at the file's name alone: to index its packets takes as long as to read it."""
     if found := objections(refuse_mdat, config.path):
         return found
-    return () if is_file(config.path) else (f"there is no file {config.path}; check the path",)
+    return () if is_file(config.path) else (missing_file(config.path),)
 
 
 def _build_mraw(config: FastcamMrawConfig, context: SourceContext) -> Source:

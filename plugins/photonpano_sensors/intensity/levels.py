@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.photometry import IntensityResponse, srgb_to_linear
+from photonpano.reading import reading
 from photonpano_sensors.intensity.configs import ResponseConfig
 
 _MOST = 2**16 - 1
@@ -97,15 +98,8 @@ def _light(config: ResponseConfig, encoded: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _measured(path: Path, n_levels: int) -> NDArray[np.float64]:
-    try:
-        text = path.read_text(encoding="utf-8")
-        light = np.array([float(word) for word in text.split()])
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"{path} is not a text file of numbers, one for each level") from error
+    with reading(path, "is not a text file of numbers, one for each level"):
+        light = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
     if len(light) != n_levels:
         raise InputError(f"{path} holds {len(light)} numbers; the levels of the capture are {n_levels}")
     if not (np.all(np.isfinite(light)) and np.all(np.diff(light) >= 0)):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from photonpano import FrameSpan, InputError
-from photonpano.reading import OpenFiles
+from photonpano.reading import OpenFiles, missing_file
 from photonpano_sensors.intensity.cih import Header, read_header
 from photonpano_sensors.intensity.configs import FastcamMrawConfig
 from photonpano_sensors.intensity.recognition import header_beside, mraw_beside, refuse_mdat
@@ -54,7 +54,7 @@ def open_recording(path: Path) -> tuple[Path, Header]:
     """
     refuse_mdat(path)
     if not path.exists():
-        raise InputError(f"there is no file {path}; check the path")
+        raise InputError(missing_file(path))
     suffix = path.suffix.lower()
     if suffix == ".mraw":
         header_path = header_beside(path)

@@ -14,6 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
+from photonpano.reading import missing_file, read_picture, reading
 from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import pictures_in
@@ -94,12 +95,7 @@ class _Folder:
 
     def read(self, index: int) -> Image:
         file = self._files[index]
-        try:
-            levels = cv2.imdecode(np.frombuffer(_content(file), np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            levels = None
-        if levels is None:
-            raise InputError(f"{file} is damaged: frame {index} cannot be read; copy it again")
+        levels = read_picture(file, f"is damaged: frame {index} cannot be read; copy it again", cv2.IMREAD_UNCHANGED)
         if levels.shape != self.form[:2] or 8 * levels.itemsize != self.form.bits:
             raise InputError(f"{file} has changed: it had {self.form} when the capture was opened")
         return levels
@@ -162,7 +158,8 @@ def _form_of(file: Path) -> _Form:
                 return _form_of_page(file, tiff.pages[0])
             except _DAMAGED as error:
                 raise InputError(f"{file} is damaged: {error}; copy it again") from error
-    header = _content(file, 26)
+    with reading(file), file.open("rb") as opened:
+        header = opened.read(26)
     if len(header) < 26 or not header.startswith(_PNG):
         raise InputError(f"{file} is not a PNG file, by its first bytes; remove it, or save it again")
     width, height, bits, colours = struct.unpack(">IIBB", header[16:])
@@ -188,14 +185,6 @@ def _tiff(path: Path) -> tifffile.TiffFile:
     try:
         return tifffile.TiffFile(path)
     except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
+        raise InputError(missing_file(path)) from error
     except _DAMAGED as error:
         raise InputError(f"{path} is neither a folder nor a TIFF file that can be read: {error}") from error
-
-
-def _content(file: Path, size: int = -1) -> bytes:
-    try:
-        with file.open("rb") as opened:
-            return opened.read(size)
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror}") from error

@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 from photonpano import InputError, Recognised
+from photonpano.reading import natural_order, read_start
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,13 +17,13 @@ _CONTAINERS = (
     ("an MP4 or MOV file", re.compile(rb"....(ftyp|moov|mdat|wide|free)", re.DOTALL)),
     ("a Matroska or WebM file", re.compile(rb"\x1a\x45\xdf\xa3")),
 )
+_START_BYTES = 16
 _TIFF = re.compile(rb"II[\x2a\x2b]\0|MM\0[\x2a\x2b]")
-_DIGITS = re.compile(r"(\d+)")
 
 
 def recognise_video(path: Path) -> Recognised | None:
     """Take files that begin as videos do."""
-    start = _start_of(path)
+    start = read_start(path, _START_BYTES)
     for name, pattern in _CONTAINERS:
         if pattern.match(start):
             return Recognised({"path": path}, f"by its first bytes it is {name}")
@@ -45,7 +46,7 @@ def recognise_mraw(path: Path) -> Recognised | None:
 
 def recognise_pictures(path: Path) -> Recognised | None:
     """Take folders of pictures, and TIFF files."""
-    if _TIFF.match(_start_of(path)):
+    if _TIFF.match(read_start(path, _START_BYTES)):
         return Recognised({"path": path}, "by its first bytes it is a TIFF file")
     found = pictures_in(path)
     if not found:
@@ -83,13 +84,7 @@ def pictures_in(folder: Path) -> list[Path]:
         pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURES]
     except OSError:
         return []
-    return sorted(pictures, key=lambda file: natural(file.name))
-
-
-def natural(name: str) -> list[int | str]:
-    """Return a key that sorts names with numbers as people do: 2 before 10."""
-    # Every other part is a number, so that numbers are compared with numbers.
-    return [int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(name))]
+    return sorted(pictures, key=natural_order)
 
 
 def _beside(path: Path, suffix: str) -> Path | None:
@@ -103,12 +98,3 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:
         return False
-
-
-def _start_of(path: Path) -> bytes:
-    """Return the first bytes of a file; nothing of what cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(16)
-    except OSError:
-        return b""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, StreamInfo
+from photonpano.reading import Closing
 from photonpano_sensors.intensity.configs import IntensityConfig
 from photonpano_sensors.intensity.levels import Encoding, linear_levels
 from photonpano_sensors.intensity.summing import Levels, add_levels, add_linear
@@ -19,7 +18,7 @@ _PART_BYTES = 4 * 1024**2
 _MOST_COUNT = 2**32 - 1
 
 
-class IntensitySource(ABC):
+class IntensitySource(Closing, ABC):
     """Grey levels that are linear in flux: a `photonpano.Source`.
 
     A pixel that saturates counts with the saturation level, so that its flux is the least that it was: a sum does not tell in
@@ -83,18 +82,8 @@ class IntensitySource(ABC):
                 add_linear(flat, self._table, counts.reshape(-1))
         return counts
 
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of files."""
-
     def _levels_of(self, span: FrameSpan) -> Levels:
         shape = len(span), *self.info.frame_shape
         levels: Levels = np.empty(shape, np.uint8) if self._one_byte else np.empty(shape, np.uint16)
         self._read(span, levels)
         return levels
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

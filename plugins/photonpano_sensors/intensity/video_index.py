@@ -15,6 +15,7 @@ from av.video.format import VideoFormat
 from numpy.typing import NDArray
 
 from photonpano import InputError
+from photonpano.reading import missing_file
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import refuse_mdat
 
@@ -125,7 +126,7 @@ def open_video(path: Path) -> InputContainer:
     try:
         container = av.open(str(path), metadata_errors="replace")
     except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; check the path") from error
+        raise InputError(missing_file(path)) from error
     except IsADirectoryError as error:
         raise InputError(f"{path} is a folder; name the video in it, or read pictures with the source image-folder") from error
     except (av.FFmpegError, OSError) as error:

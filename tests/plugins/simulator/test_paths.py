@@ -189,7 +189,10 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
         "number": (np.tile(np.eye(3), (7, 1, 1)), "{path} holds 7 homographies for 5 frames; set n_frames to 7"),
         "shape": (np.zeros((5, 2, 3)), "{path} holds float64 of shape (5, 2, 3); homographies are (n_frames, 3, 3)"),
         "zeros": (np.zeros((5, 3, 3)), "{path} holds homographies that are not finite, or whose h33 is 0"),
-        "objects": (np.full((5, 3, 3), None), "{path} is not a .npy or .npz file of plain numbers"),
+        "objects": (
+            np.full((5, 3, 3), None),
+            "{path} is not a file of homographies: it is no .npy or .npz file of plain numbers",
+        ),
     }
     for name, (array, message) in cases.items():
         path = saved(tmp_path / f"{name}.npy", array)

@@ -82,7 +82,7 @@ def test_files_of_rates_and_hot_pixels_are_added(tmp_path: Path) -> None:
         ("dark_rates", np.full(SHAPE, -1.0), "{path} holds rates that are negative or not finite"),
         ("dark_rates", np.full(SHAPE, np.nan), "{path} holds rates that are negative or not finite"),
         ("hot_pixels", np.zeros(SHAPE), "{path} holds float64 of shape (60, 81); a mask is bool of the frame's shape (60, 81)"),
-        ("hot_pixels", np.array([{}]), "{path} is not a .npy or .npz file of plain numbers"),
+        ("hot_pixels", np.array([{}]), "{path} is not a mask: it is no .npy or .npz file of plain numbers"),
         ("hot_pixels", None, "there is no file {path}; check the path"),
     ],
 )

@@ -59,7 +59,7 @@ def test_a_file_that_is_gone_is_named(source: PackedFileSource, tmp_path: Path) 
     source.counts(FrameSpan(0, 14))
     with pytest.raises(InputError) as caught:
         source.counts(FrameSpan(13, 16))
-    assert str(caught.value) == f"cannot read {tmp_path / '7.bin'}: No such file or directory"
+    assert str(caught.value) == f"there is no file {tmp_path / '7.bin'}; check the path"
 
 
 class Size(BaseModel):
