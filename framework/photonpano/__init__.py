@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING
 from photonpano.lazy import imported_on_use
 
 if TYPE_CHECKING:
-    from photonpano.api import evaluate
+    from photonpano.api.capture_info import CaptureInfo, info
+    from photonpano.api.captures import (
+        DarkMeasurement,
+        Preview,
+        WrittenCapture,
+        capture_plan,
+        convert,
+        dark,
+        preview,
+        simulate,
+    )
+    from photonpano.api.explanation import explain, forecast
+    from photonpano.api.runs import evaluate, warm_up
     from photonpano.contributions import (
         Config,
         InterpolatorContribution,
@@ -36,6 +48,7 @@ if TYPE_CHECKING:
     )
     from photonpano.hookspecs import hookimpl
     from photonpano.pipeline.components import open_source
+    from photonpano.pipeline.forecast import Forecast
     from photonpano.pipeline.run import RunResult, run
     from photonpano.protocols import (
         Interpolator,
@@ -73,13 +86,16 @@ __version__ = "0.1.0"
 __all__ = [
     "BoolArray",
     "CanvasTooLargeError",
+    "CaptureInfo",
     "CaptureSummary",
     "CaptureUnreadError",
     "Catalog",
     "Config",
     "Counts",
+    "DarkMeasurement",
     "FloatArray",
     "FluxImage",
+    "Forecast",
     "FrameSpan",
     "Frames",
     "Group",
@@ -102,6 +118,7 @@ __all__ = [
     "PhotonpanoError",
     "Plan",
     "PluginError",
+    "Preview",
     "Recognised",
     "Requirement",
     "Resampler",
@@ -117,15 +134,26 @@ __all__ = [
     "StreamInfo",
     "Trajectory",
     "VirtualExposure",
+    "WrittenCapture",
+    "capture_plan",
+    "convert",
+    "dark",
     "discover",
     "evaluate",
+    "explain",
+    "forecast",
     "hookimpl",
+    "info",
     "load_spec",
     "open_source",
     "parse_spec",
+    "preview",
     "run",
+    "simulate",
+    "warm_up",
 ]
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
-    _HOMES = ("errors", "values", "protocols", "contributions", "hookspecs", "api", "registry", "specs", "pipeline.components")
-    __getattr__, __dir__ = imported_on_use(__name__, __all__, (*_HOMES, "pipeline.run"))
+    _LIGHT = ("errors", "values", "protocols", "contributions", "hookspecs", "registry", "specs")
+    _HEAVY = ("pipeline.components", "pipeline.run", "api.captures", "api.capture_info", "api.explanation", "api.runs")
+    __getattr__, __dir__ = imported_on_use(__name__, __all__, (*_LIGHT, *_HEAVY))

@@ -59,7 +59,7 @@ class AutoResampler:
             size, reason = choose_group_size(capture, n_frames, min(stream.frame_shape), shortest_of(stream))
             self._doubled = self._densifies and capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
             if self._doubled:
-                reason += f"; from level {_KNOWN_FROM} on, where the motion is known, they are twice as long for more light"
+                reason += f"; from level {_KNOWN_FROM} on, where the motion is known, groups are twice as long for more light"
             self._context.decide("group_size", size, reason)
             self._size = size
         # Groups twice as long, as dense as they would be at this level.
@@ -81,15 +81,15 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
     photons = max(capture.flux, _LEAST)
     wanted, light = allowed, ""
     if allowed * photons < _DARK:
-        wanted, light = min(_DARK / photons, _DARK_BLUR * allowed), ", for which more blur is allowed in the dark"
+        wanted, light = min(_DARK / photons, _DARK_BLUR * allowed), ", so few that more blur is allowed"
     elif allowed * photons > _PLENTY:
-        wanted, light = max(_PLENTY / photons, allowed * _SHARP / _BLUR), ", so that less blur is worth more than more light"
+        wanted, light = max(_PLENTY / photons, allowed * _SHARP / _BLUR), ", enough to shorten groups for less blur"
     size, bound = _bounded(wanted, n_frames, shortest)
     blur_px = size * capture.speed_px
     return size, (
-        f"at {capture.speed_px:.2g} px a frame ({capture.how}) they are blurred by {blur_px:.3g} px, "
-        f"{blur_px / shorter_side_px:.2g} of the shorter side of a frame, and at a flux of {capture.flux:.2g} they hold "
-        f"{size * capture.flux:.3g} photons a pixel{light if size != shortest else ''}{bound}"
+        f"at {capture.speed_px:.2g} px per frame ({capture.how}) groups of {size} frame{'s' * (size > 1)} are blurred by "
+        f"{blur_px:.3g} px, {blur_px / shorter_side_px:.2g} of the shorter side of a frame, and at a flux of "
+        f"{capture.flux:.2g} hold {size * capture.flux:.3g} photons per pixel{light if size != shortest else ''}{bound}"
     )
 
 
@@ -97,7 +97,7 @@ def _bounded(wanted: float, n_frames: int, shortest: int) -> tuple[int, str]:
     """Return the nearest size that suits the capture, and what to say if it is not the one that was wanted."""
     most = max(shortest, n_frames // _GROUPS)
     if wanted > most:
-        return most, f"; longer ones would be fewer than {_GROUPS}"
+        return most, f"; of longer groups there would be fewer than {_GROUPS}"
     if wanted < shortest:
-        return shortest, "; shorter ones would tell nothing" if shortest > 1 else ""
+        return shortest, "; shorter groups would be mostly noise" if shortest > 1 else ""
     return round(wanted), ""

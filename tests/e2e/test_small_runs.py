@@ -13,7 +13,6 @@ import pytest
 import tifffile
 
 import photonpano
-from photonpano import api
 from photonpano.captures.writing import truth_path
 from photonpano.evaluation import Evaluation, corner_errors
 from photonpano.geometry import rescaling, translation
@@ -77,7 +76,7 @@ def three_levels(small_run: RunResult) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scored(small_run: RunResult, small_capture: Path) -> Evaluation:
-    return api.evaluate(small_run.directory, truth_path(small_capture))
+    return photonpano.evaluate(small_run.directory, truth_path(small_capture))
 
 
 def test_three_levels_find_the_motion(scored: Evaluation, three_levels: np.ndarray, error_px: Callable) -> None:

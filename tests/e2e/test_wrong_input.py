@@ -176,7 +176,7 @@ def pattern(golden: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_it_says_what_is_wrong_and_leaves_nothing(tmp_path: Path, case: Case) -> None:
+def test_wrong_input_exits_with_message_and_leaves_nothing(tmp_path: Path, case: Case) -> None:
     case.arrange(tmp_path)
     (tmp_path / "spec.yaml").write_text(SPEC.replace(*case.change) if case.change[0] else SPEC)
     before = sorted(tmp_path.rglob("*"))
@@ -186,7 +186,7 @@ def test_it_says_what_is_wrong_and_leaves_nothing(tmp_path: Path, case: Case) ->
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_width_that_is_no_multiple_of_eight_is_no_problem(simulated: Callable[..., Path], tmp_path: Path) -> None:
+def test_run_accepts_width_not_multiple_of_eight(simulated: Callable[..., Path], tmp_path: Path) -> None:
     capture = simulated(n_frames=80, frame_shape=[128, 157], path={"kind": "pan", "length_px": 15})
     spec = SPEC.replace("path: cube.npy", f"path: {capture}, width: 157").replace("size: 10", "size: 40") + "levels: 1\n"
     (tmp_path / "spec.yaml").write_text(spec)
@@ -201,7 +201,7 @@ def limit_files() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
 
 
-def test_a_full_disk_half_way_leaves_the_earlier_run(simulated: Callable[..., Path], tmp_path: Path) -> None:
+def test_full_disk_keeps_earlier_run(simulated: Callable[..., Path], tmp_path: Path) -> None:
     capture = simulated(n_frames=80, path={"kind": "pan", "length_px": 15})
     (tmp_path / "spec.yaml").write_text(SPEC.replace("cube.npy", str(capture)).replace("size: 10", "size: 40") + "levels: 1\n")
     folder = tmp_path / "runs" / "spec"

@@ -10,10 +10,10 @@ import photonpano
 from photonpano.cli.check import check
 from photonpano.cli.convert import convert
 from photonpano.cli.dark import dark
+from photonpano.cli.errors import reported
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
 from photonpano.cli.info import info
-from photonpano.cli.outcome import reported
 from photonpano.cli.plugins import plugins
 from photonpano.cli.preview import preview
 from photonpano.cli.run import run

@@ -2,26 +2,25 @@
 
 import typer
 
-from photonpano.cli.arguments import Overrides, Spec
+from photonpano.cli.options import Overrides, SpecPath
 
 
-def check(spec: Spec, overrides: Overrides = None) -> None:
-    """Find everything that is wrong with a spec, without running it.
+def check(spec: SpecPath, overrides: Overrides = None) -> None:
+    """Check a spec without running it.
 
-    Prints each problem with its file, line and column, and ends with exit code 2 if there are any. Opens the capture, so
-    that the stages are checked against its size, and reads none of its frames: what depends on them is left open.
+    Prints every problem with its file, line and column, and exits with 2 if there is one. Opens the capture to check the
+    stages against its size, but reads no frames: what depends on the frames stays open.
 
     Example: photonpano check scan.yaml
     """
-    from photonpano.cli.wording import capture_words
+    from photonpano.cli.options import spec_plan
     from photonpano.pipeline.components import foreseen_groups, open_source
-    from photonpano.specs import load_spec
 
-    plan = load_spec(spec, overrides or ())
+    plan = spec_plan(spec, overrides)
     with open_source(plan) as source:
         count = len(plan.levels)
         levels = f"{'up to ' if plan.until_converged else ''}{count} level{'' if count == 1 else 's'}"
-        typer.echo(f"{spec}: ok, {levels} on {plan.source.contribution.name}: {capture_words(source.info)}")
+        typer.echo(f"{spec}: ok, {levels} on {plan.source.contribution.name}: {source.info}")
         for decision in plan.decisions:
             typer.echo(f"{decision.what} is {decision.value}: {decision.reason}")
         for reason in dict.fromkeys(groups for groups in foreseen_groups(plan, source) if isinstance(groups, str)):

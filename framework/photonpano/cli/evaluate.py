@@ -29,9 +29,9 @@ def evaluate(
     """
     import json
 
-    from photonpano.api import evaluate as evaluate_run
+    from photonpano.api.runs import evaluate as evaluate_run
     from photonpano.cli.progress import progress_for_stderr
-    from photonpano.cli.wording import columns
+    from photonpano.cli.tables import columns
 
     evaluation = evaluate_run(run, truth, oracle, progress_for_stderr())
     typer.echo(json.dumps(_data(evaluation), indent=2) if as_json else columns(_rows(evaluation)))

@@ -38,7 +38,7 @@ def list_plugins(
 
     Example: photonpano plugins list --kind locator
     """
-    from photonpano.cli.wording import columns
+    from photonpano.cli.tables import columns
     from photonpano.registry import discover
 
     catalog = discover()
@@ -143,7 +143,7 @@ def _details(entry: "Entry") -> dict[str, Any]:
 
 
 def _page(entry: "Entry") -> str:
-    from photonpano.cli.wording import columns
+    from photonpano.cli.tables import columns
     from photonpano.registry import describe
 
     description = describe(entry.contribution)

@@ -1,15 +1,11 @@
 """photonpano preview."""
 
-from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from photonpano.cli.capture import CapturePath, Corrections, Keys, SourceName
-
-if TYPE_CHECKING:
-    from photonpano.captures.picture_files import Picture
+from photonpano.cli.options import CapturePath, Corrections, Keys, SourceName
 
 
 def preview(
@@ -48,32 +44,27 @@ def preview(
 ) -> None:
     """Merge frames into pictures, to look at a capture.
 
-    Frames are summed where they lie, since no motion is known. White is the same flux in all pictures, so that brightness can
-    be compared.
+    The motion is not known yet, so frames are summed as they are. White is the same flux in all pictures, so that their
+    brightness can be compared.
 
     Example: photonpano preview cube.npy --output look.mp4 --group-size 500
     """
-    from photonpano.captures.picture_files import require_writable, write_pictures
-    from photonpano.captures.preview import Look, pictures, preview_spans, white_flux
-    from photonpano.cli.capture import opened
+    from photonpano.api.captures import preview as preview_capture
+    from photonpano.cli.options import capture_plan
     from photonpano.cli.progress import progress_for_stderr
-    from photonpano.cli.wording import capture_words
-    from photonpano.threads import one_thread_inside, thread_count
 
-    with opened(path, source, keys, corrections) as (plan, capture), one_thread_inside():
-        threads = thread_count(plan.run.threads)
-        spans = preview_spans(capture.info, group_size, step or group_size)
-        require_writable(output, len(spans))
-        look = Look(white_flux(capture, spans, quantile, threads) if white is None else white, srgb, label)
-        digits = len(str(capture.info.n_frames))
-        names = [f"frame_{span.start:0{digits}}" for span in spans]
-        with progress_for_stderr().stage(f"writing {output.name}", len(spans), "pictures") as advance:
-            write_pictures(output, _counted(pictures(capture, spans, look, threads), advance), names, fps)
-    typer.echo(f"{output}: {len(spans):,} pictures of {capture_words(capture.info)}, {len(spans[0])} frames each")
-    typer.echo(f"white is {look.white_flux:.4g} photons per pixel per frame")
-
-
-def _counted(pictures: "Iterable[Picture]", advance: Callable[[int], None]) -> "Iterator[Picture]":
-    for picture in pictures:
-        yield picture
-        advance(1)
+    with capture_plan(path, source, keys, corrections) as plan:
+        made = preview_capture(
+            plan,
+            output,
+            group_size,
+            step,
+            quantile=quantile,
+            white=white,
+            srgb=srgb,
+            label=label,
+            fps=fps,
+            progress=progress_for_stderr(),
+        )
+    typer.echo(f"{output}: {made.n_pictures:,} pictures of {made.info}, {made.group_size} frames each")
+    typer.echo(f"white is {made.white_flux:.4g} photons per pixel per frame")

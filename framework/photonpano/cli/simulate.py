@@ -5,36 +5,24 @@ from typing import Annotated
 
 import typer
 
-from photonpano.cli.arguments import Overrides, Spec
+from photonpano.cli.options import Overrides, SpecPath
 
 
 def simulate(
-    spec: Spec,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="CUBE.npy", help="The capture to write.", show_default=False)
-    ],
+    spec: SpecPath,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="CUBE.npy", help="The file to write.", show_default=False)],
     overrides: Overrides = None,
 ) -> None:
-    """Write a simulated capture to a .npy file, with its truth.
+    """Write a simulated capture to a packed .npy file, with its truth.
 
-    The frames are packed, eight pixels to a byte; the truth, motion and scene, is stored beside them for 'evaluate'.
-
-    The spec needs no more than 'version' and 'source'. Any source of binary frames can be written, a simulated one or a
-    recording; only those that know their truth have one.
+    The truth (motion and scene) is written beside it, for 'evaluate'. The spec needs only 'version' and 'source'. The source
+    may be any that gives binary frames; a recording has no truth.
 
     Example: photonpano simulate capture.yaml --output cube.npy
     """
-    from photonpano.captures.writing import write_packed
+    from photonpano.api.captures import simulate as write_simulated
+    from photonpano.cli.options import spec_plan
     from photonpano.cli.progress import progress_for_stderr
-    from photonpano.cli.written import tell_written
-    from photonpano.pipeline.components import build_source
-    from photonpano.specs import load_spec
-    from photonpano.threads import thread_count
+    from photonpano.cli.tables import print_written
 
-    plan = load_spec(spec, overrides or ())
-    with build_source(plan) as source:
-        info = source.info
-        with progress_for_stderr().stage(f"writing {output.name}", info.n_frames, "frames") as advance:
-            files = write_packed(source, output, advance, thread_count(plan.run.threads))
-        unused = int((~source.valid).sum())
-    tell_written(files, info, unused)
+    print_written(write_simulated(spec_plan(spec, overrides), output, progress_for_stderr()))

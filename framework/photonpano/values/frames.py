@@ -87,6 +87,11 @@ class StreamInfo:
     kind: Literal["binary", "intensity"] = "binary"
     bit_depth: int = 1
 
+    def __str__(self) -> str:
+        kind = "binary" if self.kind == "binary" else f"{self.bit_depth}-bit"
+        rate = "" if self.frame_rate_hz is None else f" at {self.frame_rate_hz:,.15g} Hz"
+        return f"{self.n_frames:,} {kind} frames of {self.height}x{self.width}{rate}"
+
     @property
     def frame_shape(self) -> tuple[int, int]:
         """(height, width)."""

@@ -27,15 +27,15 @@ def built(stream: StreamInfo, name: str = "midpoint", **context: Any) -> Any:
 def test_in_the_light_motion_blur_decides() -> None:
     assert choice(0.5, 0.15) == (
         254,
-        f"at 0.15 px a frame ({HOW}) they are blurred by 38.1 px, 0.15 of the shorter side of a frame, and at a flux of 0.5 "
-        "they hold 127 photons a pixel",
+        f"at 0.15 px per frame ({HOW}) groups of 254 frames are blurred by 38.1 px, 0.15 of the shorter side of a frame, "
+        "and at a flux of 0.5 hold 127 photons per pixel",
     )
 
 
 def test_in_the_dark_up_to_twice_the_blur_is_allowed() -> None:
     size, reason = choice(0.02, 0.3)
     assert size == 150
-    assert reason.endswith("hold 3 photons a pixel, for which more blur is allowed in the dark")
+    assert reason.endswith("hold 3 photons per pixel, so few that more blur is allowed")
     assert choice(0.001, 0.3)[0] == 254
 
 
@@ -43,15 +43,15 @@ def test_a_slow_capture_has_eight_groups() -> None:
     for speed_px in (0.0, 0.001):
         size, reason = choice(0.5, speed_px)
         assert size == 1250
-        assert reason.endswith("; longer ones would be fewer than 8")
+        assert reason.endswith("; of longer groups there would be fewer than 8")
 
 
 def test_fast_motion_leaves_sixteen_frames() -> None:
     size, reason = choice(0.5, 10.0)
     assert size == 16
     assert reason.endswith(
-        "they are blurred by 160 px, 0.63 of the shorter side of a frame, and at a flux of 0.5 they hold 8 "
-        "photons a pixel; shorter ones would tell nothing"
+        "groups of 16 frames are blurred by 160 px, 0.63 of the shorter side of a frame, and at a flux of 0.5 hold 8 "
+        "photons per pixel; shorter groups would be mostly noise"
     )
 
 
@@ -60,8 +60,8 @@ def test_grey_frames_may_stand_alone() -> None:
     assert choice(20, 10.0, shortest=1)[0] == 4
     assert choice(2000, 100.0, shortest=1) == (
         1,
-        f"at 1e+02 px a frame ({HOW}) they are blurred by 100 px, 0.39 of the shorter side of a frame, and at a flux of 2e+03 "
-        "they hold 2e+03 photons a pixel",
+        f"at 1e+02 px per frame ({HOW}) groups of 1 frame are blurred by 100 px, 0.39 of the shorter side of a frame, "
+        "and at a flux of 2e+03 hold 2e+03 photons per pixel",
     )
     resampler = built(StreamInfo(80, 254, 496, None, "intensity", 8), capture=lambda: CaptureSummary(2000, 38.0, HOW))
     assert {len(group.span) for group in resampler.groups(80, 1)} == {1}
@@ -70,7 +70,7 @@ def test_grey_frames_may_stand_alone() -> None:
 def test_plenty_of_light_makes_groups_sharp() -> None:
     size, reason = choice(2000, 0.5, shortest=1)
     assert size == 20  # 0.04 of 254 px
-    assert reason.endswith("they hold 4e+04 photons a pixel, so that less blur is worth more than more light")
+    assert reason.endswith("hold 4e+04 photons per pixel, enough to shorten groups for less blur")
     assert choice(25, 0.5, shortest=1)[0] == 40  # 1000 photons
     assert choice(0.5, 0.05)[0] == 762  # which are too few
 
@@ -80,7 +80,7 @@ def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None
     assert choice(0.01, None, how=how) == (500, f"{how}, so 500 frames are assumed")
     assert choice(0.01, None, 2000, how) == (
         250,
-        f"{how}, so 500 frames are assumed; longer ones would be fewer than 8",
+        f"{how}, so 500 frames are assumed; of longer groups there would be fewer than 8",
     )
 
 
@@ -125,7 +125,7 @@ def test_groups_of_a_dim_capture_are_doubled_once_the_motion_is_known() -> None:
     # As dense as the short ones would be.
     assert resampler.groups(2000, 3) == long.groups(2000, 4)
     assert decided[0][:2] == ("group_size", 100)
-    assert decided[0][2].endswith("; from level 3 on, where the motion is known, they are twice as long for more light")
+    assert decided[0][2].endswith("; from level 3 on, where the motion is known, groups are twice as long for more light")
 
 
 @pytest.mark.parametrize("name", ["constant-groups", "sliding-window"])

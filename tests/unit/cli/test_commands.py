@@ -19,14 +19,14 @@ from photonpano.registry.plugins import observation_of
 from photonpano.specs import load_spec, parse_spec
 
 
-def test_simulate_writes_a_capture_and_says_how_to_use_it(finished: Path) -> None:
+def test_simulate_prints_files_and_spec_section(finished: Path) -> None:
     assert (finished / "simulate.err").read_text() == ""
     size = (finished / "cube.truth.npz").stat().st_size
     assert (finished / "simulate.out").read_text() == (
         "cube.npy        384.1 kB  200 binary frames of 96x160 at 96,800 Hz\n"
         f"cube.truth.npz  {size / 1000:.1f} kB  the truth: motion and scene\n"
         "\n"
-        "In a spec that lies here:\n"
+        "In a spec in this folder:\n"
         "\n"
         "source: {use: packed-npy, with: {path: cube.npy, frame_rate_hz: 96800}}\n"
         "\n"
@@ -34,19 +34,19 @@ def test_simulate_writes_a_capture_and_says_how_to_use_it(finished: Path) -> Non
     )
 
 
-def test_what_simulate_says_is_a_spec(finished: Path) -> None:
+def test_simulate_prints_valid_spec_section(finished: Path) -> None:
     line = next(line for line in (finished / "simulate.out").read_text().splitlines() if line.startswith("source:"))
     plan = parse_spec(f"version: 1\n{line}\n", directory=finished)
     assert plan.source.contribution.name == "packed-npy"
 
 
-def test_simulate_names_the_width_where_bytes_do_not_tell(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_simulate_prints_width_unless_multiple_of_eight(folder: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("simulate", "capture.yaml", "-o", "odd.npy", "--set", "source.with.frame_shape=[20, 43]")
     assert "source: {use: packed-npy, with: {path: odd.npy, frame_rate_hz: 96800, width: 43}}" in result.stdout
     assert np.load(folder / "odd.npy").shape == (200, 20, 6)
 
 
-def test_simulate_warns_of_pixels_that_the_file_cannot_mark(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_simulate_warns_of_masked_pixels(folder: Path, invoke: Callable[..., Any]) -> None:
     sensor = "source.with.sensor={hot_fraction: 0.01, mask_hot_pixels: true}"
     result = invoke("simulate", "capture.yaml", "-o", "hot.npy", "--set", sensor, "--set", "source.with.n_frames=5")
     assert result.exit_code == 0
@@ -54,11 +54,11 @@ def test_simulate_warns_of_pixels_that_the_file_cannot_mark(folder: Path, invoke
         hot = int(truth["hot_pixels"].sum())
     assert hot > 0
     assert result.stderr == (
-        f"warning: {hot} pixels are not to be used, which hot.npy does not say; mask them with `corrections`\n"
+        f"warning: {hot} pixels of the capture are masked, and hot.npy holds no mask; mask them with `corrections`\n"
     )
 
 
-def test_run_ends_with_where_to_look_and_is_quiet_in_pipes(finished: Path) -> None:
+def test_run_prints_only_result_paths_and_warnings_into_pipe(finished: Path) -> None:
     assert (finished / "run.out").read_text() == (
         f"panorama  {finished}/run/panorama.png\nreport    {finished}/run/report.html\n"
     )
@@ -66,7 +66,7 @@ def test_run_ends_with_where_to_look_and_is_quiet_in_pipes(finished: Path) -> No
     assert (finished / "run.err").read_text() == "".join(f"warning: {warning}\n" for warning in warnings)
 
 
-def test_evaluate(finished: Path, invoke: Callable[..., Any]) -> None:
+def test_evaluate_table_agrees_with_json(finished: Path, invoke: Callable[..., Any]) -> None:
     arguments = ["evaluate", finished / "run", "--truth", finished / "cube.truth.npz"]
     table = invoke(*arguments)
     assert table.exit_code == 0, table.stderr
@@ -88,25 +88,25 @@ def test_evaluate(finished: Path, invoke: Callable[..., Any]) -> None:
     assert scores["corner_error_px"]["mean"] < 1
 
 
-def test_evaluate_without_the_oracle(finished: Path, invoke: Callable[..., Any]) -> None:
+def test_evaluate_omits_oracle_when_not_asked_for(finished: Path, invoke: Callable[..., Any]) -> None:
     arguments = ["evaluate", finished / "run", "--truth", finished / "cube.truth.npz", "--no-oracle"]
     assert "oracle" not in invoke(*arguments).stdout
     assert json.loads(invoke(*arguments, "--json").stdout)["oracle"] is None
 
 
-def test_check_says_ok(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_check_prints_ok_for_valid_spec(folder: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("check", "capture.yaml", "--set", "source.with.n_frames=4000")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == "capture.yaml: ok, 1 level on simulator: 4,000 binary frames of 96x160 at 96,800 Hz\n"
 
 
-def test_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_check_and_explain_describe_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> None:
     arguments = ["capture.yaml", "--set", "levels=until-converged"]
     assert invoke("check", *arguments).stdout.startswith("capture.yaml: ok, up to 8 levels on simulator: ")
     printed = invoke("explain", *arguments).stdout
     comments = printed.partition("levels: until-converged")[0].splitlines()[-5:]
     assert comments == [
-        "# up to 8 levels, until the motion has settled",
+        "# up to 8 levels, until the motion has converged",
         "# level 1: 4 groups of 50 frames, 5 pairs, at scale 1",
         "# level 2: 9 groups of 25 to 50 frames, 20 pairs, at scale 1",
         "# level 3: 17 groups of 12 to 50 frames, 54 pairs, at scale 1",
@@ -115,7 +115,7 @@ def test_levels_until_converged(folder: Path, invoke: Callable[..., Any]) -> Non
     assert parse_spec(printed).document == load_spec("capture.yaml", ["levels=until-converged"]).document
 
 
-def test_what_depends_on_the_frames_is_left_open(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_check_and_explain_leave_automatic_group_size_open(folder: Path, invoke: Callable[..., Any]) -> None:
     arguments = ["capture.yaml", "--set", "resample.with.group_size=auto"]
     check = invoke("check", *arguments).stdout.splitlines()
     assert check[1:] == ["groups are chosen from flux and speed when the capture is read"]
@@ -125,7 +125,7 @@ def test_what_depends_on_the_frames_is_left_open(folder: Path, invoke: Callable[
     assert parse_spec(printed).document == load_spec("capture.yaml", arguments[2:]).document
 
 
-def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_explain_prints_resolved_spec(folder: Path, invoke: Callable[..., Any]) -> None:
     levels = "levels=[{scale: 0.5, locate: {with: {max_iterations: 7}}}, {}]"
     arguments = ["capture.yaml", "--set", levels, "--set", "run.seed=3"]
     result = invoke("explain", *arguments)
@@ -135,13 +135,13 @@ def test_explain_is_the_resolved_spec(folder: Path, invoke: Callable[..., Any]) 
     assert parse_spec(result.stdout).document == expected
 
 
-def test_explain_forecasts_time_and_memory(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_explain_forecast_gives_time_and_memory(folder: Path, invoke: Callable[..., Any]) -> None:
     lines = invoke("explain", "capture.yaml", "--forecast", "--set", "resample.with.group_size=10").stdout.splitlines()
     assert re.fullmatch(r"# forecast from a trial on frames 40 to 159: about .* with \d+ threads? \(level 1: .*\)", lines[-2])
     assert re.fullmatch(r"# memory: about .* [MG]iB, for a panorama of about \d+ x \d+ px if no place is seen twice", lines[-1])
 
 
-def test_a_trial_that_fails_says_why(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_explain_forecast_gives_reason_when_trial_fails(folder: Path, invoke: Callable[..., Any]) -> None:
     dark = ("--set", "source.with.flux=1e-6", "--set", "resample.with.group_size=10")
     lines = invoke("explain", "capture.yaml", "--forecast", *dark).stdout.splitlines()
     start = lines.index("# the trial in the middle of the capture failed, as the run may:")
@@ -149,7 +149,7 @@ def test_a_trial_that_fails_says_why(folder: Path, invoke: Callable[..., Any]) -
     assert all(line.startswith("# ") for line in lines[start:])
 
 
-def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_explain_marks_plugins_defaults_and_overrides(folder: Path, invoke: Callable[..., Any]) -> None:
     changed = "locate: {with: {max_iterations: 7}}\nlevels: [{locate: {}}, {}]"
     spec = (folder / "capture.yaml").read_text().replace("levels: 1", changed)
     (folder / "capture.yaml").write_text(spec)
@@ -168,7 +168,7 @@ def test_explain_says_where_values_come_from(folder: Path, invoke: Callable[...,
     assert "# level 2: 9 groups of 25 to 50 frames, 20 pairs, at scale 1" in lines
 
 
-def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_explain_marks_origin_of_fallbacks(folder: Path, invoke: Callable[..., Any]) -> None:
     stages = (
         "locate: {use: direct, fallback: opencv-sift}\n"
         "levels:\n  - {locate: {with: {blur_px: 2}}}\n  - {locate: {fallback: {use: opencv-sift, with: {ratio: 0.9}}}}\n"
@@ -189,11 +189,11 @@ def test_explain_writes_fallbacks_as_a_list_and_says_where_they_come_from(folder
     assert "    - use: direct  # photonpano 0.1.0, --set\n" in named
 
 
-def test_warm_up_says_when_it_is_done(invoke: Callable[..., Any]) -> None:
-    assert re.fullmatch(r"ready, after \d+ s\n", invoke("warm-up").stdout)
+def test_warm_up_prints_seconds(invoke: Callable[..., Any]) -> None:
+    assert re.fullmatch(r"ready after \d+ s\n", invoke("warm-up").stdout)
 
 
-def test_schema(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_schema_is_printed_or_written(folder: Path, invoke: Callable[..., Any]) -> None:
     printed = json.loads(invoke("schema").stdout)
     assert {"version", "source", "levels"} <= set(printed["properties"])
     assert invoke("schema", "--output", "schema.json").stdout == "schema.json\n"
@@ -223,7 +223,7 @@ def odd_catalog(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("photonpano.registry.discover", lambda: catalog)
 
 
-def test_plugins_list(invoke: Callable[..., Any]) -> None:
+def test_plugins_list_of_kind_prints_sorted_names(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "list", "--kind", "source")
     assert (result.exit_code, result.stderr) == (0, "")
     head, *rows = result.stdout.splitlines()
@@ -235,7 +235,7 @@ def test_plugins_list(invoke: Callable[..., Any]) -> None:
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_list_shows_what_cannot_be_used(invoke: Callable[..., Any]) -> None:
+def test_plugins_list_marks_unusable_components(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "list")
     assert result.stdout == (
         "KIND      NAME   PLUGIN       SUMMARY\n"
@@ -249,14 +249,14 @@ def test_plugins_list_shows_what_cannot_be_used(invoke: Callable[..., Any]) -> N
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_list_broken(invoke: Callable[..., Any]) -> None:
+def test_plugins_list_broken_prints_errors(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "list", "--broken")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == "delta 0.3 (d = delta.hooks): ImportError: no module named [delta]\n"
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_list_json(invoke: Callable[..., Any]) -> None:
+def test_plugins_list_json_holds_all_states(invoke: Callable[..., Any]) -> None:
     data = json.loads(invoke("plugins", "list", "--kind", "locator", "--json").stdout)
     assert [(row["name"], row["plugin"]) for row in data["components"]] == [
         ("twice", "alpha"),
@@ -288,17 +288,17 @@ def test_plugins_list_json(invoke: Callable[..., Any]) -> None:
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_list_of_a_kind_shows_what_may_be_of_it(invoke: Callable[..., Any]) -> None:
+def test_plugins_list_of_kind_includes_disabled_plugins(invoke: Callable[..., Any]) -> None:
     assert invoke("plugins", "list", "--kind", "source").stdout == (
         "KIND      NAME  PLUGIN       SUMMARY\ndisabled  e     epsilon 0.4  By PHOTONPANO_DISABLE_PLUGINS=e\n"
     )
 
 
-def test_no_plugin_is_broken(invoke: Callable[..., Any]) -> None:
+def test_plugins_list_broken_prints_a_line_when_none_is(invoke: Callable[..., Any]) -> None:
     assert invoke("plugins", "list", "--broken").stdout == "no plugin is broken\n"
 
 
-def test_plugins_show(finished: Path, invoke: Callable[..., Any]) -> None:
+def test_plugins_show_prints_keys_and_valid_snippet(finished: Path, invoke: Callable[..., Any]) -> None:
     text = invoke("plugins", "show", "packed-npy").stdout
     head, facts, table, snippet = text.split("\n\n")
     assert head.startswith("packed-npy: ")
@@ -316,7 +316,7 @@ def test_plugins_show(finished: Path, invoke: Callable[..., Any]) -> None:
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_show_says_how_to_install(invoke: Callable[..., Any]) -> None:
+def test_plugins_show_prints_install_line_for_missing_library(invoke: Callable[..., Any]) -> None:
     assert invoke("plugins", "show", "far").stdout == (
         "far: A toy\n\n"
         "kind    locator\n"
@@ -329,7 +329,7 @@ def test_plugins_show_says_how_to_install(invoke: Callable[..., Any]) -> None:
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_show_of_a_name_that_two_offer(invoke: Callable[..., Any]) -> None:
+def test_plugins_show_refuses_name_offered_twice(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "show", "twice")
     assert result.exit_code == 1
     assert result.stderr == (
@@ -339,7 +339,7 @@ def test_plugins_show_of_a_name_that_two_offer(invoke: Callable[..., Any]) -> No
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_show_names_the_plugins_that_may_have_offered_a_name(invoke: Callable[..., Any]) -> None:
+def test_plugins_show_lists_broken_and_disabled_plugins_for_unknown_name(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "show", "near")
     assert result.exit_code == 2
     assert result.stderr.endswith(
@@ -350,7 +350,7 @@ def test_plugins_show_names_the_plugins_that_may_have_offered_a_name(invoke: Cal
 
 
 @pytest.mark.usefixtures("odd_catalog")
-def test_plugins_show_json(invoke: Callable[..., Any]) -> None:
+def test_plugins_show_json_holds_all_fields(invoke: Callable[..., Any]) -> None:
     (shown,) = json.loads(invoke("plugins", "show", "far", "--json").stdout)["components"]
     assert shown == {
         "kind": "locator",
@@ -367,7 +367,7 @@ def test_plugins_show_json(invoke: Callable[..., Any]) -> None:
     }
 
 
-def test_plugins_show_of_an_unknown_name(invoke: Callable[..., Any]) -> None:
+def test_plugins_show_suggests_names_for_unknown_name(invoke: Callable[..., Any]) -> None:
     result = invoke("plugins", "show", "opencv-shift")
     assert result.exit_code == 2
     assert "Invalid value for 'NAME': there is no component 'opencv-shift'; did you mean 'opencv-sift'" in result.stderr

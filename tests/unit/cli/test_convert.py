@@ -22,24 +22,24 @@ def cube(folder: Path, finished: Path) -> Path:
     return folder / "cube.npy"
 
 
-def test_a_capture_is_written_bit_by_bit(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_copies_bits_and_prints_spec_section(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("convert", "cube.npy", "out.npy", "--with", "frame_rate_hz=96800")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == (
         "out.npy  384.1 kB  200 binary frames of 96x160 at 96,800 Hz\n\n"
-        "In a spec that lies here:\n\n"
+        "In a spec in this folder:\n\n"
         "source: {use: packed-npy, with: {path: out.npy, frame_rate_hz: 96800}}\n"
     )
     assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
 
 
-def test_a_spec_may_name_the_capture(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_accepts_spec(folder: Path, invoke: Callable[..., Any]) -> None:
     assert invoke("convert", "capture.yaml", "out.npy", "--with", "n_frames=5").exit_code == 0
     assert np.load(folder / "out.npy").shape == (5, 96, 20)
     assert (folder / "out.truth.npz").exists()
 
 
-def test_corrections_are_made_where_they_are_asked_for(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_applies_corrections_of_option(cube: Path, invoke: Callable[..., Any]) -> None:
     assert (
         invoke("convert", "cube.npy", "out.npy", "--correct", "{crop: {columns: [0, 43]}}", "--correct", "flip-lr").exit_code
         == 0
@@ -49,7 +49,7 @@ def test_corrections_are_made_where_they_are_asked_for(cube: Path, invoke: Calla
     np.testing.assert_array_equal(found, frames[:, :, 42::-1])
 
 
-def test_what_frames_cannot_hold_is_refused(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_refuses_corrections_of_sums(cube: Path, invoke: Callable[..., Any]) -> None:
     pattern = np.full((96, 160, 3), 255, np.uint8)
     pattern[::2, ::2, 1:] = 0
     np.save(cube.parent / "pattern.npy", pattern)
@@ -74,7 +74,7 @@ class Grey:
         pass
 
 
-def test_intensities_are_refused(cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_convert_refuses_intensities(cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     grey = SourceContribution(name="grey", summary="Toy", config=GreyConfig, build=lambda *_: Grey())
     catalog = discover().including(grey)
     monkeypatch.setattr("photonpano.specs.loading.discover", lambda: catalog)
@@ -105,7 +105,7 @@ def heed_interrupts() -> None:
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_conversion_is_continued(cube: Path, invoke: Callable[..., Any], sent: signal.Signals) -> None:
+def test_convert_continues_after_interrupt(cube: Path, invoke: Callable[..., Any], sent: signal.Signals) -> None:
     part, command = cube.parent / "out.npy.part", [sys.executable, "-c", SLOWLY, "convert", "cube.npy", "out.npy"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, cwd=cube.parent, text=True, preexec_fn=heed_interrupts, **pipes) as process:
@@ -115,25 +115,25 @@ def test_an_interrupted_conversion_is_continued(cube: Path, invoke: Callable[...
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
     assert err == (
-        "what is written so far is in out.npy.part; the same command goes on from there\n"
-        "\ninterrupted; nothing half-written is left under a final name\n"
+        "the frames written so far are in out.npy.part; the same command continues from there\n"
+        "\ninterrupted; no file is left half-written under its final name\n"
     )
     assert sorted(path.name for path in cube.parent.iterdir()) == ["capture.yaml", "cube.npy", "out.npy.part"]
     there = (part.stat().st_size - 128) // (96 * 20)
     result = invoke("convert", "cube.npy", "out.npy")
-    assert result.stderr == f"out.npy.part holds {there} of its frames, and is continued\n"
+    assert result.stderr == f"out.npy.part holds {there} frames of this capture: continuing from there\n"
     assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
     assert not part.exists()
 
 
-def test_a_part_of_something_else_is_written_anew(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_starts_anew_on_part_of_another_capture(cube: Path, invoke: Callable[..., Any]) -> None:
     (cube.parent / "out.npy.part").write_bytes(b"something else")
     result = invoke("convert", "cube.npy", "out.npy")
-    assert result.stderr == "out.npy.part is of another capture, and is written anew\n"
+    assert result.stderr == "out.npy.part is of another capture: starting anew\n"
     assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
 
 
-def test_a_capture_does_not_become_its_own_copy(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:
     """The old file is read until the new one takes its name."""
     before = cube.read_bytes()
     assert invoke("convert", "cube.npy", "cube.npy").exit_code == 0

@@ -26,7 +26,7 @@ def hot(folder: Path) -> np.ndarray:
     return hot
 
 
-def test_dark_counts_and_how_to_use_them(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
+def test_dark_writes_counts_and_prints_corrections(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
     done = invoke("dark", "covered.yaml", "--output", "dark.npz")
     assert (done.exit_code, done.stderr) == (0, "")
     with np.load(folder / "dark.npz") as archive:
@@ -34,15 +34,15 @@ def test_dark_counts_and_how_to_use_them(hot: np.ndarray, folder: Path, invoke: 
         assert archive["rates"][hot].mean() == pytest.approx(0.5, rel=0.1)
         assert archive["rates"][~hot].mean() == pytest.approx(0.002, rel=0.1)
     lines = done.stdout.splitlines()
-    assert lines[0] == "dark.npz             from 1,000 binary frames of 24x32"
-    assert lines[1].startswith("dark counts a frame  median 0.002, 90 % 0.0")
-    assert lines[2].startswith(f"hot pixels           {hot.sum()} of 768 ({100 * hot.mean():.2f} %), above 0.0")
+    assert lines[0] == "dark.npz               from 1,000 binary frames of 24x32"
+    assert lines[1].startswith("dark counts per frame  median 0.002, 90 % 0.0")
+    assert lines[2].startswith(f"hot pixels             {hot.sum()} of 768 ({100 * hot.mean():.2f} %), above 0.0")
     line = "corrections: [{hot-pixels: {dark: dark.npz}}, {dark-counts: {dark: dark.npz}}]"
-    assert lines[3:] == ["", "In a spec that lies here:", "", line]
+    assert lines[3:] == ["", "In a spec in this folder:", "", line]
     assert len(parse_spec(f"{SPEC}{line}\n", directory=folder).corrections) == 2
 
 
-def test_a_mask_and_how_to_use_it(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
+def test_dark_writes_mask_to_npy_file(hot: np.ndarray, folder: Path, invoke: Callable[..., Any]) -> None:
     done = invoke("dark", "covered.npy", "-o", "mask.npy", "--threshold", "20")
     np.testing.assert_array_equal(np.load(folder / "mask.npy"), hot)
     line = done.stdout.splitlines()[-1]
@@ -51,20 +51,20 @@ def test_a_mask_and_how_to_use_it(hot: np.ndarray, folder: Path, invoke: Callabl
 
 
 @pytest.mark.usefixtures("hot")
-def test_corrections_that_move_pixels_are_applied(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_dark_applies_corrections_that_move_pixels(folder: Path, invoke: Callable[..., Any]) -> None:
     invoke("dark", "covered.yaml", "-o", "dark.npz", "--correct", "rot90", "--correct", "{crop: {rows: [0, 10]}}")
     with np.load(folder / "dark.npz") as archive:
         assert archive["rates"].shape == (10, 24)
 
 
-def test_a_capture_that_is_not_dark_is_warned_of(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_dark_warns_of_bright_capture(folder: Path, invoke: Callable[..., Any]) -> None:
     done = invoke("dark", "capture.yaml", "-o", "dark.npz")
     assert done.exit_code == 0
-    assert done.stderr == "warning: half of the pixels count more than 0.1 a frame; was the lens covered?\n"
+    assert done.stderr == "warning: half of the pixels count more than 0.1 photons per frame; was the lens covered?\n"
 
 
 @pytest.mark.usefixtures("hot")
-def test_another_suffix_is_refused_and_nothing_is_left(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_dark_refuses_other_suffix_and_leaves_nothing(folder: Path, invoke: Callable[..., Any]) -> None:
     done = invoke("dark", "covered.yaml", "-o", "dark.txt")
     assert done.exit_code == 1
     assert (
@@ -74,7 +74,7 @@ def test_another_suffix_is_refused_and_nothing_is_left(folder: Path, invoke: Cal
 
 
 @pytest.mark.usefixtures("hot")
-def test_explain_shows_corrections_as_they_are_written(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_explain_prints_corrections_as_written(folder: Path, invoke: Callable[..., Any]) -> None:
     corrections = "corrections:\n  - rot90\n  - crop: {rows: [2, null]}\nresample: {with: {group_size: 50}}\n"
     (folder / "scan.yaml").write_text(f"{SPEC}{corrections}")
     printed = invoke("explain", "scan.yaml").stdout

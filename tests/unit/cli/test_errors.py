@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from photonpano import PluginError
-from photonpano.cli.outcome import reported
+from photonpano.cli.errors import reported
 
 SOURCE = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\n"
 
@@ -26,7 +26,7 @@ def spec(folder: Path, text: str) -> str:
 
 
 @pytest.mark.parametrize("command", ["check", "run", "explain"])
-def test_all_problems_of_a_spec_each_on_a_line(folder: Path, invoke: Callable[..., Any], command: str) -> None:
+def test_spec_problems_are_printed_one_per_line(folder: Path, invoke: Callable[..., Any], command: str) -> None:
     text = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\nresample: {group_size: 50}\nrender: {scale: big}\n"
     result = invoke(command, spec(folder, text), "--set", "run.seed=-1")
     assert (result.exit_code, result.stdout) == (2, "")
@@ -51,14 +51,16 @@ def test_all_problems_of_a_spec_each_on_a_line(folder: Path, invoke: Callable[..
     ],
     ids=["component", "key"],
 )
-def test_one_problem(folder: Path, invoke: Callable[..., Any], text: str, message: str) -> None:
+def test_single_spec_problem_is_printed_with_suggestion(
+    folder: Path, invoke: Callable[..., Any], text: str, message: str
+) -> None:
     np.save(folder / "cube.npy", np.zeros((2, 4, 1), np.uint8))
     result = invoke("check", spec(folder, text))
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == message + "error: the spec has 1 problem\n"
 
 
-def test_a_spec_that_is_not_there(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_run_reports_missing_spec(folder: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("run", folder / "nowhere.yaml")
     assert (result.exit_code, result.stderr) == (
         2,
@@ -67,7 +69,7 @@ def test_a_spec_that_is_not_there(folder: Path, invoke: Callable[..., Any]) -> N
 
 
 @pytest.mark.parametrize("command", ["check", "run", "explain"])
-def test_a_capture_that_is_too_short_for_the_spec(folder: Path, invoke: Callable[..., Any], command: str) -> None:
+def test_capture_shorter_than_group_is_spec_problem(folder: Path, invoke: Callable[..., Any], command: str) -> None:
     np.save(folder / "cube.npy", np.zeros((20, 4, 1), np.uint8))
     result = invoke(command, spec(folder, SOURCE + "resample: {use: midpoint, with: {group_size: 30}}\n"))
     assert (result.exit_code, result.stdout) == (2, "")
@@ -105,20 +107,22 @@ def test_a_capture_that_is_too_short_for_the_spec(folder: Path, invoke: Callable
     ],
     ids=["suffix", "folder", "schema", "run folder", "evaluate"],
 )
-def test_what_fails_exits_1(folder: Path, invoke: Callable[..., Any], arguments: list[str], message: str) -> None:
+def test_failed_command_exits_1_and_writes_nothing(
+    folder: Path, invoke: Callable[..., Any], arguments: list[str], message: str
+) -> None:
     result = invoke(*arguments)
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == message.replace("{folder}", str(folder))
     assert [path.name for path in folder.iterdir()] == ["capture.yaml"]
 
 
-def test_square_brackets_are_not_taken_for_markup(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_square_brackets_in_messages_are_not_markup(folder: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("check", folder / "[bold]no[bold].yaml")
     assert "[bold]no[bold].yaml: there is no such file" in result.stderr
 
 
 @pytest.mark.parametrize(("options", "environment"), [(["--debug"], {}), ([], {"PHOTONPANO_DEBUG": "1"})])
-def test_debug_shows_the_traceback(
+def test_debug_option_shows_traceback(
     folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, options: list[str], environment: dict[str, str]
 ) -> None:
     assert "Traceback" not in invoke("run", "nowhere.yaml").stderr
@@ -131,7 +135,7 @@ def test_debug_shows_the_traceback(
 
 
 @pytest.mark.parametrize("debug", [False, True])
-def test_what_a_plugin_raises_comes_with_the_way_to_its_traceback(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
+def test_plugin_error_names_debug_option_if_it_has_a_cause(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
     """Not what it breaks its contract by: no line of it is to blame for that."""
     for cause in (ValueError("out of luck"), None):
         with pytest.raises(typer.Exit), reported(debug=debug):
@@ -143,7 +147,7 @@ def test_what_a_plugin_raises_comes_with_the_way_to_its_traceback(capsys: pytest
 
 
 @pytest.mark.parametrize("debug", [False, True])
-def test_warnings_that_are_logged_are_printed(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
+def test_logged_warnings_are_printed(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
     logger = logging.getLogger("photonpano.anywhere")
     with reported(debug=debug):
         logger.info("not this")
@@ -157,7 +161,7 @@ def test_warnings_that_are_logged_are_printed(capsys: pytest.CaptureFixture[str]
     assert not logging.getLogger("photonpano").handlers
 
 
-def test_names_of_disabled_plugins_that_are_none_are_told(
+def test_unknown_name_of_disabled_plugin_is_warned_of(
     folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "opencw")
@@ -168,7 +172,7 @@ def test_names_of_disabled_plugins_that_are_none_are_told(
     )
 
 
-def test_a_name_of_a_disabled_plugin_says_what_disables_it(
+def test_component_of_disabled_plugin_names_what_disables_it(
     folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "opencv")
@@ -193,7 +197,7 @@ def heed_interrupts() -> None:
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: list[str], sent: signal.Signals) -> None:
+def test_interrupted_command_leaves_no_file(folder: Path, program: list[str], sent: signal.Signals) -> None:
     command = [*program, "simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=100000"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, cwd=folder, text=True, preexec_fn=heed_interrupts, **pipes) as process:
@@ -202,11 +206,11 @@ def test_an_interrupted_run_leaves_nothing_half_written(folder: Path, program: l
         process.send_signal(sent)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
-    assert err == "\ninterrupted; nothing half-written is left under a final name\n"
+    assert err == "\ninterrupted; no file is left half-written under its final name\n"
     assert [path.name for path in folder.iterdir()] == ["capture.yaml"]
 
 
-def test_a_reader_that_goes_away_is_no_error(folder: Path, program: list[str]) -> None:
+def test_closed_pipe_is_no_error(folder: Path, program: list[str]) -> None:
     with subprocess.Popen([*program, "schema"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None

@@ -34,13 +34,13 @@ COMMANDS = dict(commands(typer.main.get_command(app)))
 def test_help_imports_nothing_heavy(program: list[str]) -> None:
     script = f"import sys, atexit; atexit.register(lambda: print(*sys.modules, file=sys.stderr)); {program[-1]}"
     done = subprocess.run([sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True)
-    assert "Make the panorama of a spec." in done.stdout
+    assert "Make a panorama from a spec." in done.stdout
     loaded = {module.partition(".")[0] for module in done.stderr.split()}
     assert "typer" in loaded
     assert not loaded & HEAVY
 
 
-def test_there_are_these_commands() -> None:
+def test_commands_are_complete() -> None:
     assert {" ".join(name) for name in COMMANDS} == {
         "run",
         "check",
@@ -59,7 +59,7 @@ def test_there_are_these_commands() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS, ids=" ".join)
-def test_help_explains_every_option_and_has_an_example_that_works(name: tuple[str, ...], invoke: Callable[..., Any]) -> None:
+def test_help_explains_every_option_and_its_example_parses(name: tuple[str, ...], invoke: Callable[..., Any]) -> None:
     command = COMMANDS[name]
     assert [parameter.name for parameter in command.params if not parameter.help] == []
     text = invoke(*name, "--help").stdout
@@ -77,7 +77,7 @@ def test_short_help_is_not_cut(invoke: Callable[..., Any]) -> None:
     assert "..." not in invoke("plugins", "--help").stdout.replace("[ARGS]...", "")
 
 
-def test_version(invoke: Callable[..., Any]) -> None:
+def test_version_is_printed(invoke: Callable[..., Any]) -> None:
     assert invoke("--version").stdout == f"photonpano {photonpano.__version__}\n"
 
 
@@ -90,7 +90,7 @@ def test_version(invoke: Callable[..., Any]) -> None:
         (["simulate", "a.yaml"], "Missing option '--output' / '-o'"),
     ],
 )
-def test_a_wrong_command_line_exits_2(arguments: list[str], message: str, invoke: Callable[..., Any]) -> None:
+def test_wrong_command_line_exits_2(arguments: list[str], message: str, invoke: Callable[..., Any]) -> None:
     result = invoke(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")
     assert message in result.stderr

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano.cli.info import _percent
+from photonpano.api.capture_info import percent
 from photonpano.specs import parse_spec
 
 
@@ -25,7 +25,7 @@ def rows_of(printed: str) -> dict[str, str]:
     return {line[:10].strip(): line[10:].strip() for line in table.splitlines()}
 
 
-def test_what_it_is_and_how_it_looks(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_info_prints_facts_and_valid_spec(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("info", "cube.npy", "--with", "frame_rate_hz=96800")
     assert (result.exit_code, result.stderr) == (0, "")
     rows = rows_of(result.stdout)
@@ -36,8 +36,8 @@ def test_what_it_is_and_how_it_looks(cube: Path, invoke: Callable[..., Any]) -> 
     assert unit == "photons per pixel per frame"
     assert 0.5 < float(flux) < 2
     assert rows["hot pixels"].startswith(("none", "about "))
-    assert rows["speed"].startswith("0.1 px a frame (the second fastest of ")
-    assert rows["group size"].startswith("25: at 0.1 px a frame ")
+    assert rows["speed"].startswith("0.1 px per frame (the second fastest of ")
+    assert rows["group size"].startswith("25: at 0.1 px per frame ")
     assert result.stdout.endswith(
         "\n\nA spec to start from:\n\nversion: 1\nsource: {use: packed-npy, with: {path: cube.npy, frame_rate_hz: 96800}}\n"
     )
@@ -45,7 +45,7 @@ def test_what_it_is_and_how_it_looks(cube: Path, invoke: Callable[..., Any]) -> 
     assert plan.source.config.path == cube
 
 
-def test_the_group_size_is_the_one_that_a_run_chooses(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_info_group_size_is_that_of_run(cube: Path, invoke: Callable[..., Any]) -> None:
     facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
     (cube.parent / "scan.yaml").write_text("version: 1\nsource: {use: auto, with: {path: cube.npy}}\nlevels: 1\n")
     assert invoke("run", "scan.yaml").exit_code == 0
@@ -56,7 +56,7 @@ def test_the_group_size_is_the_one_that_a_run_chooses(cube: Path, invoke: Callab
     }
 
 
-def test_json_says_the_same(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_info_json_holds_all_facts(cube: Path, invoke: Callable[..., Any]) -> None:
     facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
     assert {key: facts[key] for key in ("source", "n_frames", "height", "width", "kind", "bit_depth", "warnings")} == {
         "source": "packed-npy",
@@ -73,7 +73,7 @@ def test_json_says_the_same(cube: Path, invoke: Callable[..., Any]) -> None:
     assert facts["spec"] == {"version": 1, "source": {"use": "packed-npy", "with": {"path": "cube.npy"}}}
 
 
-def test_a_spec_is_looked_at_whatever_groups_it_asks_for(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_info_ignores_group_size_of_spec(cube: Path, invoke: Callable[..., Any]) -> None:
     (cube.parent / "scan.yaml").write_text(
         "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\ncorrections: [rot90]\n"
         "resample: {with: {group_size: 7}}\nlevels: [{resample: {with: {group_size: 9}}}, {}]\n"
@@ -84,7 +84,7 @@ def test_a_spec_is_looked_at_whatever_groups_it_asks_for(cube: Path, invoke: Cal
     assert facts["spec"]["corrections"] == ["rot90"]
 
 
-def test_corrections_are_in_the_spec_to_start_from(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_info_keeps_corrections_in_printed_spec(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("info", "cube.npy", "--correct", "flip-ud", "--correct", "{crop: {rows: [2, null]}}")
     assert rows_of(result.stdout)["capture"] == "200 binary frames of 94x160"
     assert rows_of(result.stdout)["duration"] == "unknown without frame_rate_hz"
@@ -99,7 +99,7 @@ def test_corrections_are_in_the_spec_to_start_from(cube: Path, invoke: Callable[
         (255, 7.2, "every pixel is lit in all of 256 frames looked at all over the capture, so that no flux can be told; "),
     ],
 )
-def test_dark_and_saturated_captures_are_told(
+def test_info_warns_of_dark_and_saturated_captures(
     folder: Path, invoke: Callable[..., Any], value: int, flux: float, warning: str
 ) -> None:
     np.save(folder / "cube.npy", np.full((600, 32, 4), value, np.uint8))
@@ -112,7 +112,7 @@ def test_dark_and_saturated_captures_are_told(
     assert facts["flux"] == 0 if not flux else facts["flux"] > 3
 
 
-def test_hot_and_saturated_pixels_are_told(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_info_warns_of_hot_and_saturated_pixels(folder: Path, invoke: Callable[..., Any]) -> None:
     rng = np.random.default_rng(0)
     frames = rng.random((600, 64, 64)) < 0.1
     frames[:, rng.random((64, 64)) < 0.02] = True
@@ -122,11 +122,13 @@ def test_hot_and_saturated_pixels_are_told(folder: Path, invoke: Callable[..., A
     assert facts["hot_share"] == pytest.approx(0.02 * 7 / 8, abs=0.006)
     assert facts["saturated_share"] == pytest.approx(frames.all(axis=0).mean())
     hot, saturated = invoke("info", "cube.npy").stderr.splitlines()
-    assert hot == f"warning: about {_percent(facts['hot_share'])} of the pixels are hot; the correction hot-pixels masks them"
-    assert saturated.startswith("warning: 14 % of the pixels have their highest value in every frame: ")
+    assert (
+        hot == f"warning: about {percent(facts['hot_share'])} of the pixels are hot; mask them with the correction hot-pixels"
+    )
+    assert saturated.startswith("warning: 14 % of the pixels have their highest value in every frame, so that ")
 
 
-def test_a_capture_that_is_too_short_for_groups(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_info_warns_of_capture_too_short_for_groups(folder: Path, invoke: Callable[..., Any]) -> None:
     np.save(folder / "cube.npy", np.random.default_rng(0).integers(0, 256, (5, 32, 4), np.uint8))
     result = invoke("info", "cube.npy")
     assert result.exit_code == 0

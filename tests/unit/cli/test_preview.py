@@ -16,7 +16,7 @@ def cube(folder: Path, finished: Path) -> Path:
     return folder / "cube.npy"
 
 
-def test_a_folder_of_pictures(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_preview_writes_folder_of_pictures(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("preview", "cube.npy", "-o", "look", "--group-size", "50", "--step", "75", "--white", "1.5")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == (
@@ -27,14 +27,14 @@ def test_a_folder_of_pictures(cube: Path, invoke: Callable[..., Any]) -> None:
     assert {cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape for file in files} == {(110, 160)}
 
 
-def test_a_film(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_preview_writes_film(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("preview", "cube.npy", "-o", "look.webp", "--group-size", "20", "--fps", "10", "--no-label")
     assert result.stdout.startswith("look.webp: 10 pictures of ")
     with Image.open(cube.parent / "look.webp") as film:
         assert (film.n_frames, film.size) == (10, (160, 96))
 
 
-def test_what_cannot_be_written_is_told_at_once(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_preview_refuses_unknown_suffix_at_once(cube: Path, invoke: Callable[..., Any]) -> None:
     result = invoke("preview", "cube.npy", "-o", "look.jpg")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == (

@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
     [(io.StringIO(), "xterm", Quiet), (Terminal(), "xterm", Bars), (Terminal(), "dumb", Quiet)],
     ids=["pipe", "terminal", "dumb terminal"],
 )
-def test_bars_are_for_those_who_watch(
+def test_progress_draws_bars_only_on_terminal(
     monkeypatch: pytest.MonkeyPatch, stderr: io.StringIO, terminal: str, expected: type
 ) -> None:
     monkeypatch.setattr("sys.stderr", stderr)
@@ -28,7 +28,7 @@ def test_bars_are_for_those_who_watch(
     assert isinstance(progress_for_stderr(), expected)
 
 
-def test_a_bar_shows_stage_count_and_rate() -> None:
+def test_bar_shows_stage_count_and_rate() -> None:
     screen = io.StringIO()
     bars = Bars(Console(file=screen, width=100, force_terminal=True, color_system=None))
     with bars.stage("level 2: locate [all]", 1200, "exposures") as advance:
@@ -39,7 +39,7 @@ def test_a_bar_shows_stage_count_and_rate() -> None:
     assert "exposures/s" in last
 
 
-def test_notes_are_printed_as_they_are() -> None:
+def test_note_is_printed_unchanged() -> None:
     screen = io.StringIO()
     bars = Bars(Console(file=screen, width=20, force_terminal=True, color_system=None, markup=False, highlight=False))
     bars.note("level 1: [bold] " + "a long line " * 5)

@@ -117,7 +117,9 @@ def make_record(n_frames: int, panorama: RenderedPanorama) -> dict[str, Any]:
             for stage, choice in stages.items()
         ],
         "libraries": {"numpy": "2.4.6", "opencv-python-headless": "5.0.0.93", "scipy": "1.17.1", "python": "3.11.7"},
-        "decisions": [{"what": "group_size", "value": 250, "reason": "at 0.15 px a frame they are blurred by 38 px"}],
+        "decisions": [
+            {"what": "group_size", "value": 250, "reason": "at 0.15 px per frame groups of 250 frames are blurred by 38 px"}
+        ],
         "levels": levels,
         "motion": {"std_px": 0.07, "worst_std_px": 0.61, "worst_frame": 9874},
         "panorama": {

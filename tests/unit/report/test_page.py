@@ -64,7 +64,8 @@ def test_the_page_says_what_happened(record, motion, panorama, no_figures):
         "change in the last level 0.063 px",
         "time 1 min 23 s",
         "peak memory 812 MiB",
-        "Chosen from what the capture shows group_size : 250 \N{EN DASH} at 0.15 px a frame they are blurred by 38 px",
+        "Chosen from what the capture shows group_size : 250 \N{EN DASH} at 0.15 px per frame groups of 250 "
+        "frames are blurred by 38 px",
         "250 frames of 10,000 were not located: 0 to 124; 9,875 to 9,999 (counted from 0; the trajectory is",
         "the images overlap by 4% (at least 10% is needed)",
         "9,000 to 9,249 against 9,125 to 9,374",

@@ -1,4 +1,4 @@
-"""How commands end: what goes wrong becomes a message on stderr and an exit code."""
+"""Report errors of commands: a message on stderr, and an exit code."""
 
 import logging
 import sys
@@ -21,34 +21,34 @@ class WrongArgumentError(PhotonpanoError):
 
 @contextmanager
 def reported(*, debug: bool = False) -> Iterator[None]:
-    """Report the errors of a command that are made for users; others are defects and keep their traceback.
+    """Report the errors of a command; errors other than `PhotonpanoError` are defects and keep their traceback.
 
-    What is logged as a warning meanwhile, such as what a plugin that watches runs has raised, is printed as one.
+    Logged warnings, such as the exception of a plugin that watches runs, are printed.
 
     Args:
-        debug: whether errors made for users, and warnings, show their traceback as well.
+        debug: whether reported errors and warnings show their traceback as well.
 
     Raises:
-        typer.Exit: with the exit code of what went wrong.
+        typer.Exit: with the exit code of the error.
     """
     logger, handler = logging.getLogger("photonpano"), _Warnings(debug)
     logger.addHandler(handler)
     try:
         yield
-        sys.stdout.flush()  # a closed pipe shows here at the latest, and typer ends in silence
+        sys.stdout.flush()  # raises on a closed pipe, which typer ends without a message
     except PhotonpanoError as error:
         if debug:
             traceback.print_exc()
-        raise typer.Exit(_told(error, debug)) from error
+        raise typer.Exit(_print(error, debug)) from error
     except KeyboardInterrupt as error:
-        typer.echo("\ninterrupted; nothing half-written is left under a final name", err=True)
+        typer.echo("\ninterrupted; no file is left half-written under its final name", err=True)
         raise typer.Exit(INTERRUPTED) from error
     finally:
         logger.removeHandler(handler)
 
 
 class _Warnings(logging.Handler):
-    """Prints what is logged, a line each."""
+    """Prints logged warnings."""
 
     def __init__(self, debug: bool) -> None:
         super().__init__(logging.WARNING)
@@ -58,12 +58,12 @@ class _Warnings(logging.Handler):
         """Print a warning."""
         if self._debug and record.exc_info:
             traceback.print_exception(record.exc_info[1])
-        # Not by typer, which would write past the progress bars.
+        # Not with typer.echo, which bypasses the progress bars.
         sys.stderr.write(f"warning: {record.getMessage()}\n")
 
 
-def _told(error: PhotonpanoError, debug: bool) -> int:
-    """Print an error, every problem of a spec on a line of its own, and return its exit code."""
+def _print(error: PhotonpanoError, debug: bool) -> int:
+    """Print an error, each problem of a spec on its own line, and return the exit code."""
     if not isinstance(error, SpecError):
         typer.echo(f"error: {error}", err=True)
         if isinstance(error, PluginError) and error.__cause__ and not debug:

@@ -1,4 +1,4 @@
-"""How a capture is named on the command line that no spec names, and what is said if that is wrong."""
+"""Captures named on the command line: options, and errors that name them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from photonpano.cli.capture import plan_for
-from photonpano.cli.outcome import WrongArgumentError
+from photonpano.cli.errors import WrongArgumentError
+from photonpano.cli.options import capture_plan
 from photonpano.errors import SpecError
 
 
@@ -21,28 +22,34 @@ def cube(folder: Path) -> Path:
     return folder / "cube.npy"
 
 
-def test_a_path_is_relative_to_the_current_folder(cube: Path) -> None:
-    plan = plan_for(Path("cube.npy"))
+def test_capture_plan_resolves_path_from_current_folder(cube: Path) -> None:
+    with capture_plan(Path("cube.npy")) as plan:
+        pass
     assert (plan.source.contribution.name, plan.source.config.path) == ("packed-npy", cube)
 
 
-def test_values_are_yaml(cube: Path) -> None:
-    plan = plan_for(Path("cube.npy"), "packed-npy", ["frame_rate_hz=1e3", "width=13"], ["rot90", "{crop: {rows: [2, null]}}"])
+def test_capture_plan_reads_option_values_as_yaml(cube: Path) -> None:
+    corrections = ["rot90", "{crop: {rows: [2, null]}}"]
+    with capture_plan(Path("cube.npy"), "packed-npy", ["frame_rate_hz=1e3", "width=13"], corrections) as plan:
+        pass
     assert (plan.source.config.frame_rate_hz, plan.source.config.width) == (1000, 13)
     assert plan.document["corrections"] == ["rot90", {"crop": {"rows": [2, None], "columns": [None, None]}}]
 
 
-def test_a_spec_is_changed_by_the_same_options(cube: Path) -> None:
+def test_capture_plan_applies_options_to_spec(cube: Path) -> None:
     Path("scan.yml").write_text("version: 1\nsource: {use: auto, with: {path: cube.npy, frame_rate_hz: 7}}\nlevels: 2\n")
-    plan = plan_for(Path("scan.yml"), None, ["width=13"], ["rot90"], ["levels=1"])
-    assert (plan.source.config.frame_rate_hz, plan.source.config.width, len(plan.levels)) == (7, 13, 1)
+    with capture_plan(Path("scan.yml"), None, ["width=13"], ["rot90"]) as plan:
+        pass
+    assert (plan.source.config.frame_rate_hz, plan.source.config.width, len(plan.levels)) == (7, 13, 2)
     assert plan.document["corrections"] == ["rot90"]
-    with pytest.raises(SpecError):
-        plan_for(Path("scan.yml"), "nobody")
+    with pytest.raises(SpecError), capture_plan(Path("scan.yml"), "nobody"):
+        pass
 
 
 @pytest.mark.parametrize("command", [["info"], ["convert", "out.npy"], ["preview", "-o", "out"]])
-def test_a_capture_that_nobody_recognises(cube: Path, invoke: Callable[..., Any], command: list[str]) -> None:
+def test_unrecognised_capture_exits_2_and_lists_known_endings(
+    cube: Path, invoke: Callable[..., Any], command: list[str]
+) -> None:
     (cube.parent / "cube.dat").write_bytes(b"0123")
     name, *others = command
     result = invoke(name, "cube.dat", *others)
@@ -73,16 +80,16 @@ def test_a_capture_that_nobody_recognises(cube: Path, invoke: Callable[..., Any]
         ({"corrections": ["rot9"]}, "--correct: there is no correction 'rot9'; did you mean "),
     ],
 )
-def test_what_is_wrong_is_told_by_the_name_of_the_option(cube: Path, arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(WrongArgumentError) as caught:
-        plan_for(**{"path": Path("cube.npy")} | arguments)
-    told = str(caught.value)
-    assert told.startswith(message.replace("{folder}", str(cube.parent)))
-    assert "override" not in told
+def test_wrong_value_is_attributed_to_its_option(cube: Path, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(WrongArgumentError) as caught, capture_plan(**{"path": Path("cube.npy")} | arguments):
+        pass
+    text = str(caught.value)
+    assert text.startswith(message.replace("{folder}", str(cube.parent)))
+    assert "override" not in text
 
 
 @pytest.mark.parametrize("command", [["info"], ["convert", "out.npy"], ["preview", "-o", "out"], ["dark", "-o", "out.npz"]])
-def test_what_shows_when_the_capture_is_open_is_told_so_as_well(
+def test_problem_of_opened_capture_is_attributed_to_its_option(
     cube: Path, invoke: Callable[..., Any], command: list[str]
 ) -> None:
     name, *others = command
@@ -93,7 +100,7 @@ def test_what_shows_when_the_capture_is_open_is_told_so_as_well(
     )
 
 
-def test_a_capture_that_cannot_be_opened_says_what_it_was_taken_for(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_unreadable_capture_names_recognised_source(folder: Path, invoke: Callable[..., Any]) -> None:
     pytest.importorskip("av")
     (folder / "film.mp4").write_bytes(b"....ftypisom")
     result = invoke("info", "film.mp4")
@@ -103,7 +110,7 @@ def test_a_capture_that_cannot_be_opened_says_what_it_was_taken_for(folder: Path
     )
 
 
-def test_a_check_that_refuses_what_was_recognised_says_what_it_was_taken_for(folder: Path, invoke: Callable[..., Any]) -> None:
+def test_refused_capture_names_recognised_source(folder: Path, invoke: Callable[..., Any]) -> None:
     (folder / "pictures").mkdir()
     (folder / "pictures" / "a.png").write_bytes(b"no picture")
     result = invoke("info", "pictures")
@@ -111,16 +118,16 @@ def test_a_check_that_refuses_what_was_recognised_says_what_it_was_taken_for(fol
     assert result.stderr.endswith("(pictures is taken for image-folder: it holds 1 .png file)\n")
 
 
-def test_a_source_that_nobody_named_is_not_blamed_on_an_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_of_recognised_source_names_no_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *args: None if name == "av" else found(name, *args))
     (folder / "film.mp4").write_bytes(b"....ftypisom")
-    with pytest.raises(WrongArgumentError) as caught:
-        plan_for(Path("film.mp4"))
+    with pytest.raises(WrongArgumentError) as caught, capture_plan(Path("film.mp4")):
+        pass
     assert str(caught.value).startswith("the source 'video' needs av, which is not installed: pip install ")
 
 
-def test_check_and_explain_say_what_auto_is_and_why(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_check_and_explain_give_reason_of_automatic_source(cube: Path, invoke: Callable[..., Any]) -> None:
     Path("scan.yaml").write_text(
         "version: 1\nsource: {use: auto, with: {path: cube.npy}}\nresample: {with: {group_size: 5}}\nlevels: 1\n"
     )
@@ -131,3 +138,35 @@ def test_check_and_explain_say_what_auto_is_and_why(cube: Path, invoke: Callable
     printed = invoke("explain", "scan.yaml").stdout
     assert f"\n  use: packed-npy  # photonpano 0.1.0, {because}\n" in printed
     assert f"\n    path: {cube}\n" in printed
+
+
+@pytest.mark.parametrize("command", ["run", "check", "explain"])
+def test_spec_command_given_a_capture_names_info(cube: Path, invoke: Callable[..., Any], command: str) -> None:
+    result = invoke(command, "cube.npy")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "error: cube.npy is a capture, and this command takes a spec; `photonpano info cube.npy` reads it and prints a spec\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "arrange"),
+    [
+        ("cut.npy", lambda path: path.write_bytes(Path("cube.npy").read_bytes()[:-9])),
+        ("large.npy", lambda path: np.save(path, np.zeros((2**15, 8, 8), np.uint8))),
+        ("frames", lambda path: (path.mkdir(), Image.new("L", (16, 8)).save(path / "1.png"))),
+    ],
+    ids=["cut short", "larger than any spec", "folder"],
+)
+def test_run_names_info_for_any_recognised_capture(
+    cube: Path, invoke: Callable[..., Any], name: str, arrange: Callable[[Path], Any]
+) -> None:
+    arrange(cube.parent / name)
+    result = invoke("run", name)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {name} is a capture, and this command takes a spec; ")
+
+
+def test_run_reports_file_that_is_neither_spec_nor_capture(cube: Path, invoke: Callable[..., Any]) -> None:
+    (cube.parent / "notes.txt").write_text("no spec")
+    assert "is a capture" not in invoke("run", "notes.txt").stderr

@@ -1,0 +1,161 @@
+"""Arguments and options that several commands share, and the plans that they name."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from photonpano.errors import Problem
+    from photonpano.registry import Catalog
+    from photonpano.specs import Plan
+
+SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec: a YAML file.", show_default=False)]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a value of the spec, such as run.seed=1 or levels.0.scale=0.5. Repeatable.",
+        show_default=False,
+    ),
+]
+CapturePath = Annotated[
+    Path, typer.Argument(metavar="PATH", help="A capture (a file or a folder), or a spec (.yaml).", show_default=False)
+]
+SourceName = Annotated[
+    str | None,
+    typer.Option(
+        "--source",
+        metavar="NAME",
+        help="The source that reads the capture; by default the one that recognises it.",
+        show_default=False,
+    ),
+]
+Keys = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--with",
+        metavar="KEY=VALUE",
+        help="Set a key of the source, such as frame_rate_hz=96800. Repeatable.",
+        show_default=False,
+    ),
+]
+Corrections = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--correct",
+        metavar="CORRECTION",
+        help="Apply a correction, as in a spec, such as rot90 or '{crop: {rows: [2, null]}}'. Repeatable.",
+        show_default=False,
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
+
+SPEC_SUFFIXES = {".yaml", ".yml"}
+
+
+def spec_plan(path: Path, overrides: Sequence[str] | None, output: Path | None = None, catalog: Catalog | None = None) -> Plan:
+    """Load the spec that a command names.
+
+    Raises:
+        SpecError: the spec is wrong.
+        WrongArgumentError: the path is a capture.
+    """
+    from photonpano.cli.errors import WrongArgumentError
+    from photonpano.errors import SpecError
+    from photonpano.specs import load_spec
+
+    try:
+        return load_spec(path, overrides or (), output, catalog)
+    except SpecError:
+        if not _is_spec(path) and _is_capture(path, catalog):
+            raise WrongArgumentError(
+                f"{path} is a capture, and this command takes a spec; `photonpano info {path}` reads it and prints a spec"
+            ) from None
+        raise
+
+
+@contextmanager
+def capture_plan(
+    path: Path,
+    source: str | None = None,
+    keys: Sequence[str] | None = None,
+    corrections: Sequence[str] | None = None,
+    catalog: Catalog | None = None,
+) -> Iterator[Plan]:
+    """Make the plan of a capture that is given by its path, or by a spec.
+
+    Errors of the options, in making the plan and in the block, name the option instead of a key of a spec that nobody wrote.
+
+    Args:
+        path: the capture, or a spec.
+        source: the source that reads it.
+        keys: its keys, such as `frame_rate_hz=96800`.
+        corrections: items of the spec's list of corrections, in YAML; they replace those of a spec.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        SpecError: the spec is wrong.
+        WrongArgumentError: no source recognises the capture, or an option is wrong.
+    """
+    from photonpano.api.captures import capture_plan as plan_of_capture
+    from photonpano.cli.errors import WrongArgumentError
+    from photonpano.specs import load_spec
+
+    for key in keys or ():
+        if "=" not in key:
+            raise WrongArgumentError(f"--with {key}: expected KEY=VALUE, such as frame_rate_hz=96800")
+    changes = [f"source.with.{key}" for key in keys or ()]
+    if source is not None:
+        changes.append(f"source.use={source}")
+    if corrections:
+        changes.append(f"corrections=[{', '.join(corrections)}]")
+    if _is_spec(path):
+        yield load_spec(path, changes, catalog=catalog)
+        return
+    with _attributing_to_options(source):
+        yield plan_of_capture(path, overrides=changes, catalog=catalog)
+
+
+@contextmanager
+def _attributing_to_options(source: str | None) -> Iterator[None]:
+    from photonpano.cli.errors import WrongArgumentError
+    from photonpano.errors import SpecError
+
+    try:
+        yield
+    except SpecError as error:
+        raise WrongArgumentError("\n".join(_message(each, source) for each in error.problems)) from error
+
+
+def _is_capture(path: Path, catalog: Catalog | None) -> bool:
+    """Return whether a source recognises a path, even if it cannot read it."""
+    from photonpano.api.captures import capture_plan as plan_of_capture
+    from photonpano.errors import SpecError
+
+    try:
+        plan_of_capture(path, catalog=catalog)
+    except SpecError as error:
+        return all(problem.where != "source.with.path" for problem in error.problems)
+    return True
+
+
+def _is_spec(path: Path) -> bool:
+    return path.suffix.lower() in SPEC_SUFFIXES
+
+
+def _message(problem: Problem, source: str | None) -> str:
+    """Return the message of a problem, after the option that set the value, if one did."""
+    where = problem.where
+    if where in ("", "source", "source.with.path") or (where == "source.use" and source is None):
+        return problem.message
+    if where.startswith("corrections"):
+        return f"--correct: {problem.message}"
+    option = "--source" if where == "source.use" else where.replace("source.with.", "--with ", 1)
+    return f"{option}: {problem.message}"

@@ -1,0 +1,35 @@
+"""Print tables, and what was written."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from photonpano.api.captures import WrittenCapture
+
+
+def columns(rows: Sequence[Sequence[str]]) -> str:
+    """Align rows of text in columns: two spaces apart, no line wrapped, no trailing spaces."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+
+
+def print_written(written: WrittenCapture) -> None:
+    """Print the files that were written, and the spec that reads them."""
+    from rich.filesize import decimal
+
+    from photonpano.cli.errors import warn
+    from photonpano.registry.description import flow
+
+    if written.n_masked:
+        mask = "mask them with `corrections`"
+        warn(f"{written.n_masked} pixels of the capture are masked, and {written.path} holds no mask; {mask}")
+    files = [(written.path, str(written.info)), (written.truth, "the truth: motion and scene")]
+    typer.echo(columns([[str(file), decimal(file.stat().st_size), text] for file, text in files if file]))
+    typer.echo(f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}")
+    if written.truth:
+        typer.echo(f"\nTo score a run of it: photonpano evaluate RUN --truth {written.truth}")
