@@ -1,9 +1,9 @@
-"""A constant number of groups: the ablation that fails in the paper (section 4, "Re-sample")."""
+"""Constant number of groups: the ablation that fails in the paper (section 4, "Re-sample")."""
 
 from __future__ import annotations
 
 from photonpano import Group
-from photonpano_core.configs import ConstantGroupsConfig
+from photonpano_core.configs import GroupedConfig
 from photonpano_core.grouping import centred, evenly_spread, require_a_group, size_of, spans_at
 
 
@@ -11,14 +11,14 @@ class ConstantGroupsResampler:
     """floor(n / m) groups at every level: those of the first level of `midpoint`.
 
     Raises:
-        ValueError: the config leaves the group size open.
+        ValueError: the group size is `auto`.
     """
 
-    def __init__(self, config: ConstantGroupsConfig) -> None:
+    def __init__(self, config: GroupedConfig) -> None:
         self._size = size_of(config)
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        """Return the same groups whatever the level, side by side, spread evenly from the first frame to the last.
+        """Return the same groups at every level, spread evenly from the first frame to the last.
 
         Raises:
             InputError: the capture has fewer frames than a group.

@@ -1,4 +1,4 @@
-"""`group_size: auto`: as long as motion blur allows, and longer in the dark."""
+"""`group_size: auto`: groups as long as motion blur allows, and longer in the dark."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ from photonpano import CaptureSummary, Group, Resampler, StageContext
 from photonpano_core.grouping import shortest_of
 
 _BLUR = 0.15
-"""Groups of the first level may be blurred by this share of the shorter side of a frame; twice as much spoils the result."""
-_DARK = 3.0
-"""Below so many photons a pixel noise does more harm than blur does, and groups get longer."""
-_DIM = 8.0
-"""Below so many, groups get longer once the motion is known, so that they are not blurred by it."""
-_KNOWN_FROM = 3
-"""From this level on even a trembling hand is known, whose period would forbid long groups before."""
+"""Blur of a group at the first level, as a share of the shorter side of a frame. Twice as much spoils the result."""
+_DARK_PHOTONS = 3.0
+"""Below this many photons per pixel, noise harms more than blur, and groups get longer."""
 _DARK_BLUR = 2.0
-"""In the dark, so many times the blur is allowed."""
-_SHARP = 0.04
-"""Where light is plentiful, groups are so short that they are blurred by this share only; shorter ones tell no more."""
-_PLENTY = 1000.0
-"""So many photons a pixel are plenty."""
-_GROUPS = 8
-"""The first level has at least so many groups, where the capture is long enough."""
-_LEAST = 1e-9
-"""Flux and speed are at least this, so that they can be divided by."""
-_UNKNOWN = 500
-"""The group size if nothing tells how fast the image moves."""
+"""Factor on the blur that is allowed in the dark."""
+_DIM_PHOTONS = 8.0
+"""Below this many photons per pixel, groups are doubled once the motion is known, since it does not blur them any more."""
+_DOUBLED_FROM = 3
+"""First level of doubled groups: only then is the tremor of a hand known, whose period limits the length of groups before."""
+_BRIGHT_PHOTONS = 1000.0
+"""Above this many photons per pixel, groups get shorter, since less blur improves the result more than more light."""
+_BRIGHT_BLUR = 0.04
+"""Blur below which groups do not get shorter, as a share of the shorter side of a frame."""
+_MIN_GROUPS = 8
+"""Groups at the first level, at least, if the capture is long enough."""
+_EPSILON = 1e-9
+"""Floor on flux and speed, which are divided by."""
+_DEFAULT_SIZE = 500
+"""Frames of a group where the speed of the image is unknown."""
 
 
 class AutoResampler:
-    """A resampler that chooses its group size when it is first asked for groups.
+    """A resampler that chooses its group size on the first call of `groups`.
 
-    Where groups get denser from level to level, those of a dim capture get twice as long once the motion is known.
+    If groups get denser from level to level, those of a dim capture are doubled once the motion is known.
     """
 
     def __init__(self, context: StageContext, of_size: Callable[[int], Resampler], densifies: bool) -> None:
         """Prepare to choose.
 
         Args:
-            context: tells flux and speed, and is told the choice.
-            of_size: makes the resampler with a group size.
-            densifies: whether each level has twice as many groups as the one before.
+            context: measures flux and speed, and records the decision.
+            of_size: returns the resampler with a group size.
+            densifies: whether each level has about twice as many groups as the one before.
         """
         self._context, self._of_size, self._densifies = context, of_size, densifies
         self._size: int | None = None
@@ -57,33 +57,34 @@ class AutoResampler:
             stream = self._context.stream
             capture = self._context.capture()
             size, reason = choose_group_size(capture, n_frames, min(stream.frame_shape), shortest_of(stream))
-            self._doubled = self._densifies and capture.flux * size < _DIM and n_frames // (2 * size) >= _GROUPS
+            self._doubled = self._densifies and capture.flux * size < _DIM_PHOTONS and n_frames // (2 * size) >= _MIN_GROUPS
             if self._doubled:
-                reason += f"; from level {_KNOWN_FROM} on, where the motion is known, groups are twice as long for more light"
+                reason += f"; from level {_DOUBLED_FROM} on, where the motion is known, groups are twice as long for more light"
             self._context.decide("group_size", size, reason)
             self._size = size
-        # Groups twice as long, as dense as they would be at this level.
-        twice = self._doubled and level >= _KNOWN_FROM
-        return self._of_size(self._size * (2 if twice else 1)).groups(n_frames, level + (1 if twice else 0))
+        if self._doubled and level >= _DOUBLED_FROM:
+            # Twice the length, at the density of this level.
+            return self._of_size(2 * self._size).groups(n_frames, level + 1)
+        return self._of_size(self._size).groups(n_frames, level)
 
 
 def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int, shortest: int) -> tuple[int, str]:
-    """Return the group size for a capture, in frames, and a clause that gives the reason.
+    """Return the group size for a capture, in frames, and a clause with the reason.
 
-    The blur of a group of m frames at v px a frame is m v px. It may be 0.15 of the shorter side of a frame, and up to twice
-    that as long as a pixel gets fewer than 3 photons; it is kept to 0.04 where a pixel gets 1000 all the same. There are at
-    least `shortest` frames in a group, and at least 8 groups.
+    A group of m frames is blurred by m v px at v px per frame. The blur may be 0.15 of the shorter side of a frame; up to twice
+    that while a pixel collects fewer than 3 photons; down to 0.04 while it collects more than 1000. A group has at least
+    `shortest` frames, and the capture at least 8 groups.
     """
     if capture.speed_px is None:
-        size, bound = _bounded(_UNKNOWN, n_frames, shortest)
-        return size, f"{capture.how}, so {_UNKNOWN} frames are assumed{bound}"
-    allowed = _BLUR * shorter_side_px / max(capture.speed_px, _LEAST)
-    photons = max(capture.flux, _LEAST)
-    wanted, light = allowed, ""
-    if allowed * photons < _DARK:
-        wanted, light = min(_DARK / photons, _DARK_BLUR * allowed), ", so few that more blur is allowed"
-    elif allowed * photons > _PLENTY:
-        wanted, light = max(_PLENTY / photons, allowed * _SHARP / _BLUR), ", enough to shorten groups for less blur"
+        size, bound = _bounded(_DEFAULT_SIZE, n_frames, shortest)
+        return size, f"{capture.how}, so {_DEFAULT_SIZE} frames are assumed{bound}"
+    longest = _BLUR * shorter_side_px / max(capture.speed_px, _EPSILON)
+    flux = max(capture.flux, _EPSILON)
+    wanted, light = longest, ""
+    if longest * flux < _DARK_PHOTONS:
+        wanted, light = min(_DARK_PHOTONS / flux, _DARK_BLUR * longest), ", so few that more blur is allowed"
+    elif longest * flux > _BRIGHT_PHOTONS:
+        wanted, light = max(_BRIGHT_PHOTONS / flux, longest * _BRIGHT_BLUR / _BLUR), ", enough to shorten groups for less blur"
     size, bound = _bounded(wanted, n_frames, shortest)
     blur_px = size * capture.speed_px
     return size, (
@@ -94,10 +95,10 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
 
 
 def _bounded(wanted: float, n_frames: int, shortest: int) -> tuple[int, str]:
-    """Return the nearest size that suits the capture, and what to say if it is not the one that was wanted."""
-    most = max(shortest, n_frames // _GROUPS)
-    if wanted > most:
-        return most, f"; of longer groups there would be fewer than {_GROUPS}"
+    """Return the nearest size that suits the capture, and a clause with the reason if it is not the wanted one."""
+    longest = max(shortest, n_frames // _MIN_GROUPS)
+    if wanted > longest:
+        return longest, f"; of longer groups there would be fewer than {_MIN_GROUPS}"
     if wanted < shortest:
         return shortest, "; shorter groups would be mostly noise" if shortest > 1 else ""
     return round(wanted), ""

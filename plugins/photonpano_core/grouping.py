@@ -1,4 +1,4 @@
-"""Where groups lie: what the resamplers share."""
+"""Positions of groups, shared by the resamplers."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from photonpano import FrameSpan, Group, InputError, StreamInfo
 from photonpano_core.configs import GroupedConfig
 
 _SHORTEST = {"binary": 16, "intensity": 1}
-"""Groups whose length is chosen by us get no shorter than this: too few binary frames tell nothing, a grey one is a picture."""
+"""Frames of the shortest group that `group_size: auto` chooses: fewer binary frames are too noisy."""
 _SHORTEST_END = 4
-"""Those at the ends may: otherwise the motion there is not measured at all."""
+"""Frames of the shortest group at the ends of the capture, which may be noisier, since there is no other measurement there."""
 
 
 def shortest_of(stream: StreamInfo) -> int:
-    """Return the least frames of a group whose length is chosen by us."""
+    """Return the frames of the shortest group that `group_size: auto` chooses."""
     return _SHORTEST[stream.kind]
 
 
 def size_of(config: GroupedConfig) -> int:
-    """Return the frames of a group.
+    """Return the number of frames of a group.
 
     Raises:
-        ValueError: the config leaves them open; `AutoResampler` chooses them.
+        ValueError: it is `auto`; `AutoResampler` resolves that first.
     """
     if config.group_size == "auto":
-        raise ValueError("group_size is a number of frames here, not auto")
+        raise ValueError("group_size must be a number of frames here, not auto")
     return config.group_size
 
 
 def too_short(group_size: int, n_frames: int) -> str | None:
-    """Say that a capture is shorter than a group, if it is."""
+    """Return the problem if a capture is shorter than a group; None if it is not."""
     if n_frames >= group_size:
         return None
     return (
@@ -43,17 +43,17 @@ def too_short(group_size: int, n_frames: int) -> str | None:
 
 
 def require_a_group(group_size: int, n_frames: int) -> None:
-    """Refuse a capture that is shorter than a group.
+    """Raise if a capture is shorter than a group.
 
     Raises:
-        InputError: it is.
+        InputError: the capture has fewer frames than a group.
     """
     if problem := too_short(group_size, n_frames):
         raise InputError(problem)
 
 
 def evenly_spread(n_frames: int, size: int, count: int) -> NDArray[np.float64]:
-    """Return where groups start, from frame 0 to `n_frames - size`: (count,), in frames, fractions included.
+    """Return evenly spaced starts of groups, from frame 0 to `n_frames - size`: (count,), in frames, with fractions.
 
     A single group lies in the middle.
     """
@@ -62,7 +62,7 @@ def evenly_spread(n_frames: int, size: int, count: int) -> NDArray[np.float64]:
 
 
 def spans_at(starts: NDArray[np.float64], size: int) -> list[FrameSpan]:
-    """Return groups that start at the nearest whole frames, each once: between neighbouring frames there is nothing."""
+    """Return spans that start at the nearest whole frames, each once."""
     return [FrameSpan(int(start), int(start) + size) for start in np.unique(np.rint(starts))]
 
 
@@ -75,5 +75,5 @@ def with_ends(spans: list[FrameSpan], n_frames: int, size: int, level: int) -> l
 
 
 def centred(spans: Iterable[FrameSpan]) -> tuple[Group, ...]:
-    """Return groups that are seen from the centres of spans."""
+    """Return groups whose reference instants are the centres of spans."""
     return tuple(Group(span, span.centre) for span in spans)

@@ -1,4 +1,4 @@
-"""What this plugin contributes."""
+"""Hooks: the components that this plugin offers."""
 
 from __future__ import annotations
 
@@ -12,16 +12,12 @@ from photonpano import (
     hookimpl,
 )
 from photonpano_core.configs import (
-    ConstantGroupsConfig,
-    GeodesicConfig,
     GroupedConfig,
-    LieConfig,
-    LucasKanadeConfig,
+    InterpolatorConfig,
     MidpointConfig,
     PhotonMleConfig,
     RobustMergeConfig,
     SlidingWindowConfig,
-    SmoothingSplineConfig,
     SplatConfig,
     StratifiedConfig,
 )
@@ -49,55 +45,53 @@ def photonpano_sources() -> Iterator[SourceContribution]:
 
 @hookimpl
 def photonpano_resamplers() -> Iterator[ResamplerContribution]:
-    """Offer midpoint resampling, and what it is compared with."""
-    yield ResamplerContribution(
-        name="midpoint",
-        summary="Groups of equal size; each level adds one between every two (paper, section 4)",
-        config=MidpointConfig,
-        build=_build_midpoint,
-        check=_check_groups,
+    """Offer midpoint resampling and its alternatives."""
+    yield _resampler(
+        "midpoint",
+        "Groups of equal size; each level adds one between every two (paper, section 4)",
+        MidpointConfig,
+        lambda config, _: MidpointResampler(config),
+        densifies=True,
     )
-    yield ResamplerContribution(
-        name="stratified",
-        summary="As many groups as midpoint has, at instants by chance, one in each stratum",
-        config=StratifiedConfig,
-        build=_build_stratified,
-        check=_check_groups,
+    yield _resampler(
+        "stratified",
+        "As many groups as midpoint, at random instants, one in each stratum",
+        StratifiedConfig,
+        lambda config, context: StratifiedResampler(config, context.seed),
+        densifies=True,
     )
-    yield ResamplerContribution(
-        name="sliding-window",
-        summary="A group every so many frames, at each level (the paper's comparison)",
-        config=SlidingWindowConfig,
-        build=_build_sliding_window,
-        check=_check_groups,
+    yield _resampler(
+        "sliding-window",
+        "Groups at a fixed step, the same at each level (the paper's baseline)",
+        SlidingWindowConfig,
+        lambda config, _: SlidingWindowResampler(config),
     )
-    yield ResamplerContribution(
-        name="constant-groups",
-        summary="The same groups at each level (the paper's failing ablation)",
-        config=ConstantGroupsConfig,
-        build=_build_constant_groups,
-        check=_check_groups,
+    yield _resampler(
+        "constant-groups",
+        "The same groups side by side at each level (the paper's failing ablation)",
+        GroupedConfig,
+        lambda config, _: ConstantGroupsResampler(config),
     )
 
 
 @hookimpl
 def photonpano_mergers() -> Iterator[MergerContribution]:
-    """Offer maximum-likelihood merging: of everything, of what agrees, and frame by frame."""
+    """Offer maximum-likelihood merging: of all frames, without moving objects, and photon by photon."""
     yield MergerContribution(
         name="photon-mle",
-        summary="One maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
+        summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=PhotonMleConfig,
         build=_build_photon_mle,
     )
     yield MergerContribution(
         name="robust-merge",
-        summary="photon-mle without ghosts: what moves by itself counts less (Ma and others 2020)",
+        summary="photon-mle without ghosts: moving objects get less weight (Ma et al. 2020)",
         config=RobustMergeConfig,
         build=_build_robust_merge,
     )
     yield MergerContribution(
         name="splat",
-        summary="Puts each lit pixel where the motion of its own frame says: for the dark, and for fast motion",
+        summary="Warps each photon along the motion of its own frame: for low light and fast motion",
         config=SplatConfig,
         build=_build_splat,
     )
@@ -105,56 +99,49 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
 
 @hookimpl
 def photonpano_interpolators() -> Iterator[InterpolatorContribution]:
-    """Offer the paper's interpolation, and others."""
+    """Offer the paper's interpolation and its alternatives."""
     yield InterpolatorContribution(
         name="lucas-kanade",
         summary="Cubic spline of the eight parameters of the homography (paper, section 4)",
-        config=LucasKanadeConfig,
+        config=InterpolatorConfig,
         build=_build_lucas_kanade,
     )
     yield InterpolatorContribution(
         name="smoothing-spline",
-        summary="Cubic spline of the eight parameters, as smooth as the noise asks for",
-        config=SmoothingSplineConfig,
+        summary="Cubic spline of the eight parameters, whose smoothness follows from the noise",
+        config=InterpolatorConfig,
         build=_build_smoothing_spline,
     )
     yield InterpolatorContribution(
         name="geodesic",
         summary="Constant velocity from each located instant to the next, along geodesics",
-        config=GeodesicConfig,
+        config=InterpolatorConfig,
         build=_build_geodesic,
     )
     yield InterpolatorContribution(
         name="lie",
         summary="Cubic spline in the group of the homographies",
-        config=LieConfig,
+        config=InterpolatorConfig,
         build=_build_lie,
     )
 
 
-def _build_midpoint(config: MidpointConfig, context: StageContext) -> Resampler:
-    return _of_size(config, context, MidpointResampler, densifies=True)
+def _resampler(
+    name: str,
+    summary: str,
+    config: type[Grouped],
+    of_config: Callable[[Grouped, StageContext], Resampler],
+    *,
+    densifies: bool = False,
+) -> ResamplerContribution:
+    def build(config: Grouped, context: StageContext) -> Resampler:
+        if config.group_size != "auto":
+            return of_config(config, context)
+        return AutoResampler(
+            context, lambda size: of_config(config.model_copy(update={"group_size": size}), context), densifies
+        )
 
-
-def _build_stratified(config: StratifiedConfig, context: StageContext) -> Resampler:
-    return _of_size(config, context, lambda sized: StratifiedResampler(sized, context.seed), densifies=True)
-
-
-def _build_sliding_window(config: SlidingWindowConfig, context: StageContext) -> Resampler:
-    return _of_size(config, context, SlidingWindowResampler, densifies=False)
-
-
-def _build_constant_groups(config: ConstantGroupsConfig, context: StageContext) -> Resampler:
-    return _of_size(config, context, ConstantGroupsResampler, densifies=False)
-
-
-def _of_size(
-    config: Grouped, context: StageContext, resampler: Callable[[Grouped], Resampler], *, densifies: bool
-) -> Resampler:
-    """Build a resampler now, or once the capture has told its group size."""
-    if config.group_size != "auto":
-        return resampler(config)
-    return AutoResampler(context, lambda size: resampler(config.model_copy(update={"group_size": size})), densifies)
+    return ResamplerContribution(name=name, summary=summary, config=config, build=build, check=_check_groups)
 
 
 def _check_groups(config: GroupedConfig, stream: StreamInfo) -> list[str]:
@@ -182,27 +169,27 @@ def _build_splat(config: SplatConfig, context: StageContext) -> Merger:
     return SplatMerger()
 
 
-def _build_lucas_kanade(config: LucasKanadeConfig, context: StageContext) -> Interpolator:
+def _build_lucas_kanade(config: InterpolatorConfig, context: StageContext) -> Interpolator:
     from photonpano_core.lucas_kanade import LucasKanadeInterpolator
 
     del context
     return LucasKanadeInterpolator(config)
 
 
-def _build_smoothing_spline(config: SmoothingSplineConfig, context: StageContext) -> Interpolator:
+def _build_smoothing_spline(config: InterpolatorConfig, context: StageContext) -> Interpolator:
     from photonpano_core.smoothing_spline import SmoothingSplineInterpolator
 
     return SmoothingSplineInterpolator(config, context.stream.frame_shape)
 
 
-def _build_geodesic(config: GeodesicConfig, context: StageContext) -> Interpolator:
+def _build_geodesic(config: InterpolatorConfig, context: StageContext) -> Interpolator:
     from photonpano_core.geodesic import GeodesicInterpolator
 
     del context
     return GeodesicInterpolator(config)
 
 
-def _build_lie(config: LieConfig, context: StageContext) -> Interpolator:
+def _build_lie(config: InterpolatorConfig, context: StageContext) -> Interpolator:
     from photonpano_core.lie import LieInterpolator
 
     return LieInterpolator(config, context.stream.frame_shape)

@@ -1,4 +1,4 @@
-"""Cubic interpolation in the group of the homographies."""
+"""Cubic spline interpolation in the group of the homographies."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from scipy.sparse.linalg import splu
 
 from photonpano import FloatArray, LocationError
 from photonpano.geometry import apply, corners, inverse
-from photonpano_core.configs import LieConfig
-from photonpano_core.group_spline import GroupTrajectory
-from photonpano_core.lucas_kanade import interpolating_spline
+from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.sl3 import exponential, logarithm, unimodular
+from photonpano_core.trajectories import GroupTrajectory, interpolating_spline
 
 DEGREE = 3
 MAX_ITERATIONS = 50
-PASSED_PX = 1e-7
-"""A curve that misses its knots by less, at the corners of the frame, goes through them."""
+TOLERANCE_PX = 1e-7
+"""Converged when the residual at the knots, at the corners of the frame, is below this."""
 
 
 class LieInterpolator:
-    """Puts a curve with a continuous acceleration through the knots: a cumulative cubic B-spline.
+    """Fits a curve with continuous acceleration through the knots: a cumulative cubic B-spline.
 
-    For a camera that is only shifted it is the curve of `lucas-kanade`; for one that turns about a fixed axis the angle is.
+    For a camera that only shifts it equals the curve of `lucas-kanade`; for a rotation about a fixed axis, the angle is a cubic
+    spline.
     """
 
-    def __init__(self, config: LieConfig, frame_shape: tuple[int, int]) -> None:
-        """Take the (height, width) of a frame, whose corners tell what is near enough."""
+    def __init__(self, config: InterpolatorConfig, frame_shape: tuple[int, int]) -> None:
+        """Take the (height, width) of a frame; the residual is measured at its corners."""
         self._config = config
         self._corners = corners(frame_shape)
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> GroupTrajectory:
-        """Interpolate; the information is not used, since the curve goes through every knot.
+        """Interpolate; the information is not used, since the curve passes through every knot.
 
         Raises:
-            LocationError: knots are half a turn or more apart, or they turn too fast, or lie too unevenly, for such a curve.
+            LocationError: knots are half a turn or more apart, or the iteration does not converge.
         """
         del information
         hold = self._config.hold_frames
@@ -45,18 +45,18 @@ class LieInterpolator:
         controls = unimodular(homographies)
         for _ in range(MAX_ITERATIONS):
             curve = GroupTrajectory(instants, controls, DEGREE, hold)
-            missed = inverse(curve.at(instants)) @ homographies
-            if np.abs(apply(missed, self._corners) - self._corners).max() < PASSED_PX:
+            residuals = inverse(curve.at(instants)) @ homographies
+            if np.abs(apply(residuals, self._corners) - self._corners).max() < TOLERANCE_PX:
                 return curve
-            errors = logarithm(unimodular(missed))
+            errors = logarithm(unimodular(residuals))
             if np.isnan(errors).any():
                 break
-            # Spread over the control points as in a vector space, which is right but for the turns between them.
+            # Errors are distributed over the control points as in a vector space, which is exact without rotation between them.
             changes = collocation.solve(errors.reshape(-1, 9)).reshape(-1, 3, 3)
             if np.abs(np.linalg.eigvals(changes)).max() > np.pi:
                 break
             controls = controls @ exponential(changes)
         raise LocationError(
-            "the located exposures turn too fast, or lie too unevenly in time, for a smooth curve of homographies through all "
-            "of them; interpolate with geodesic, lucas-kanade or smoothing-spline"
+            "no smooth curve of homographies was found through the located exposures: they turn too fast, or lie too unevenly "
+            "in time; interpolate with geodesic, lucas-kanade or smoothing-spline"
         )

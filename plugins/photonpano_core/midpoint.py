@@ -8,10 +8,10 @@ from photonpano_core.grouping import centred, evenly_spread, require_a_group, si
 
 
 class MidpointResampler:
-    """floor(n / m) groups at the first level; each further level adds one centred between every two.
+    """floor(n / m) groups at the first level; each further level adds one centred between every two neighbours.
 
     Raises:
-        ValueError: the config leaves the group size open.
+        ValueError: the group size is `auto`.
     """
 
     def __init__(self, config: MidpointConfig) -> None:
@@ -21,10 +21,10 @@ class MidpointResampler:
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
         """Return k = floor(n / m) groups at level 1, 2k - 1 at level 2, 4k - 3 at level 3, ..., and shorter ones at the ends.
 
-        The k groups are spread evenly, so that the first starts at frame 0 and the last ends with the capture; frames that do
-        not fill a group are left out between groups at level 1, never at one end. Every reference is the centre of its
-        group. Each further level halves what remains beyond the first and the last reference, by a group of m / 2, of m / 4,
-        ... frames. No instant comes twice: where groups start at every frame, there is nothing between them.
+        The k groups are spread evenly: the first starts at frame 0, and the last ends with the capture. At level 1, frames that
+        do not fill a group are left out between groups, never at an end. The reference of a group is its centre. Each further
+        level adds a group of m / 2, m / 4, ... frames at each end, which halves the time beyond the outermost references. No
+        instant comes twice: once groups start at every frame, no more are added.
 
         Raises:
             InputError: the capture has fewer frames than a group.

@@ -1,4 +1,4 @@
-"""Maximum-likelihood merging of binary frames along a motion (paper, section 4, "Merge", and equation 3)."""
+"""Maximum-likelihood merging of frames along a motion (paper, section 4, "Merge", and equation 3)."""
 
 from __future__ import annotations
 
@@ -8,74 +8,91 @@ from threading import Lock
 
 import numpy as np
 
-from photonpano import Group, Source, Trajectory, VirtualExposure
+from photonpano import Group, Homography, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, rescaling
-from photonpano.merging import Chunk, CountsCache, accumulate, chunks_of, clipped
+from photonpano.merging import Chunk, CountsCache, PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import PhotonMleConfig
-from photonpano_core.exposures import scaled_shape
 
 Decide = Callable[[str, float, str], None]
 
-_SHARED_BYTES = 64 * 1024**2
-"""Sums that overlapping groups share are kept up to this: a group of them."""
+_CACHE_BYTES = 64 * 1024**2
+"""Memory for the sums that overlapping groups share: about those of one group."""
 
 
 class PhotonMleMerger:
     """Warps the counts of a group to its reference instant and estimates the flux once.
 
-    Warping relative to the reference instant, not to the panorama, keeps the warps small. A pixel lit in every frame gets the
-    flux that `BinaryResponse` states; a pixel that was seen in less than one whole frame is unknown.
+    Warps are relative to the reference instant, not to the panorama, so that they are small. A pixel lit in every frame gets
+    the flux that `BinaryResponse` states; a pixel that was seen in less than one whole frame is unknown.
     """
 
     def __init__(self, config: PhotonMleConfig, decide: Decide | None = None) -> None:
         """Prepare to merge.
 
         Args:
-            config: what the spec says.
-            decide: is told how long chunks are along each motion, and why.
+            config: the keys of the spec.
+            decide: called with the mean length of chunks along each motion, and the reason.
         """
         self._config, self._decide = config, decide
-        self._along: _Along | None = None
+        self._shared: _Shared | None = None
         self._lock = Lock()
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge a group; see `photonpano.Merger`."""
-        shape = scaled_shape(source.info.frame_shape, scale)
         if trajectory is None or not self._config.compensate:
-            still = Chunk(group.span, np.eye(3))
-            photons = accumulate(source, [still], rescaling(scale), shape)
+            photons = unwarped_sum(source, group, scale)
         else:
-            along = self._chunked(source, trajectory)
-            chunks = clipped(along.chunks, group.span, trajectory)
-            to_reference = inverse(trajectory.at([group.reference])[0])
-            photons = accumulate(source, chunks, rescaling(scale) @ to_reference, shape, counts_of=along.counts)
-        flux, weight = photons.estimate(source.response)
-        return VirtualExposure(flux, weight, group, scale, source.response)
+            shared = self._shared_along(source, trajectory)
+            chunks = clipped(shared.chunks, group.span, trajectory)
+            shape = exposure_shape(source, scale)
+            photons = accumulate(source, chunks, to_exposure(group, trajectory, scale), shape, counts_of=shared.counts)
+        return exposure_of(photons, source, group, scale)
 
-    def _chunked(self, source: Source, trajectory: Trajectory) -> _Along:
-        """Return the chunks of a capture along a motion, which the groups of a level share."""
+    def _shared_along(self, source: Source, trajectory: Trajectory) -> _Shared:
         with self._lock:
-            known = self._along
-            if known is not None and known.source is source and known.trajectory is trajectory:
-                return known
-            tolerance_px = self._config.tolerance_px
-            chunks = chunks_of(source.info.span, trajectory, source.info.frame_shape, tolerance_px)
-            if self._decide is not None:
-                self._decide(
-                    "chunk_frames",
-                    round(source.info.n_frames / len(chunks), 1),
-                    f"so many frames, on average, move less than tolerance_px = {tolerance_px:g} along the motion, "
-                    "and are summed before they are warped",
-                )
-            self._along = _Along(source, trajectory, chunks, CountsCache(source, _SHARED_BYTES))
-            return self._along
+            shared = self._shared
+            if shared is None or shared.source is not source or shared.trajectory is not trajectory:
+                tolerance_px = self._config.tolerance_px
+                chunks = chunks_of(source.info.span, trajectory, source.info.frame_shape, tolerance_px)
+                if self._decide is not None:
+                    self._decide(
+                        "chunk_frames",
+                        round(source.info.n_frames / len(chunks), 1),
+                        f"mean number of consecutive frames that move less than tolerance_px = {tolerance_px:g}; they are "
+                        " summed before they are warped",
+                    )
+                shared = self._shared = _Shared(source, trajectory, chunks, CountsCache(source, _CACHE_BYTES))
+            return shared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Along:
-    """What the groups of a level share: the chunks of the capture along a motion, and their sums."""
+class _Shared:
+    """Chunks of a capture along a motion, with their sums: shared by the groups of a level."""
 
     source: Source
     trajectory: Trajectory
     chunks: tuple[Chunk, ...]
     counts: CountsCache
+
+
+def exposure_shape(source: Source, scale: float) -> tuple[int, int]:
+    """Return the (height, width) of an exposure."""
+    height, width = source.info.frame_shape
+    return max(1, round(height * scale)), max(1, round(width * scale))
+
+
+def to_exposure(group: Group, trajectory: Trajectory, scale: float) -> Homography:
+    """Return (3, 3): pixels of the reference plane to pixels of the exposure, at the group's reference instant."""
+    return rescaling(scale) @ inverse(trajectory.at([group.reference])[0])
+
+
+def unwarped_sum(source: Source, group: Group, scale: float) -> PhotonSum:
+    """Sum the frames of a group as they are, while no motion is known."""
+    chunk = Chunk(group.span, np.eye(3))
+    return accumulate(source, [chunk], rescaling(scale), exposure_shape(source, scale))
+
+
+def exposure_of(photons: PhotonSum, source: Source, group: Group, scale: float) -> VirtualExposure:
+    """Estimate the flux of a sum."""
+    flux, weight = photons.estimate(source.response)
+    return VirtualExposure(flux, weight, group, scale, source.response)

@@ -1,34 +1,33 @@
-"""Robust merging: what moves by itself leaves no ghosts (after Ma and others 2020, "Quanta Burst Photography")."""
+"""Robust merging: moving objects leave no ghosts (after Ma et al. 2020, "Quanta Burst Photography")."""
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, Group, Response, Source, Trajectory, VirtualExposure
-from photonpano.merging import PhotonSum, accumulate, chunks_of
+from photonpano.merging import PhotonSum, accumulate, chunks_of, divided
 from photonpano_core.configs import RobustMergeConfig
-from photonpano_core.exposures import scaled_shape, summed_as_they_lie, to_exposure
+from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
 Image = NDArray[np.float32]
 
-_LEAST_SHARE = 1e-3
-"""Where less than this of a neighbourhood was seen by both, nothing is compared."""
+_MIN_WEIGHT = 1e-3
+"""Blocks are compared where the smoothed weight of their overlap is above this."""
 
 
 class RobustMerger:
-    """Divides a group into blocks of frames, and trusts each where it agrees with the block around the reference instant.
+    """Divides a group into blocks of frames, and weights each where it differs from the block around the reference instant.
 
-    Where the difference D of two smoothed blocks exceeds what photon noise and an inexact motion explain, a block counts for
-    `s^2 / (s^2 + e)`: s is the standard deviation of the noise of D, and e what `D^2` exceeds the tolerated. It is the
-    gain of a Wiener filter. Counts and weights shrink alike, so that the weight still says how many frames a pixel was seen in.
+    D is the difference of two smoothed blocks. Where D^2 exceeds the tolerance for photon noise and motion errors by e, the
+    block has the weight `s^2 / (s^2 + e)`, with the standard deviation s of the noise of D: the gain of a Wiener filter. Counts
+    and weights are multiplied alike, so that the weight remains the number of frames in which a pixel was seen.
 
-    A block that the reference block does not overlap, as at the borders of the exposure, has nothing to differ from, and counts
-    fully. So does everything while no motion is known: the scene's motion cannot be told from the camera's.
+    A block has its full weight where the reference block does not overlap it, as at the borders of the exposure, and everywhere
+    while no motion is known, since the motion of the scene is then not separable from that of the camera.
     """
 
     def __init__(self, config: RobustMergeConfig) -> None:
@@ -36,60 +35,50 @@ class RobustMerger:
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge a group; see `photonpano.Merger`."""
-        if trajectory is None:
-            photons = summed_as_they_lie(source, group, scale)
-        else:
-            photons = self._sum(source, group, trajectory, scale)
-        flux, weight = photons.estimate(source.response)
-        return VirtualExposure(flux, weight, group, scale, source.response)
+        photons = unwarped_sum(source, group, scale) if trajectory is None else self._sum(source, group, trajectory, scale)
+        return exposure_of(photons, source, group, scale)
 
     def _sum(self, source: Source, group: Group, trajectory: Trajectory, scale: float) -> PhotonSum:
-        onto = to_exposure(group, trajectory, scale)
-        shape = scaled_shape(source.info.frame_shape, scale)
+        onto, shape = to_exposure(group, trajectory, scale), exposure_shape(source, scale)
 
         def summed(span: FrameSpan) -> PhotonSum:
             chunks = chunks_of(span, trajectory, source.info.frame_shape, self._config.tolerance_px)
             return accumulate(source, chunks, onto, shape)
 
-        blocks = divided(group.span, self._config.blocks)
+        start = group.span.start
+        parts = divided(len(group.span), self._config.blocks)
+        blocks = [FrameSpan(start + part.start, start + part.stop) for part in parts]
         middle = next(block for block in blocks if group.reference < block.stop)
         reference = summed(middle)
         counts, weight = reference.counts.copy(), reference.weight.copy()
         for block in blocks:
             if block != middle:
                 photons = summed(block)
-                trust = agreement(photons, reference, source.response, self._config, scale)
+                trust = trust_weights(photons, reference, source.response, self._config, scale)
                 counts += trust * photons.counts
                 weight += trust * photons.weight
         return PhotonSum(counts, weight)
 
 
-def divided(span: FrameSpan, parts: int) -> list[FrameSpan]:
-    """Divide a span into parts of about the same length, of a frame at least."""
-    parts = min(parts, len(span))
-    bounds = [span.start + len(span) * part // parts for part in range(parts + 1)]
-    return [FrameSpan(start, stop) for start, stop in pairwise(bounds)]
+def trust_weights(block: PhotonSum, reference: PhotonSum, response: Response, config: RobustMergeConfig, scale: float) -> Image:
+    """Return the weights of a block's pixels: (H, W), from 0 to 1.
 
-
-def agreement(block: PhotonSum, reference: PhotonSum, response: Response, config: RobustMergeConfig, scale: float) -> Image:
-    """Return how far a block is to be trusted: (H, W), from 0 to 1.
-
-    Both are smoothed over the same places with the same weights, and compared on the scale on which photon noise is uniform.
+    Both blocks are smoothed with the same weights, and compared on the scale on which photon noise is uniform.
 
     Args:
-        block: sums of some frames, on the grid of the exposure.
-        reference: those of the frames around the reference instant.
-        response: the camera's, which tells the noise.
-        config: what is tolerated, in px of a frame.
+        block: sum of some frames, on the grid of the exposure.
+        reference: sum of the frames around the reference instant.
+        response: the camera's response.
+        config: tolerances and smoothing, in px of a frame.
         scale: pixels of the exposure per pixel of a frame.
     """
     blur_px = config.smoothing_px * scale
-    # The weight of least variance of a difference; 0 where one of them saw nothing.
+    # The weights for which the smoothed difference has the least variance; 0 where a block saw nothing.
     both = block.weight * reference.weight / np.maximum(block.weight + reference.weight, np.float32(1e-6))
     smoothed = _blurred(both, blur_px)
-    seen = smoothed > _LEAST_SHARE
+    seen = smoothed > _MIN_WEIGHT
     norm: Image = np.where(seen, smoothed, np.float32(1))
-    # The square of a Gaussian is a narrower one. Noise is that of pixels of frames, however large those of the exposure are.
+    # The square of a Gaussian is a narrower Gaussian. Noise is independent between pixels of frames, not of the exposure.
     squares = _blurred(both, blur_px / math.sqrt(2)) / np.float32(4 * math.pi * config.smoothing_px**2)
     frames = np.maximum(norm**2 / np.maximum(squares, np.float32(1e-9)), np.float32(1))
     means: list[Image] = [_blurred(both * _mean(each), blur_px) / norm for each in (block, reference)]
@@ -102,7 +91,7 @@ def agreement(block: PhotonSum, reference: PhotonSum, response: Response, config
 
 
 def _mean(photons: PhotonSum) -> Image:
-    """Return the mean count of a frame; 0 where nothing was seen."""
+    """Return the mean count per frame; 0 where nothing was seen."""
     return np.divide(photons.counts, photons.weight, out=np.zeros_like(photons.counts), where=photons.weight > 0)
 
 

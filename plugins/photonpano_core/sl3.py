@@ -1,7 +1,7 @@
-"""The exponential and the logarithm of 3x3 matrices, for stacks of them.
+"""Exponential and logarithm of stacks of 3x3 matrices.
 
 A homography is a matrix up to scale; with determinant 1 it is an element of the group SL(3), and its logarithm, of trace 0,
-one of the algebra sl(3). Nothing here depends on the unit of a pixel, or on where pixels are counted from.
+one of the algebra sl(3). The results do not depend on the origin and unit of pixel coordinates.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 from photonpano import FloatArray
 
 _TERMS = 19
-"""Of the exponential series where eigenvalues are below 1: what is left out is below 1 / 19!, a rounding error."""
+"""Terms of the exponential series; for eigenvalues below 1 the remainder is below 1 / 19!, a rounding error."""
 _SMALL = 0.2
-"""The logarithmic series is exact to rounding after eight terms where the eigenvalues of the result are below this."""
+"""Below this eigenvalue of the logarithm, eight terms of its series are exact to rounding."""
 _ITERATIONS = 10
-"""Of a square root; they converge quadratically."""
+"""Newton iterations of a square root, which converge quadratically."""
 
 
 def unimodular(matrices: FloatArray) -> FloatArray:
@@ -26,12 +26,12 @@ def unimodular(matrices: FloatArray) -> FloatArray:
 def exponential(matrices: FloatArray) -> FloatArray:
     """Return the matrix exponentials of (N, 3, 3) matrices."""
     trace, minors, determinant = _invariants(matrices)
-    # No eigenvalue exceeds this bound (Fujiwara): halve until it is below 1, and square as often.
+    # Bound of the eigenvalues (Fujiwara): halve the matrix until it is below 1, and square the result as often.
     largest = 2 * np.maximum(np.maximum(np.abs(trace), np.sqrt(np.abs(minors))), np.cbrt(np.abs(determinant)))
     halvings = np.ceil(np.log2(np.maximum(largest, 1)))
     scale = 0.5**halvings
     trace, minors, determinant = trace * scale, minors * scale**2, determinant * scale**3
-    # By the theorem of Cayley and Hamilton every power of A is a combination of I, A and A^2, and so is the series.
+    # Cayley-Hamilton: every power of A, and so the series, is a combination of I, A and A^2.
     power = (np.ones_like(trace), np.zeros_like(trace), np.zeros_like(trace))
     series = np.array(power)
     for term in range(1, _TERMS):
@@ -51,8 +51,8 @@ def logarithm(matrices: FloatArray) -> FloatArray:
     """Return the principal logarithms of (N, 3, 3) matrices of determinant 1.
 
     Returns:
-        (N, 3, 3); NaN for a matrix that has none among the real ones, or one whose eigenvalues exceed pi: it mirrors, turns by
-        half a turn, or magnifies more than twentyfold.
+        (N, 3, 3); NaN where there is no real logarithm, or one with an eigenvalue above pi: the matrix mirrors, turns by half a
+        turn or more, or magnifies more than twentyfold.
     """
     with np.errstate(divide="ignore"):
         size = np.abs(np.log(np.linalg.eigvals(matrices).astype(complex))).max(axis=-1)
@@ -79,7 +79,7 @@ def _square_root(matrices: FloatArray) -> FloatArray:
 
 
 def _invariants(matrices: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the coefficients of the characteristic polynomials x^3 - a x^2 + b x - c: three of (N,)."""
+    """Return the coefficients of the characteristic polynomials x^3 - a x^2 + b x - c: three arrays (N,)."""
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrices, 0, -1)
     minors = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
     return a + e + i, minors, np.linalg.det(matrices)

@@ -1,4 +1,4 @@
-"""Sliding windows: what the paper compares its resampling with (section 4, "Computational Considerations")."""
+"""Sliding windows, the baseline of the paper (section 4, "Computational Considerations")."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from photonpano_core.grouping import centred, evenly_spread, require_a_group, si
 class SlidingWindowResampler:
     """A group of m frames every s frames.
 
-    With one step for all levels, the first pays for as many groups as the last, though its motion is not known well enough
-    for so many to tell more than a few: O(n m / s) frames a level.
+    With one step for all levels, the first level has as many groups as the last, O(n m / s) frames a level, although so many
+    hardly help while the motion is inaccurate.
 
     Raises:
-        ValueError: the config leaves the group size open.
+        ValueError: the group size is `auto`.
     """
 
     def __init__(self, config: SlidingWindowConfig) -> None:

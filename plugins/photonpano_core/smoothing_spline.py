@@ -1,4 +1,4 @@
-"""A smoothing spline of the eight parameters of the homography, as smooth as the noise of the knots asks for."""
+"""A smoothing spline of the eight parameters of the homography, whose smoothness is estimated from the noise of the knots."""
 
 from __future__ import annotations
 
@@ -11,46 +11,45 @@ from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_ban
 
 from photonpano import FloatArray
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
-from photonpano_core.configs import SmoothingSplineConfig
-from photonpano_core.lucas_kanade import ParameterTrajectory, interpolating_spline
+from photonpano_core.configs import InterpolatorConfig
+from photonpano_core.trajectories import ParameterTrajectory, interpolating_spline
 
 ORDER = 3
-"""Of the derivative that is penalised. A parabola, which fits any three knots, goes free."""
+"""Order of the derivative that is penalised. Parabolas, which fit any three knots, are not penalised."""
 _SCALES = np.logspace(-10, 10, 41)
-"""From hardly any jerk, so that a parabola remains, to so much that all knots stay where they are. The number of knots that are
-averaged goes with the sixth root."""
+"""Candidates for the scale of the jerk: from a parabola to interpolation. The number of knots that are averaged grows with the
+sixth root."""
 _NOISES = np.logspace(-16, 0, 129)
-"""Variances of the noise, as shares of how far the quiet modes are from a parabola."""
+"""Candidates for the variance of the noise, relative to the squared distance of the quiet modes from a parabola."""
 _TINY = 1e-200
-"""The noise of knots that lie on a parabola exactly."""
-_LEAST_KNOWN = 1e-8
-"""What a knot knows of nothing, as a share of the best known: its error is no more than 10,000 times as large."""
+"""Floor on the noise variance, for knots that lie on a parabola exactly."""
+_MIN_INFORMATION = 1e-8
+"""Floor on the information eigenvalues of a knot, relative to the largest."""
 _TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
-"""From the coordinates of the corners to shift, twist, stretch and shear: orthonormal, so that these too are in px."""
+"""Orthonormal map from the corners' coordinates to modes (shift, twist, stretch, shear), which so are in px, too."""
 _QUIET = [2, 3]
-"""The twists. A shaking camera shifts, rolls, perhaps stretches the image, but hardly changes its perspective."""
+"""The twists: modes that a shaking camera hardly excites, since it changes shift, roll and scale more than perspective."""
 
 
 class SmoothingSplineInterpolator:
-    """Moves the knots as far as their noise deserves, and puts the spline of `lucas-kanade` through them.
+    """Smooths the knots according to their noise, and fits the spline of `lucas-kanade` through them.
 
-    They move to the spline f of degree 5 that minimises, over the knots y with their information W,
+    The knots y with information W are moved onto the spline f of degree 5 that minimises
 
         sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale,
 
-    where y are the modes of the motion of the frame's corners, in px. So each knot counts for what it knows, direction by
-    direction, and each mode is as smooth as it is found to be. The scales, and the factor by which all noise differs from what
-    W says, have the restricted maximum likelihood if the jerk is white noise. The factor is found from the modes that a
-    trembling camera hardly excites; in the others, motion that is too fast for the knots looks like noise.
+    where y are the modes of the motion of the frame's corners, in px. Each mode has its own scale. The scales, and a factor on
+    the covariances W^-1, are estimated by restricted maximum likelihood with white noise as the jerk. The factor is estimated
+    from the twists alone: in the other modes, motion that is too fast for the knots looks like noise.
     """
 
-    def __init__(self, config: SmoothingSplineConfig, frame_shape: tuple[int, int]) -> None:
+    def __init__(self, config: InterpolatorConfig, frame_shape: tuple[int, int]) -> None:
         """Take the (height, width) of a frame."""
         self._config = config
         self._corners = corners(frame_shape)
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
-        """Smooth; without information all knots count alike, with equal and independent errors of the corners.
+        """Smooth; without information, all corners of all knots have equal and independent errors.
 
         Up to three knots are interpolated.
         """
@@ -59,21 +58,21 @@ class SmoothingSplineInterpolator:
         return ParameterTrajectory(instants, interpolating_spline(instants, parameters(homographies)), self._config.hold_frames)
 
     def _smoothed(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> FloatArray:
-        """Return the (N, 3, 3) homographies of knots after smoothing."""
+        """Return the smoothed (N, 3, 3) homographies of the knots."""
         covariances = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
         if information is not None:
-            slopes = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
-            covariances = _covariances(information, _TO_MODES @ slopes)
+            derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
+            covariances = _covariances(information, _TO_MODES @ derivatives)
         paths = apply(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
         moved = _smoothed_modes(instants, paths, covariances) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
 
 def _smoothed_modes(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return where a smoothing spline passes its knots: (N, 8).
+    """Return a smoothing spline at its knots: (N, 8).
 
-    Noise of the knots, and a jerk that is white noise, both make third differences that are normally distributed. What the jerk
-    does not explain of them is noise (Reinsch 1967; de Hoog and Hutchinson 1987).
+    With normal noise of the knots, and white noise as the jerk, third differences are normally distributed. The part of them
+    that the jerk does not explain is noise (Reinsch 1967; de Hoog and Hutchinson 1987).
 
     Args:
         instants: (N,), more than three.
@@ -97,10 +96,10 @@ def _smoothed_modes(instants: FloatArray, knots: FloatArray, covariances: FloatA
 
 
 class _Mode:
-    """How likely the third differences of one mode are, for each scale of its jerk.
+    """Likelihood of the third differences of one mode, for each scale of its jerk.
 
-    With the noise variance s and the jerk's variance s l, they are normally distributed with the covariance s (V + l J). So
-    minus twice the logarithm of their likelihood is n log s + squares(l) / s + determinant(l), but for a constant.
+    With the noise variance s and the jerk's variance s l, they are normally distributed with the covariance s (V + l J). The
+    deviance is n log s + squares(l) / s + determinant(l), up to a constant.
 
     Attributes:
         n_observed: n.
@@ -110,7 +109,7 @@ class _Mode:
     """
 
     def __init__(self, observed: FloatArray, noise: sparse.csr_array, jerk: sparse.csr_array) -> None:
-        """Take the (N - 3,) third differences, and their covariances due to each."""
+        """Take the (N - 3,) third differences, and their covariances V and J from noise and jerk of unit variance."""
         self.n_observed = len(observed)
         self.scales = _SCALES * np.median(noise.diagonal() / jerk.diagonal())
         self.squares, self.determinants = np.empty((2, len(self.scales)))
@@ -121,12 +120,12 @@ class _Mode:
             self.determinants[index] = 2 * np.log(factor[-1]).sum()
 
     def deviances(self, noises: FloatArray) -> FloatArray:
-        """Return minus twice the logarithms of the likelihoods with S variances of the noise: (S, L)."""
+        """Return the deviances, minus twice the log likelihoods, for S variances of the noise: (S, L)."""
         return self.n_observed * np.log(noises)[:, None] + self.squares / noises[:, None] + self.determinants
 
 
 def _most_likely_scales(modes: Sequence[_Mode]) -> list[float]:
-    """Return the scale of the jerk of each mode that is most likely, with the noise that is most likely for the quiet ones."""
+    """Return the most likely scale of the jerk of each mode, given the most likely noise of the quiet modes."""
     quiet = [modes[index] for index in _QUIET]
     largest = sum(mode.squares[0] for mode in quiet) / sum(mode.n_observed for mode in quiet)
     noises = max(largest, _TINY) * _NOISES
@@ -135,7 +134,7 @@ def _most_likely_scales(modes: Sequence[_Mode]) -> list[float]:
 
 
 def _from_corners(here: FloatArray, there: FloatArray) -> FloatArray:
-    """Return the homographies that send (4, 2) points to (N, 4, 2) ones: (N, 3, 3)."""
+    """Return the homographies that map (4, 2) points to (N, 4, 2) points: (N, 3, 3)."""
     x, y = np.broadcast_to(here, there.shape)[..., None].transpose(2, 0, 1, 3)
     u, v = there[..., None].transpose(2, 0, 1, 3)
     zero, one = np.zeros_like(x), np.ones_like(x)
@@ -147,16 +146,16 @@ def _from_corners(here: FloatArray, there: FloatArray) -> FloatArray:
     return from_parameters(np.linalg.solve(equations, (there - here).reshape(-1, 8, 1))[..., 0])
 
 
-def _covariances(information: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Return (N, 8, 8) covariances of what has these slopes by p1..p8; a knot may know nothing of a direction."""
-    back = np.linalg.inv(slopes)
+def _covariances(information: FloatArray, derivatives: FloatArray) -> FloatArray:
+    """Return the (N, 8, 8) covariances of functions with these derivatives by p1..p8; the information may be singular."""
+    back = np.linalg.inv(derivatives)
     values, vectors = np.linalg.eigh(back.transpose(0, 2, 1) @ information @ back)
-    values = np.maximum(values, _LEAST_KNOWN * values.max())
+    values = np.maximum(values, _MIN_INFORMATION * values.max())
     return np.asarray((vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
 def _third_differences(times: FloatArray) -> sparse.csr_array:
-    """Return the (N - 3, N) map from N values to divided differences, which are the third derivatives of cubics."""
+    """Return the (N - 3, N) map from N values to divided differences: for a cubic, its third derivative."""
     result = sparse.csr_array(sparse.eye_array(len(times)))
     for order in range(1, ORDER + 1):
         lengths = times[order:] - times[:-order]
@@ -167,19 +166,20 @@ def _third_differences(times: FloatArray) -> sparse.csr_array:
 def _jerk_covariance(times: FloatArray) -> sparse.csr_array:
     """Return the covariance of third differences of a motion whose jerk is white noise of unit density: (N - 3, N - 3).
 
-    Each is the jerk, averaged by a B-spline over four instants (Peano); so it is the integral of products of those.
+    Each difference is the average of the jerk, weighted by a B-spline over four instants (Peano kernel); so the covariances are
+    integrals of products of B-splines.
     """
     nodes, weights = np.polynomial.legendre.leggauss(ORDER)
     halves = np.diff(times)[:, None] / 2
     points = times[:-1, None] + halves * (1 + nodes)
     padded = np.pad(times, ORDER - 1, mode="edge")
-    # Those at the ends, with knots that coincide, average over fewer instants.
+    # B-splines at the ends have coinciding knots, and average over fewer instants.
     splines = BSpline.design_matrix(points.ravel(), padded, ORDER - 1)[:, ORDER - 1 : 1 - ORDER]
     averages = splines @ sparse.diags_array(ORDER / (times[ORDER:] - times[:-ORDER]))
     return sparse.csr_array(averages.T @ sparse.diags_array((halves * weights).ravel()) @ averages)
 
 
 def _banded(matrix: sparse.csr_array, width: int) -> FloatArray:
-    """Return the diagonals of a symmetric matrix as LAPACK's upper form wants them: (width + 1, N)."""
+    """Return the diagonals of a symmetric matrix in the upper form of LAPACK: (width + 1, N)."""
     width = min(width, matrix.shape[0] - 1)
     return np.stack([np.pad(matrix.diagonal(offset), (offset, 0)) for offset in range(width, -1, -1)])

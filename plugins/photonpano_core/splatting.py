@@ -1,4 +1,4 @@
-"""Lit pixels put where they belong, one by one: loops over binary frames of which most pixels are dark."""
+"""Compiled loops of splatting: warp the lit pixels of binary frames, most of whose pixels are dark."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ _WORD = np.uint64
 
 
 def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64], total: NDArray[np.float32]) -> None:
-    """Put the counts of frames where each of them saw them: on four pixels, linearly, times the area a pixel has there.
+    """Add the counts of frames to a grid, each with bilinear weights to four pixels, times the area of a frame's pixel there.
 
-    It is the adjoint of linear interpolation: what a pixel gives to one of the grid is what it would take from it.
+    This is the adjoint of bilinear interpolation: a pixel of a frame adds to a pixel of the grid with the weight with which it
+    would interpolate from it.
 
     Convention:
         Points are (x, y), integers are pixel centres. The depth `h31 x + h32 y + h33` is positive in front of the camera.
 
     Args:
-        frames: (n, h, w) counts of pixels, of which most should be 0.
-        used: (h, w), false for pixels that must not count.
+        frames: (n, h, w) counts, most of them 0.
+        used: (h, w), false for pixels to leave out.
         to_grid: (n, 3, 3), pixels of each frame to pixels of the grid; of determinant 1, so that the area is `1 / depth^3`.
-        total: (H + 2, W + 2), what is added to: the grid with a margin of a pixel, which holds what falls over its border.
+        total: (H + 2, W + 2), the grid to add to, with a margin of a pixel for photons that cross its border.
     """
     lanes = _WORD().itemsize // frames.itemsize
     missing = -frames.shape[2] % lanes
@@ -43,7 +44,7 @@ def _splat(
     to_grid: NDArray[np.float64],
     total: NDArray[np.float32],
 ) -> None:
-    """Do so for rows of whole words, which are passed over where they are 0."""
+    """Splat rows of whole words, and skip words that are 0."""
     n_frames, height, width = frames.shape
     words_a_row = words.shape[2]
     lanes = width // words_a_row
@@ -57,7 +58,7 @@ def _splat(
         h20, h21, h22 = to_grid[index, 2]
         image, packed = frames[index].reshape(-1), words[index].reshape(-1)
         for y in range(height):
-            # Light comes by chance, which no processor foresees: what is lit is collected without a branch.
+            # Photons are random, so that branches would be mispredicted: lit pixels are collected without a branch.
             n_busy = n_lit = 0
             for word in range(words_a_row):
                 busy[np.uint64(n_busy)] = word
@@ -72,13 +73,13 @@ def _splat(
                 x = lit[np.uint64(number)]
                 if not used[y, x]:
                     continue
-                near = 1 / (h20 * x + depth_0)
-                # From the corner of the margin on, so that nothing that counts is negative.
-                u, v = (h00 * x + x_0) * near + 1, (h10 * x + y_0) * near + 1
-                if not (near > 0 and 0 <= u < right and 0 <= v < bottom):
+                inverse_depth = 1 / (h20 * x + depth_0)
+                # Relative to the corner of the margin, so that coordinates on the grid are not negative.
+                u, v = (h00 * x + x_0) * inverse_depth + 1, (h10 * x + y_0) * inverse_depth + 1
+                if not (inverse_depth > 0 and 0 <= u < right and 0 <= v < bottom):
                     continue
                 left, top = int(u), int(v)
-                mass = image[np.uint64(y * width + x)] * near * near * near
+                mass = image[np.uint64(y * width + x)] * inverse_depth * inverse_depth * inverse_depth
                 a, b = u - left, mass * (v - top)
                 place = np.uint64(top * columns + left)
                 grid[place] += np.float32((1 - a) * (mass - b))
@@ -91,13 +92,13 @@ def _splat(
 def add_coverage(
     shape: tuple[int, int], to_frame: NDArray[np.float64], total: NDArray[np.float32], steps: NDArray[np.float32]
 ) -> None:
-    """Add what splats of frames of ones add up to where neighbours land a pixel apart: 1, but less at the border.
+    """Add the sum of splats of frames of ones whose pixels stay 1 px apart: 1 inside a frame, less at its border.
 
     Args:
         shape: (h, w) of a frame.
         to_frame: (n, 3, 3), pixels of the grid to pixels of each frame.
         total: (H, W) the grid.
-        steps: (H, W + 1) whose sums along rows are to be added to it in the end.
+        steps: (H, W + 1), row-wise differences, whose cumulative sums are to be added to it in the end.
     """
     height, width = shape
     rows, columns = total.shape
@@ -111,8 +112,8 @@ def add_coverage(
             steps[y, outside] -= 1
             for part in ((first, inside), (outside, last)):
                 for x in range(part[0], part[1]):
-                    near = 1 / (h[2, 0] * x + h[2, 1] * y + h[2, 2])
-                    u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) * near
-                    v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) * near
+                    inverse_depth = 1 / (h[2, 0] * x + h[2, 1] * y + h[2, 2])
+                    u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) * inverse_depth
+                    v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) * inverse_depth
                     along, across = 1 + min(u, width - 1 - u, 0.0), 1 + min(v, height - 1 - v, 0.0)
                     total[y, x] += max(along, 0.0) * max(across, 0.0)

@@ -1,4 +1,4 @@
-"""Stratified sampling of instants: as dense as midpoint resampling, by chance within even strata."""
+"""Stratified sampling of instants: as dense as midpoint resampling, at random within even strata."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from photonpano_core.grouping import centred, evenly_spread, require_a_group, si
 
 
 class StratifiedResampler:
-    """As many groups as `midpoint` has at each level, each by chance in a stratum of its own.
+    """As many groups as `midpoint` at each level, each at random within its own stratum.
 
-    Groups at equal distances see a hand that trembles with that period always in the same phase, and take it for standing
-    still. Groups by chance do not.
+    Evenly spaced groups sample a tremor of the same period always at the same phase, and miss it (aliasing). Random groups do
+    not.
 
     Raises:
-        ValueError: the config leaves the group size open.
+        ValueError: the group size is `auto`.
     """
 
     def __init__(self, config: StratifiedConfig, seed: int) -> None:
@@ -25,10 +25,10 @@ class StratifiedResampler:
         self._seed = seed
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        """Return the groups of a level, which follow from the seed, the level and the length of the capture alone.
+        """Return the groups of a level; they depend on the seed, the level and the length of the capture alone.
 
         A stratum reaches half-way to the neighbours of a group of `midpoint`. The first group starts with the capture and
-        the last ends with it, so that no frame is lost, and shorter ones follow at the ends as there. No instant comes twice.
+        the last ends with it, and shorter groups are added at the ends, as in `midpoint`. No instant comes twice.
 
         Raises:
             InputError: the capture has fewer frames than a group.

@@ -24,7 +24,7 @@ def built(stream: StreamInfo, name: str = "midpoint", **context: Any) -> Any:
     return contribution.build(contribution.config(group_size="auto"), StageContext(stream, response=None, **context))
 
 
-def test_in_the_light_motion_blur_decides() -> None:
+def test_choose_group_size_limits_motion_blur_in_the_light() -> None:
     assert choice(0.5, 0.15) == (
         254,
         f"at 0.15 px per frame ({HOW}) groups of 254 frames are blurred by 38.1 px, 0.15 of the shorter side of a frame, "
@@ -32,21 +32,21 @@ def test_in_the_light_motion_blur_decides() -> None:
     )
 
 
-def test_in_the_dark_up_to_twice_the_blur_is_allowed() -> None:
+def test_choose_group_size_allows_twice_the_blur_in_the_dark() -> None:
     size, reason = choice(0.02, 0.3)
     assert size == 150
     assert reason.endswith("hold 3 photons per pixel, so few that more blur is allowed")
     assert choice(0.001, 0.3)[0] == 254
 
 
-def test_a_slow_capture_has_eight_groups() -> None:
+def test_choose_group_size_keeps_eight_groups_for_slow_motion() -> None:
     for speed_px in (0.0, 0.001):
         size, reason = choice(0.5, speed_px)
         assert size == 1250
         assert reason.endswith("; of longer groups there would be fewer than 8")
 
 
-def test_fast_motion_leaves_sixteen_frames() -> None:
+def test_choose_group_size_keeps_sixteen_frames_for_fast_motion() -> None:
     size, reason = choice(0.5, 10.0)
     assert size == 16
     assert reason.endswith(
@@ -55,7 +55,7 @@ def test_fast_motion_leaves_sixteen_frames() -> None:
     )
 
 
-def test_grey_frames_may_stand_alone() -> None:
+def test_choose_group_size_allows_single_grey_frames() -> None:
     """At 500 frames a second the image may move by tens of px from one to the next."""
     assert choice(20, 10.0, shortest=1)[0] == 4
     assert choice(2000, 100.0, shortest=1) == (
@@ -67,7 +67,7 @@ def test_grey_frames_may_stand_alone() -> None:
     assert {len(group.span) for group in resampler.groups(80, 1)} == {1}
 
 
-def test_plenty_of_light_makes_groups_sharp() -> None:
+def test_choose_group_size_reduces_blur_in_bright_light() -> None:
     size, reason = choice(2000, 0.5, shortest=1)
     assert size == 20  # 0.04 of 254 px
     assert reason.endswith("hold 4e+04 photons per pixel, enough to shorten groups for less blur")
@@ -75,7 +75,7 @@ def test_plenty_of_light_makes_groups_sharp() -> None:
     assert choice(0.5, 0.05)[0] == 762  # which are too few
 
 
-def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None:
+def test_choose_group_size_assumes_500_frames_without_speed() -> None:
     how = "no motion can be told at any of 12 places"
     assert choice(0.01, None, how=how) == (500, f"{how}, so 500 frames are assumed")
     assert choice(0.01, None, 2000, how) == (
@@ -90,7 +90,7 @@ def test_a_capture_that_tells_no_motion_gets_500_frames_if_it_has_them() -> None
     n_frames=st.integers(16, 100_000),
     side=st.integers(8, 1024),
 )
-def test_any_capture_gets_a_size_within_bounds(flux: float, speed_px: float | None, n_frames: int, side: int) -> None:
+def test_choose_group_size_keeps_bounds_for_any_capture(flux: float, speed_px: float | None, n_frames: int, side: int) -> None:
     size, reason = choose_group_size(CaptureSummary(flux, speed_px, HOW), n_frames, side, 16)
     assert 16 <= size <= max(16, n_frames // 8)
     assert "\n" not in reason
@@ -98,22 +98,22 @@ def test_any_capture_gets_a_size_within_bounds(flux: float, speed_px: float | No
         assert (size - 1) * speed_px <= 0.3 * side
 
 
-def test_the_size_is_chosen_once_recorded_and_used_at_every_level() -> None:
-    looked, decided = [], []
+def test_auto_resampler_chooses_and_records_size_once() -> None:
+    measured, decided = [], []
 
     def capture() -> CaptureSummary:
-        looked.append(1)
+        measured.append(1)
         return CaptureSummary(0.5, 0.381, HOW)
 
     resampler = built(StreamInfo(1000, 254, 496, None), capture=capture, decide=lambda *what: decided.append(what))
-    assert not looked
+    assert not measured
     fixed = MidpointResampler(MidpointConfig(group_size=100))
     assert [resampler.groups(1000, level) for level in (1, 2, 3)] == [fixed.groups(1000, level) for level in (1, 2, 3)]
-    assert looked == [1]
+    assert measured == [1]
     assert [what[:2] for what in decided] == [("group_size", 100)]
 
 
-def test_groups_of_a_dim_capture_are_doubled_once_the_motion_is_known() -> None:
+def test_auto_resampler_doubles_groups_of_dim_capture_from_level_3() -> None:
     decided: list[tuple] = []
     resampler = built(
         StreamInfo(2000, 254, 496, None),
@@ -129,20 +129,20 @@ def test_groups_of_a_dim_capture_are_doubled_once_the_motion_is_known() -> None:
 
 
 @pytest.mark.parametrize("name", ["constant-groups", "sliding-window"])
-def test_groups_that_get_no_denser_are_not_doubled(name: str) -> None:
+def test_auto_resampler_never_doubles_groups_that_get_no_denser(name: str) -> None:
     """Longer ones would be fewer, or other ones than at the levels before."""
     resampler = built(StreamInfo(2000, 254, 496, None), name, capture=lambda: CaptureSummary(0.05, 0.381, HOW))
     assert resampler.groups(2000, 3) == resampler.groups(2000, 1)
     assert {len(group.span) for group in resampler.groups(2000, 3)} == {100}
 
 
-def test_it_is_left_open_where_no_frames_are_read() -> None:
+def test_auto_resampler_raises_where_no_frames_are_read() -> None:
     resampler = built(StreamInfo(1000, 254, 496, None))
     with pytest.raises(CaptureUnreadError, match=r"^chosen from flux and speed when the capture is read$"):
         resampler.groups(1000, 1)
 
 
-def test_a_capture_shorter_than_the_shortest_group_is_refused() -> None:
+def test_check_refuses_capture_shorter_than_shortest_group() -> None:
     for contribution in photonpano_resamplers():
         config = contribution.config(group_size="auto")
         assert contribution.check(config, StreamInfo(16, 8, 8, None)) == []

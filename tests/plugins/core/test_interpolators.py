@@ -22,7 +22,7 @@ few = settings(max_examples=20, deadline=None)
 @pytest.mark.parametrize("name", EXACT)
 @few
 @given(gaps=gaps, seed=seeds)
-def test_they_go_through_every_knot(name, gaps, seed, fit, motions):
+def test_interpolators_pass_through_every_knot(name, gaps, seed, fit, motions):
     instants, knots = np.cumsum(gaps), motions(len(gaps), seed)
     trajectory = fit(name, instants, knots)
     assert corner_displacements(trajectory.at(instants), knots, FRAME_SHAPE).max() < 1e-6
@@ -31,7 +31,7 @@ def test_they_go_through_every_knot(name, gaps, seed, fit, motions):
 @pytest.mark.parametrize("name", GROUP)
 @few
 @given(gaps=gaps, seed=seeds)
-def test_another_reference_plane_changes_nothing(name, gaps, seed, fit, motions):
+def test_group_interpolators_do_not_depend_on_reference_plane(name, gaps, seed, fit, motions):
     """What is seen from another plane G is G H(t), also beyond the knots."""
     instants, (plane, *knots) = np.cumsum(gaps), motions(len(gaps) + 1, seed)
     frames = np.linspace(instants[0] - 100, instants[-1] + 100, 50)
@@ -43,7 +43,7 @@ def test_another_reference_plane_changes_nothing(name, gaps, seed, fit, motions)
 @pytest.mark.parametrize("name", GROUP)
 @few
 @given(gaps=gaps, seed=seeds)
-def test_where_pixels_are_counted_from_changes_nothing(name, gaps, seed, fit, motions):
+def test_interpolators_do_not_depend_on_pixel_origin(name, gaps, seed, fit, motions):
     instants, (change, *knots) = np.cumsum(gaps), motions(len(gaps) + 1, seed)
     frames = np.linspace(instants[0] - 100, instants[-1] + 100, 50)
     here = fit(name, instants, np.array(knots)).at(frames)
@@ -52,14 +52,14 @@ def test_where_pixels_are_counted_from_changes_nothing(name, gaps, seed, fit, mo
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_one_knot_is_a_still_camera(name, fit):
+def test_interpolators_return_still_camera_for_one_knot(name, fit):
     trajectory = fit(name, [50], translation(3, 4)[None])
     np.testing.assert_allclose(trajectory.at([0, 50, 1000]), [translation(3, 4)] * 3, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("n_knots", [2, 3, 4, 5, 12])
-def test_a_constant_shift_is_kept_up_and_then_the_camera_stands_still(name, n_knots, fit):
+def test_extrapolation_holds_velocity_then_stops(name, n_knots, fit):
     """By default for twice the mean distance of the knots: 200 frames, here at half a pixel a frame."""
     instants = 100.0 * np.arange(1, n_knots + 1)
     trajectory = fit(name, instants, np.stack([translation(0.5 * frame, 0) for frame in instants]))
@@ -71,7 +71,7 @@ def test_a_constant_shift_is_kept_up_and_then_the_camera_stands_still(name, n_kn
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_the_velocity_is_that_at_the_ends(name, fit, turning):
+def test_extrapolation_continues_velocity_at_the_ends(name, fit, turning):
     instants = np.arange(0, 1001, 100.0)
     vectors = np.stack([1e-4 * instants, (instants / 1000) ** 2 / 10, 0 * instants], axis=1)
     trajectory = fit(name, instants, turning(vectors), hold_frames=1)
@@ -82,13 +82,13 @@ def test_the_velocity_is_that_at_the_ends(name, fit, turning):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_nothing_is_held_when_the_spec_says_so(name, fit):
+def test_extrapolation_stops_at_once_for_hold_frames_0(name, fit):
     trajectory = fit(name, [0, 100], np.stack([np.eye(3), translation(50, 0)]), hold_frames=0)
     np.testing.assert_allclose(trajectory.at([-10, 130])[:, 0, 2], [0, 50], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_homographies_are_normalised_and_an_instant_does_not_depend_on_the_others(name, fit, motions):
+def test_at_returns_normalised_homographies_independent_of_other_instants(name, fit, motions):
     instants = np.arange(8) * 70.0
     trajectory = fit(name, instants, motions(8, 0))
     frames = np.linspace(-200, 700, 57)

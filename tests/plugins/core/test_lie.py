@@ -15,7 +15,7 @@ def path(frames: np.ndarray) -> np.ndarray:
     return np.stack([0.1 * np.sin(5 * t), 0.15 * np.cos(4 * t), np.sin(3 * t)], axis=1)
 
 
-def test_a_turn_about_any_axis_is_exact(fit, turning):
+def test_lie_is_exact_for_rotation_about_any_axis(fit, turning):
     """Also where the angle is a cubic of time, as it is for a cubic spline."""
     instants, frames = np.array([0.0, 130, 200, 430, 500, 610]), np.linspace(0, 610, 40)
     axis = np.array([-0.1, 0.3, 0.9])
@@ -27,7 +27,7 @@ def test_a_turn_about_any_axis_is_exact(fit, turning):
     np.testing.assert_allclose(found, turning(angles(frames)), rtol=1e-8, atol=1e-10)
 
 
-def test_for_shifts_it_is_the_cubic_spline(fit):
+def test_lie_equals_cubic_spline_for_shifts(fit):
     rng = np.random.default_rng(0)
     instants, frames = np.cumsum(rng.uniform(30, 100, 9)), np.linspace(0, 700, 80)
     knots = np.stack([translation(x, y) for x, y in rng.normal(0, 30, (9, 2))])
@@ -37,7 +37,7 @@ def test_for_shifts_it_is_the_cubic_spline(fit):
 
 
 @pytest.mark.parametrize("n_knots", [2, 3])
-def test_few_knots_give_a_geodesic_or_what_is_like_a_parabola(n_knots, fit, motions):
+def test_lie_lowers_degree_for_few_knots(n_knots, fit, motions):
     """With a parabola, the velocity in the frame changes at a constant rate: for shifts exactly so."""
     instants, knots = np.array([0.0, 50, 130])[:n_knots], motions(3, 1)[:n_knots]
     trajectory = fit("lie", instants, knots)
@@ -47,7 +47,7 @@ def test_few_knots_give_a_geodesic_or_what_is_like_a_parabola(n_knots, fit, moti
         np.testing.assert_allclose(trajectory.at(frames), fit("geodesic", instants, knots).at(frames), rtol=1e-9, atol=1e-12)
 
 
-def test_velocity_and_acceleration_are_continuous_at_the_knots(fit, turning):
+def test_lie_velocity_and_acceleration_are_continuous_at_knots(fit, turning):
     instants = np.arange(0, 1001, 100.0)
     trajectories = {name: fit(name, instants, turning(path(instants))) for name in ("lie", "geodesic")}
     h = 0.5
@@ -68,7 +68,7 @@ def test_velocity_and_acceleration_are_continuous_at_the_knots(fit, turning):
     assert jumps("geodesic")[0] > 0.05
 
 
-def test_it_is_nearer_to_a_smooth_motion_than_the_geodesic_and_where_the_camera_rolls_than_the_parameters(fit, turning):
+def test_lie_beats_geodesic_on_smooth_motion_and_parameters_on_roll(fit, turning):
     instants, frames = np.linspace(0, 3000, 31), np.arange(0, 3001, 7.0)
     truth = turning(path(frames))
     errors = {
@@ -79,17 +79,17 @@ def test_it_is_nearer_to_a_smooth_motion_than_the_geodesic_and_where_the_camera_
     assert errors["lie"] < errors["lucas-kanade"]
 
 
-def test_a_camera_may_roll_around_more_than_once(fit, turning):
+def test_lie_follows_roll_of_more_than_one_turn(fit, turning):
     instants, frames = np.linspace(0, 1000, 41), np.linspace(0, 1000, 300)
     found = fit("lie", instants, turning(np.outer(instants / 1000, [0, 0, 20]))).at(frames)
     np.testing.assert_allclose(found, turning(np.outer(frames / 1000, [0, 0, 20])), rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("instants", [[0, 1, 2, 60, 61, 62], [0, 500, 501, 502, 503, 1000]])
-def test_it_says_so_when_no_smooth_curve_was_found(instants, fit, motions):
+def test_lie_refuses_knots_without_smooth_curve(instants, fit, motions):
     with pytest.raises(LocationError) as caught:
         fit("lie", instants, motions(6, 2))
     assert str(caught.value) == (
-        "the located exposures turn too fast, or lie too unevenly in time, for a smooth curve of homographies through all of "
-        "them; interpolate with geodesic, lucas-kanade or smoothing-spline"
+        "no smooth curve of homographies was found through the located exposures: they turn too fast, or lie too unevenly in "
+        "time; interpolate with geodesic, lucas-kanade or smoothing-spline"
     )

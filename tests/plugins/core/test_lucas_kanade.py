@@ -10,7 +10,7 @@ SIZES = np.array([1e-2, 1e-2, 1e-2, 1e-2, 100, 100, 1e-5, 1e-5])
 
 
 @pytest.mark.parametrize(("n_knots", "degree"), [(1, 0), (2, 1), (3, 2), (4, 3), (9, 3)])
-def test_it_reproduces_polynomials_as_high_as_the_knots_allow(n_knots, degree, fit):
+def test_lucas_kanade_reproduces_polynomials_up_to_degree_of_knots(n_knots, degree, fit):
     coefficients = np.random.default_rng(0).normal(size=(degree + 1, 8)) * SIZES
 
     def motion(frames: np.ndarray) -> np.ndarray:
@@ -23,7 +23,7 @@ def test_it_reproduces_polynomials_as_high_as_the_knots_allow(n_knots, degree, f
     np.testing.assert_allclose(found, motion(between), rtol=0, atol=1e-8)
 
 
-def test_the_velocity_is_that_at_the_last_knot(fit):
+def test_lucas_kanade_extrapolates_velocity_at_last_knot(fit):
     """A parabola x = t^2 / 100 moves by 2 px a frame at 100."""
     instants = np.array([0.0, 50, 100])
     trajectory = fit("lucas-kanade", instants, np.stack([translation(frame**2 / 100, 0) for frame in instants]), hold_frames=10)

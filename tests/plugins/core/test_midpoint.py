@@ -20,13 +20,13 @@ def spans(*starts: int, size: int = 100) -> list[FrameSpan]:
     return [FrameSpan(start, start + size) for start in starts]
 
 
-def test_the_first_level_fills_the_capture_side_by_side() -> None:
+def test_midpoint_fills_capture_at_level_1() -> None:
     found = groups(400, 1)
     assert [group.span for group in found] == spans(0, 100, 200, 300)
     assert [group.reference for group in found] == [49.5, 149.5, 249.5, 349.5]
 
 
-def test_each_level_adds_a_group_between_every_two_and_a_shorter_one_at_each_end() -> None:
+def test_midpoint_adds_group_between_every_two_and_shorter_ones_at_ends() -> None:
     found = groups(400, 2)
     assert [group.span for group in found] == [FrameSpan(0, 50), *spans(0, 50, 100, 150, 200, 250, 300), FrameSpan(350, 400)]
     assert [group.reference for group in found] == [24.5, 49.5, 99.5, 149.5, 199.5, 249.5, 299.5, 349.5, 374.5]
@@ -39,28 +39,28 @@ def test_each_level_adds_a_group_between_every_two_and_a_shorter_one_at_each_end
     ]
 
 
-def test_groups_at_the_ends_get_no_shorter_than_four_frames() -> None:
+def test_midpoint_end_groups_have_four_frames_at_least() -> None:
     assert min(len(group.span) for group in groups(400, 9)) == 6
 
 
-def test_frames_that_fill_no_group_are_left_out_between_groups() -> None:
+def test_midpoint_leaves_out_spare_frames_between_groups() -> None:
     assert [group.span for group in groups(460, 1)] == spans(0, 120, 240, 360)
 
 
-def test_a_single_group_lies_in_the_middle() -> None:
+def test_midpoint_centres_single_group() -> None:
     assert [group.span for group in groups(160, 1)] == spans(30)
     assert [group.reference for group in groups(160, 2)] == [24.5, 79.5, 134.5]
 
 
 @pytest.mark.parametrize(("level", "count"), [(1, 10), (2, 19), (3, 37), (4, 73)])
-def test_levels_get_denser_as_in_the_paper(level: int, count: int) -> None:
+def test_midpoint_has_as_many_groups_as_the_paper(level: int, count: int) -> None:
     ends = 2 * (level - 1)
     assert len(groups(1000, level)) == count + ends
     assert len(groups(1000, level, endpoints=False)) == count
 
 
 @given(group_size=st.integers(1, 300), more=st.integers(0, 1500), level=st.integers(1, 4))
-def test_any_capture_is_covered_evenly(group_size: int, more: int, level: int) -> None:
+def test_midpoint_covers_any_capture_evenly(group_size: int, more: int, level: int) -> None:
     n_frames = group_size + more
     found = groups(n_frames, level, group_size)
     assert all(min(4, group_size) <= len(group.span) <= group_size and group.span.stop <= n_frames for group in found)
@@ -81,7 +81,7 @@ def test_any_capture_is_covered_evenly(group_size: int, more: int, level: int) -
 
 
 @given(group_size=st.integers(1, 300), count=st.integers(1, 20), rest=st.integers(0, 299))
-def test_the_first_level_has_as_many_groups_as_fit_and_they_share_no_frame(group_size: int, count: int, rest: int) -> None:
+def test_midpoint_level_1_has_as_many_disjoint_groups_as_fit(group_size: int, count: int, rest: int) -> None:
     found = groups(group_size * count + rest % group_size, 1, group_size)
     assert len(found) == count
     assert all(earlier.span.stop <= later.span.start for earlier, later in pairwise(found))
@@ -92,13 +92,13 @@ TOO_SHORT = (
 )
 
 
-def test_a_capture_shorter_than_a_group_is_refused() -> None:
+def test_midpoint_refuses_capture_shorter_than_a_group() -> None:
     with pytest.raises(InputError) as caught:
         groups(99, 1)
     assert str(caught.value) == TOO_SHORT
 
 
-def test_it_is_refused_before_the_run() -> None:
+def test_check_refuses_capture_shorter_than_a_group() -> None:
     (contribution,) = (each for each in photonpano_resamplers() if each.name == "midpoint")
     assert contribution.check(MidpointConfig(group_size=100), StreamInfo(99, 8, 8, None)) == [TOO_SHORT]
     assert contribution.check(MidpointConfig(group_size=100), StreamInfo(100, 8, 8, None)) == []

@@ -39,7 +39,7 @@ def merger(**config: object) -> PhotonMleMerger:
     return PhotonMleMerger(PhotonMleConfig.model_validate(config))
 
 
-def test_the_first_level_sums_frames_where_they_lie(still: Source) -> None:
+def test_photon_mle_sums_unwarped_frames_without_trajectory(still: Source) -> None:
     exposure = merger().merge(still, GROUP, None, 1.0)
     expected = still.response.flux((still.counts(GROUP.span) / N).astype(np.float32), N)
     np.testing.assert_allclose(exposure.flux, expected, rtol=1e-6)
@@ -47,12 +47,12 @@ def test_the_first_level_sums_frames_where_they_lie(still: Source) -> None:
     assert (exposure.group, exposure.scale, exposure.response) == (GROUP, 1.0, still.response)
 
 
-def test_only_the_frames_of_the_group_count(still: Source) -> None:
+def test_photon_mle_sums_frames_of_group_only(still: Source) -> None:
     exposure = merger().merge(still, Group(FrameSpan(10, 30), 15), None, 1.0)
     np.testing.assert_array_equal(exposure.weight, np.full((40, 48), 20))
 
 
-def test_known_motion_makes_edges_sharp(panning: Source, scene: np.ndarray, pan: Callable) -> None:
+def test_photon_mle_sharpens_edges_along_known_motion(panning: Source, scene: np.ndarray, pan: Callable) -> None:
     """At frame 29.5 the scene begins at 7 px: frames see whole pixels, so the true start is floor(29.5 / 4)."""
     motion = pan(SPEED_PX)
     compensated = merger(tolerance_px=0.25).merge(panning, GROUP, motion, 1.0)
@@ -64,7 +64,7 @@ def test_known_motion_makes_edges_sharp(panning: Source, scene: np.ndarray, pan:
     assert errors[1] > 2 * errors[0]
 
 
-def test_warps_are_relative_to_the_reference_instant_of_the_group(panning: Source, pan: Callable) -> None:
+def test_photon_mle_warps_relative_to_reference_instant(panning: Source, pan: Callable) -> None:
     """A camera that stands far away on the plane, or a plane that is turned, gives the same exposure."""
     motion = pan(SPEED_PX)
     there = type(motion)(lambda frame: translation(5000, -300) @ motion.at([frame])[0])
@@ -73,7 +73,7 @@ def test_warps_are_relative_to_the_reference_instant_of_the_group(panning: Sourc
     )
 
 
-def test_an_end_group_is_seen_from_its_end(panning: Source, pan: Callable) -> None:
+def test_photon_mle_uses_reference_at_end_of_group(panning: Source, pan: Callable) -> None:
     exposure = merger().merge(panning, Group(FrameSpan(0, N), 0.0), pan(SPEED_PX), 1.0)
     # Later frames see further right, so that the left border of the first one is seen by it and few others.
     assert exposure.weight[20, 0] < N / 4
@@ -81,7 +81,7 @@ def test_an_end_group_is_seen_from_its_end(panning: Source, pan: Callable) -> No
 
 
 @pytest.mark.parametrize(("scale", "shape"), [(0.5, (20, 24)), (2.0, (80, 96)), (0.3, (12, 14))])
-def test_the_scale_is_pixels_of_the_exposure_per_pixel_of_the_frame(
+def test_photon_mle_scale_is_exposure_pixels_per_frame_pixel(
     panning: Source, pan: Callable, scale: float, shape: tuple[int, int]
 ) -> None:
     exposure = merger().merge(panning, GROUP, pan(SPEED_PX), scale)
@@ -92,7 +92,7 @@ def test_the_scale_is_pixels_of_the_exposure_per_pixel_of_the_frame(
     assert means[0] == pytest.approx(means[1], rel=0.03)
 
 
-def test_it_sums_chunks_as_the_tolerance_says(panning: Source, pan: Callable) -> None:
+def test_photon_mle_sums_chunks_within_tolerance(panning: Source, pan: Callable) -> None:
     motion = pan(SPEED_PX)
     to_reference = translation(-SPEED_PX * GROUP.reference, 0)
     for tolerance_px in (0.25, 4.0):

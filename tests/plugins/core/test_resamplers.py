@@ -35,7 +35,7 @@ def midpoint(n_frames: int, level: int, group_size: int = 100, **config: bool) -
 
 @pytest.mark.parametrize("name", NAMES)
 @given(group_size=st.integers(1, 300), more=st.integers(0, 1500), level=st.integers(1, 4))
-def test_any_capture_is_covered_in_order(name: str, group_size: int, more: int, level: int) -> None:
+def test_resamplers_cover_any_capture_in_order(name: str, group_size: int, more: int, level: int) -> None:
     n_frames = group_size + more
     found = groups(name, n_frames, level, group_size)
     assert all(group.span.stop <= n_frames and group.reference == group.span.centre for group in found)
@@ -50,7 +50,7 @@ TOO_SHORT = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_capture_shorter_than_a_group_is_refused(name: str) -> None:
+def test_resamplers_refuse_capture_shorter_than_a_group(name: str) -> None:
     with pytest.raises(InputError) as caught:
         groups(name, 99)
     assert str(caught.value) == TOO_SHORT
@@ -60,22 +60,22 @@ def test_a_capture_shorter_than_a_group_is_refused(name: str) -> None:
 
 @pytest.mark.parametrize("level", [1, 2, 5])
 @pytest.mark.parametrize("n_frames", [100, 160, 460, 1000])
-def test_constant_groups_are_those_of_the_first_level(n_frames: int, level: int) -> None:
+def test_constant_groups_equal_midpoint_level_1_at_every_level(n_frames: int, level: int) -> None:
     assert groups("constant-groups", n_frames, level) == midpoint(n_frames, 1)
 
 
-def test_windows_slide_by_half_a_group_at_every_level() -> None:
+def test_sliding_window_steps_by_half_a_group_by_default() -> None:
     assert starts(groups("sliding-window", 400)) == [0, 50, 100, 150, 200, 250, 300]
     assert groups("sliding-window", 400, 3) == groups("sliding-window", 400, 1)
 
 
-def test_windows_slide_by_the_step_or_a_little_less() -> None:
+def test_sliding_window_steps_by_step_frames_or_slightly_less() -> None:
     assert starts(groups("sliding-window", 400, step_frames=100)) == [0, 100, 200, 300]
     assert starts(groups("sliding-window", 430, step_frames=100)) == [0, 82, 165, 248, 330]
     assert starts(groups("sliding-window", 105, step_frames=1)) == [0, 1, 2, 3, 4, 5]
 
 
-def test_a_step_that_shrinks_adds_groups_from_level_to_level() -> None:
+def test_sliding_window_step_shrink_adds_groups_per_level() -> None:
     """With a step of a group that is halved, they are those of midpoint without its ends."""
     for level in (1, 2, 3, 4):
         found = groups("sliding-window", 1000, level, step_frames=100, step_shrink=2)
@@ -84,7 +84,7 @@ def test_a_step_that_shrinks_adds_groups_from_level_to_level() -> None:
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
-def test_there_is_one_group_in_each_stratum(level: int) -> None:
+def test_stratified_puts_one_group_in_each_stratum(level: int) -> None:
     found = groups("stratified", 4000, level)
     even = midpoint(4000, level)
     assert len(found) == len(even)
@@ -96,11 +96,11 @@ def test_there_is_one_group_in_each_stratum(level: int) -> None:
     assert [len(group.span) for group in found] == [len(group.span) for group in even]
 
 
-def test_the_outermost_groups_lose_no_frame() -> None:
+def test_stratified_starts_and_ends_with_the_capture() -> None:
     assert [group.span for group in groups("stratified", 4000)[::39]] == [FrameSpan(0, 100), FrameSpan(3900, 4000)]
 
 
-def test_chance_follows_from_the_seed_and_the_level() -> None:
+def test_stratified_depends_on_seed_and_level_only() -> None:
     assert groups("stratified", 4000, 2, seed=1) == groups("stratified", 4000, 2, seed=1)
     assert groups("stratified", 4000, 2, seed=1) != groups("stratified", 4000, 2, seed=2)
     # Other chance at another level, and not the same places again.
@@ -109,10 +109,10 @@ def test_chance_follows_from_the_seed_and_the_level() -> None:
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
-def test_without_jitter_they_are_those_of_midpoint(level: int) -> None:
+def test_stratified_without_jitter_equals_midpoint(level: int) -> None:
     for n_frames in (100, 160, 460, 1000):
         assert groups("stratified", n_frames, level, jitter=0) == midpoint(n_frames, level)
 
 
-def test_a_stratum_of_a_frame_has_one_group() -> None:
+def test_stratified_has_one_group_per_stratum_of_one_frame() -> None:
     assert starts(groups("stratified", 104, 4, group_size=2, endpoints=False)) == list(range(103))

@@ -9,7 +9,7 @@ from photonpano import FrameSpan, Group, Source, Trajectory
 from photonpano.geometry import translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
 from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.robust_merge import RobustMerger, divided
+from photonpano_core.robust_merge import RobustMerger
 
 N, HEIGHT, WIDTH = 140, 60, 90
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)
@@ -65,7 +65,9 @@ def mean_count(merger: RobustMerger | PhotonMleMerger, source: Source, motion: T
     return exposure.response.mean_count(exposure.flux)
 
 
-def test_a_static_scene_loses_next_to_nothing(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
+def test_robust_merge_is_as_exact_as_photon_mle_on_static_scene(
+    memory_source: type, scene: np.ndarray, motion: Trajectory
+) -> None:
     """Over many captures: as exact as all photons allow within a few percent, and with no bias of its own."""
     found = {merger: [] for merger in (robust(), plain())}
     weights = []
@@ -82,7 +84,7 @@ def test_a_static_scene_loses_next_to_nothing(memory_source: type, scene: np.nda
     assert abs(np.mean(means[0] - means[1])) < 0.01 * standard_error
 
 
-def test_what_moves_by_itself_leaves_no_ghost(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
+def test_robust_merge_leaves_no_ghost_of_moving_object(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
     source = capture(memory_source, scene, 0, crossed=True)
     true = with_object(true_view(scene, GROUP.reference), GROUP.reference)
     # Where the object was at other times.
@@ -98,7 +100,7 @@ def test_what_moves_by_itself_leaves_no_ghost(memory_source: type, scene: np.nda
     assert objects[1] < 0.7
 
 
-def test_weights_say_what_was_trusted(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
+def test_robust_merge_reduces_weight_at_moving_object(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
     weight = robust().merge(capture(memory_source, scene, 0, crossed=True), GROUP, motion, 1.0).weight
     assert weight[4:14, 10:-10].mean() > 0.97 * N
     # The blocks in which the object is elsewhere do not count where it is now: about one in seven does.
@@ -107,7 +109,7 @@ def test_weights_say_what_was_trusted(memory_source: type, scene: np.ndarray, mo
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_the_first_level_sums_frames_where_they_lie(memory_source: type, scene: np.ndarray, scale: float) -> None:
+def test_robust_merge_equals_photon_mle_without_trajectory(memory_source: type, scene: np.ndarray, scale: float) -> None:
     """Camera and scene cannot be told apart there."""
     source = capture(memory_source, scene, 0, crossed=True)
     exposure, other = (each.merge(source, GROUP, None, scale) for each in (robust(), plain()))
@@ -116,7 +118,9 @@ def test_the_first_level_sums_frames_where_they_lie(memory_source: type, scene: 
 
 
 @pytest.mark.parametrize(("scale", "shape"), [(0.5, (30, 45)), (2.0, (120, 180))])
-def test_scales(memory_source: type, scene: np.ndarray, motion: Trajectory, scale: float, shape: tuple[int, int]) -> None:
+def test_robust_merge_keeps_weight_at_other_scales(
+    memory_source: type, scene: np.ndarray, motion: Trajectory, scale: float, shape: tuple[int, int]
+) -> None:
     source = capture(memory_source, scene, 0, crossed=False)
     exposure, other = (each.merge(source, GROUP, motion, scale) for each in (robust(), plain()))
     assert exposure.flux.shape == shape
@@ -124,7 +128,7 @@ def test_scales(memory_source: type, scene: np.ndarray, motion: Trajectory, scal
     assert exposure.weight.mean() > 0.98 * other.weight.mean()
 
 
-def test_masked_pixels_do_not_count(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
+def test_robust_merge_ignores_masked_pixels(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
     """Hot pixels draw no trail, and pixels that no frame saw are unknown."""
     valid = np.random.default_rng(9).random((HEIGHT, WIDTH)) > 0.02
     valid[:8] = False
@@ -139,7 +143,7 @@ def test_masked_pixels_do_not_count(memory_source: type, scene: np.ndarray, moti
     assert found.weight[20:40, 20:70].mean() > 0.95 * N
 
 
-def test_borders_that_the_reference_block_did_not_see_are_merged_as_they_are(
+def test_robust_merge_keeps_borders_outside_of_reference_block(
     memory_source: type, scene: np.ndarray, motion: Trajectory
 ) -> None:
     source = capture(memory_source, scene, 0, crossed=False)
@@ -149,7 +153,7 @@ def test_borders_that_the_reference_block_did_not_see_are_merged_as_they_are(
     np.testing.assert_allclose(found.weight[5:-5, -2:], other.weight[5:-5, -2:], rtol=0.05, atol=1)
 
 
-def test_a_motion_that_is_slightly_wrong_is_tolerated(memory_source: type, scene: np.ndarray, known_motion: type) -> None:
+def test_robust_merge_tolerates_small_motion_error(memory_source: type, scene: np.ndarray, known_motion: type) -> None:
     """Half a pixel off at the ends of the group: edges deviate more than noise explains, and are no scene motion."""
     wrong = known_motion(lambda frame: translation(SPEED_PX * frame + 0.5 * (abs(frame - 70) > 50), 0))
     source = capture(memory_source, scene, 0, crossed=False)
@@ -157,12 +161,7 @@ def test_a_motion_that_is_slightly_wrong_is_tolerated(memory_source: type, scene
     assert tolerant.weight[5:-5, 10:-10].mean() > strict.weight[5:-5, 10:-10].mean()
 
 
-def test_groups_are_divided_evenly() -> None:
-    assert divided(FrameSpan(10, 20), 3) == [FrameSpan(10, 13), FrameSpan(13, 16), FrameSpan(16, 20)]
-    assert divided(FrameSpan(10, 12), 7) == [FrameSpan(10, 11), FrameSpan(11, 12)]
-
-
-def test_a_group_of_a_frame_is_that_frame(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
+def test_robust_merge_of_one_frame_is_that_frame(memory_source: type, scene: np.ndarray, motion: Trajectory) -> None:
     source = capture(memory_source, scene, 0, crossed=False)
     exposure = robust().merge(source, Group(FrameSpan(3, 4), 3.0), motion, 1.0)
     np.testing.assert_allclose(exposure.weight, 1, rtol=1e-5)

@@ -18,19 +18,19 @@ def matrices(size: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [0, 1e-9, 1e-3, 0.1, 1, 5])
-def test_the_exponential_is_that_of_scipy(size):
+def test_exponential_equals_scipy_expm(size):
     small = matrices(size)
     found, expected = exponential(small * PIXELS) / PIXELS, expm(small)
     error = np.abs(found - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
     assert error.max() < 1e-11
 
 
-def test_the_exponential_of_a_trace_is_a_scale():
+def test_exponential_of_multiple_of_identity_is_a_scale():
     np.testing.assert_allclose(exponential(np.diag([1.0, 2, 3])[None])[0], np.diag(np.exp([1, 2, 3])), rtol=1e-14)
 
 
 @pytest.mark.parametrize("size", [0, 1e-9, 1e-3, 0.1, 0.5])
-def test_the_logarithm_undoes_the_exponential(size):
+def test_logarithm_inverts_exponential(size):
     small = matrices(size)
     inside = np.abs(np.linalg.eigvals(small)).max(axis=1) < 3
     found = logarithm(unimodular(7 * exponential(small[inside] * PIXELS))) / PIXELS
@@ -39,7 +39,7 @@ def test_the_logarithm_undoes_the_exponential(size):
 
 
 @pytest.mark.parametrize("degrees", [1e-6, 30, 120, 175])
-def test_the_logarithm_of_a_turn_is_its_axis(degrees):
+def test_logarithm_of_rotation_is_its_axis(degrees):
     axis = np.deg2rad(degrees) * np.array([2, 1, 2]) / 3
     x, y, z = axis
     found = logarithm(Rotation.from_rotvec(axis).as_matrix()[None])[0]
@@ -47,7 +47,7 @@ def test_the_logarithm_of_a_turn_is_its_axis(degrees):
 
 
 @pytest.mark.parametrize("diagonal", [(-1, -1, 1), (-1, 1, 1), (-2, -0.5, 1), (1e-4, 1, 1)])
-def test_what_has_no_real_logarithm_or_a_huge_one_is_nan_and_spoils_no_other(diagonal):
+def test_logarithm_is_nan_only_where_none_is_real_or_small(diagonal):
     stack = unimodular(np.stack([np.diag(np.array(diagonal, dtype=float)), np.eye(3)]))
     found = logarithm(stack)
     assert np.isnan(found[0]).all()

@@ -39,7 +39,7 @@ def rms_px(trajectory: Trajectory, truth: np.ndarray, frames: np.ndarray) -> flo
     return float(np.sqrt(np.mean(moved**2) / 2))
 
 
-def test_of_noise_on_a_parabola_there_remains_what_a_parabola_fits(fit):
+def test_smoothing_spline_reduces_noise_on_parabola_to_its_fit(fit):
     """Three of N numbers: the error falls by sqrt(N / 3), or a little less, since a slight curve might be one."""
     instants = np.arange(80) * 40.0
     truth = parabola(instants)
@@ -52,7 +52,7 @@ def test_of_noise_on_a_parabola_there_remains_what_a_parabola_fits(fit):
     assert 0.8 * expected < np.mean(left) < 1.5 * expected
 
 
-def test_it_honours_that_some_knots_know_less(fit):
+def test_smoothing_spline_weights_knots_by_information(fit):
     """Every second knot is ten times worse: by themselves the good ones give sqrt(3 / 40) of their error."""
     instants = np.arange(80) * 40.0
     truth = parabola(instants)
@@ -67,7 +67,7 @@ def test_it_honours_that_some_knots_know_less(fit):
     assert np.mean(unknown) > 3 * np.mean(known)
 
 
-def test_it_honours_that_a_knot_knows_one_direction_and_not_the_other(fit):
+def test_smoothing_spline_weights_directions_by_information(fit):
     """Even knots know x and not y, as above a horizontal edge, and odd ones the reverse."""
     instants = np.arange(80) * 40.0
     truth = parabola(instants)
@@ -80,7 +80,7 @@ def test_it_honours_that_a_knot_knows_one_direction_and_not_the_other(fit):
     assert 0.8 * expected < np.mean(left) < 1.5 * expected
 
 
-def test_what_a_knot_does_not_know_at_all_is_taken_from_the_others(fit):
+def test_smoothing_spline_fills_direction_without_information(fit):
     instants = np.arange(40) * 40.0
     truth = parabola(instants)
     knots = noisy(truth, np.where(np.arange(40)[:, None] == 20, 300.0, 0.1))
@@ -89,7 +89,7 @@ def test_what_a_knot_does_not_know_at_all_is_taken_from_the_others(fit):
     assert rms_px(fit("smoothing-spline", instants, knots, worth), truth, instants) < 0.1
 
 
-def test_only_the_ratios_of_the_information_count(fit):
+def test_smoothing_spline_does_not_depend_on_scale_of_information(fit):
     """The noise is measured, since what locators say of themselves may be off by a factor."""
     rng = np.random.default_rng(0)
     instants = np.cumsum(rng.uniform(20, 60, 30))
@@ -111,7 +111,7 @@ def shaken(frames: np.ndarray, period: float) -> np.ndarray:
 
 @pytest.mark.parametrize("knots_per_period", [2.3, 3, 4, 8, 16])
 @pytest.mark.parametrize("informed", [False, True])
-def test_motion_that_is_too_fast_for_the_knots_is_not_smoothed_away(knots_per_period, informed, fit, turning):
+def test_smoothing_spline_keeps_motion_too_fast_for_the_knots(knots_per_period, informed, fit, turning):
     instants, frames = np.arange(80) * 50.0, np.arange(0, 3951, 7.0)
     knots, truth = (turning(shaken(t, 50 * knots_per_period)) for t in (instants, frames))
     worth = information(knots, 0.05) if informed else None
@@ -125,7 +125,7 @@ def test_motion_that_is_too_fast_for_the_knots_is_not_smoothed_away(knots_per_pe
 
 
 @pytest.mark.parametrize("n_knots", [4, 5, 7, 40])
-def test_without_noise_it_is_the_cubic(n_knots, fit, turning):
+def test_smoothing_spline_without_noise_is_the_cubic(n_knots, fit, turning):
     instants = np.arange(n_knots) * 50.0
     frames = np.linspace(0, instants[-1], 300)
     knots, truth = turning(shaken(instants, 600)), turning(shaken(frames, 600))
@@ -134,18 +134,18 @@ def test_without_noise_it_is_the_cubic(n_knots, fit, turning):
 
 
 @pytest.mark.parametrize("n_knots", [1, 2, 3])
-def test_three_knots_and_fewer_are_interpolated(n_knots, fit, motions):
+def test_smoothing_spline_interpolates_three_knots_and_fewer(n_knots, fit, motions):
     instants, knots, frames = np.array([0, 30, 100.0])[:n_knots], motions(n_knots, 0), np.linspace(-50, 150, 30)
     smoothed, cubic = (fit(name, instants, knots).at(frames) for name in ("smoothing-spline", "lucas-kanade"))
     np.testing.assert_allclose(smoothed, cubic, rtol=1e-9, atol=1e-12)
 
 
-def test_a_camera_that_stands_still_stands_still(fit):
+def test_smoothing_spline_of_still_camera_stands_still(fit):
     trajectory = fit("smoothing-spline", np.arange(20) * 10.0, np.stack([np.eye(3)] * 20))
     np.testing.assert_allclose(trajectory.at([-5, 33.3, 500]), np.stack([np.eye(3)] * 3), atol=1e-12)
 
 
-def test_uneven_knots_are_weighed_by_time(fit):
+def test_smoothing_spline_accounts_for_uneven_knots(fit):
     """Knots in pairs, with gaps between the pairs, as at the ends of a level, and where exposures were lost."""
     instants = np.cumsum(np.tile([5.0, 95.0], 30))
     truth = parabola(instants)

@@ -74,7 +74,7 @@ def some_masked() -> np.ndarray:
 @pytest.mark.parametrize(
     ("motion", "scale"), [("rigid", 1.0), ("rigid", 2.0), ("rigid", 0.7), ("turning", 1.0), ("turning", 1.6)]
 )
-def test_it_equals_warping_each_frame_by_the_adjoint_of_interpolation(
+def test_splat_equals_adjoint_of_interpolation(
     memory_source: type, frames: np.ndarray, motion: str, scale: float, masked: bool, request: pytest.FixtureRequest
 ) -> None:
     valid = some_masked() if masked else np.ones((HEIGHT, WIDTH), bool)
@@ -90,7 +90,7 @@ def test_it_equals_warping_each_frame_by_the_adjoint_of_interpolation(
     assert (exposure.group, exposure.scale) == (GROUP, scale)
 
 
-def test_nearly_rigid_motion_needs_no_splats_of_weights(memory_source: type, frames: np.ndarray, known_motion: type) -> None:
+def test_splat_skips_weights_for_nearly_rigid_motion(memory_source: type, frames: np.ndarray, known_motion: type) -> None:
     """The shortcut errs by less than a hundredth of a frame in twenty, and only at the border."""
     motion = known_motion(
         lambda t: np.array([[1 + 2e-4 * t, -3e-4 * t, 0.3 * t], [3e-4 * t, 1 + 1e-4 * t, 0.2 * t], [1e-6 * t, 0, 1]])
@@ -115,7 +115,7 @@ class Intensities:
 
 @pytest.mark.parametrize("scale", [1.0, 2.0, 0.6])
 @pytest.mark.parametrize("motion", ["rigid", "turning"])
-def test_a_flat_scene_stays_flat(memory_source: type, motion: str, scale: float, request: pytest.FixtureRequest) -> None:
+def test_splat_keeps_flat_scene_flat(memory_source: type, motion: str, scale: float, request: pytest.FixtureRequest) -> None:
     """However densely pixels land, beside masks and at the border."""
     source = memory_source(np.ones((N, HEIGHT, WIDTH), np.uint8), some_masked())
     source.response = Intensities()
@@ -125,7 +125,7 @@ def test_a_flat_scene_stays_flat(memory_source: type, motion: str, scale: float,
     np.testing.assert_allclose(exposure.flux[known], 1, rtol=1e-5)
 
 
-def test_it_is_unbiased(memory_source: type, rigid: Trajectory) -> None:
+def test_splat_is_unbiased(memory_source: type, rigid: Trajectory) -> None:
     """The mean over many captures lies within four standard errors of the truth."""
     share, rng = 0.2, np.random.default_rng(2)
     means = []
@@ -138,7 +138,7 @@ def test_it_is_unbiased(memory_source: type, rigid: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_counts_above_one_work_alike(memory_source: type, rigid: Trajectory, dtype: type) -> None:
+def test_splat_takes_counts_above_1(memory_source: type, rigid: Trajectory, dtype: type) -> None:
     counts = np.random.default_rng(3).poisson(0.7, (N, HEIGHT, WIDTH)).astype(dtype) * 50
     source = memory_source(counts)
     source._frames, source.response = counts, Intensities()
@@ -149,7 +149,7 @@ def test_counts_above_one_work_alike(memory_source: type, rigid: Trajectory, dty
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_the_first_level_sums_frames_where_they_lie(memory_source: type, frames: np.ndarray, scale: float) -> None:
+def test_splat_equals_photon_mle_without_trajectory(memory_source: type, frames: np.ndarray, scale: float) -> None:
     source = memory_source(frames, some_masked())
     exposure = SplatMerger().merge(source, GROUP, None, scale)
     other = PhotonMleMerger(PhotonMleConfig()).merge(source, GROUP, None, scale)
@@ -157,7 +157,7 @@ def test_the_first_level_sums_frames_where_they_lie(memory_source: type, frames:
     np.testing.assert_array_equal(exposure.weight, other.weight)
 
 
-def test_frames_are_read_a_few_at_a_time(memory_source: type, frames: np.ndarray, rigid: Trajectory, monkeypatch) -> None:
+def test_splat_reads_frames_in_blocks(memory_source: type, frames: np.ndarray, rigid: Trajectory, monkeypatch) -> None:
     whole = SplatMerger().merge(memory_source(frames), GROUP, rigid, 1.0)
     asked: list[FrameSpan] = []
 
@@ -172,16 +172,14 @@ def test_frames_are_read_a_few_at_a_time(memory_source: type, frames: np.ndarray
     np.testing.assert_array_equal(parts.flux, whole.flux)
 
 
-def test_frames_behind_the_camera_or_beside_the_grid_count_nothing(
-    memory_source: type, frames: np.ndarray, known_motion: type
-) -> None:
+def test_splat_ignores_frames_behind_camera_or_off_grid(memory_source: type, frames: np.ndarray, known_motion: type) -> None:
     motion = known_motion(lambda frame: np.array([[1, 0, 1e4 * (frame != 10)], [0, 1, 0], [0, 0, 1.0]]))
     group = Group(FrameSpan(9, 12), 10.0)
     exposure = SplatMerger().merge(memory_source(frames), group, motion, 1.0)
     np.testing.assert_allclose(exposure.weight, 1, atol=1e-5)
 
 
-def test_dark_counts_that_are_to_be_taken_out_are_refused() -> None:
+def test_splat_refuses_source_with_corrected_sums() -> None:
     """At the first level already, where nothing is splatted yet."""
     source: Any = MemorySource(np.zeros((10, 8, 8)))
     source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
@@ -189,6 +187,6 @@ def test_dark_counts_that_are_to_be_taken_out_are_refused() -> None:
         with pytest.raises(InputError) as caught:
             SplatMerger().merge(source, Group(FrameSpan(0, 10), 5), trajectory, 1.0)
         assert str(caught.value) == (
-            "splat puts photons one by one, so that dark counts cannot be taken out, nor pixels interpolated: merge with "
-            "photon-mle, or let corrections only move and mask pixels"
+            "splat warps photons one by one, so that dark counts cannot be subtracted, nor pixels interpolated; merge with "
+            "photon-mle, or use only corrections that move or mask pixels"
         )

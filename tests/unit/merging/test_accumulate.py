@@ -8,7 +8,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import from_parameters, rescaling, translation
-from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of
+from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
 
@@ -218,3 +218,8 @@ def test_estimate_is_zero_where_corrected_counts_are_negative() -> None:
     photons = PhotonSum(np.float32([[-3, 5]]), np.float32([[10, 10]]))
     flux, _ = photons.estimate(BinaryResponse())
     assert flux.tolist() == [[0, pytest.approx(np.log(2))]]
+
+
+def test_divided_returns_about_equal_parts_of_1_or_more() -> None:
+    assert divided(10, 3) == [range(3), range(3, 6), range(6, 10)]
+    assert divided(2, 7) == [range(1), range(1, 2)]

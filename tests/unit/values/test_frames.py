@@ -50,6 +50,11 @@ def test_spread_covers_the_whole_capture() -> None:
     assert stream.spread(100, 10) == [stream.span]
 
 
+def test_blocks_cover_the_span() -> None:
+    assert FrameSpan(10, 17).blocks(3) == [FrameSpan(10, 13), FrameSpan(13, 16), FrameSpan(16, 17)]
+    assert FrameSpan(10, 17).blocks(100) == [FrameSpan(10, 17)]
+
+
 @pytest.mark.parametrize("value", [FrameSpan(0, 1), Group(FrameSpan(0, 1), 0), StreamInfo(1, 1, 1, None)])
 def test_values_are_frozen(value: FrameSpan | Group | StreamInfo) -> None:
     field = dataclasses.fields(value)[0].name
