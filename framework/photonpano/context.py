@@ -1,4 +1,4 @@
-"""What a long computation needs of its caller: how many threads it may use, where progress goes, whom to call back."""
+"""How a long computation runs: number of threads, progress and callbacks."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ if TYPE_CHECKING:
 
 
 class Progress(Protocol):
-    """Is told of stages as they start, advance and end. One stage at a time; calls come from any thread."""
+    """Shows stages as they advance, and messages. Stages do not overlap; calls may come from any thread."""
 
     def stage(self, title: str, total: int, unit: str) -> AbstractContextManager[Callable[[int], None]]:
         """Enter a stage of `total` units, such as "level 2: locate" of 81 exposures; call the value with units done."""
         ...
 
     def note(self, message: str) -> None:
-        """Say one line that the user should see, such as the result of a level or a warning."""
+        """Show one line, such as the result of a level or a warning."""
         ...
 
 
 class Quiet:
-    """Progress that says nothing."""
+    """Progress that shows nothing."""
 
     @contextmanager
     def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:

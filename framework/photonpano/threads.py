@@ -6,15 +6,14 @@ import os
 import threading
 import time
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-    from concurrent.futures import Future
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
@@ -27,24 +26,49 @@ def thread_count(threads: int | Literal["auto"]) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def in_order(work: Callable[[ItemT], ResultT], items: Iterable[ItemT], threads: int) -> Iterator[ResultT]:
-    """Yield the results of `work` in the order of the items, while as many more as there are threads are being made.
+@contextmanager
+def thread_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Open a pool of threads. If the block ends early, work that has not started is cancelled."""
+    pool = ThreadPoolExecutor(threads)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
-    Unlike `Executor.map`, it never has more than these in memory.
+
+def in_order(
+    work: Callable[[ItemT], ResultT], items: Iterable[ItemT], threads: int, pool: ThreadPoolExecutor | None = None
+) -> Iterator[ResultT]:
+    """Yield the results of `work` in the order of the items.
+
+    Unlike `Executor.map`, it holds at most one result for each thread beside the one that it yields.
+
+    Args:
+        work: called with each item, in the pool.
+        items: drawn in the thread of the caller.
+        threads: how many items are worked on ahead.
+        pool: the threads; by default, a pool of its own.
     """
-    due: deque[Future[ResultT]] = deque()
-    with ThreadPoolExecutor(threads, thread_name_prefix="in-order") as pool:
-        for item in items:
-            due.append(pool.submit(work, item))
-            if len(due) > threads:
-                yield due.popleft().result()
-        while due:
-            yield due.popleft().result()
+    with nullcontext(pool) if pool else thread_pool(threads) as executor:
+        submitted = (executor.submit(work, item) for item in items)
+        # `map` keeps no reference to a result once it is yielded.
+        yield from map(Future.result, lagging(submitted, threads))
+
+
+def lagging(items: Iterable[ItemT], by: int) -> Iterator[ItemT]:
+    """Yield the items, each as soon as `by` later ones were drawn."""
+    held: deque[ItemT] = deque()
+    for item in items:
+        held.append(item)
+        if len(held) > by:
+            yield held.popleft()
+    while held:
+        yield held.popleft()
 
 
 @contextmanager
 def one_thread_inside() -> Iterator[None]:
-    """Keep OpenCV and BLAS from starting threads of their own under ours: they would fight for the cores."""
+    """Keep OpenCV and BLAS from starting threads of their own, which would compete with ours for the cores."""
     import cv2
 
     before = cv2.getNumThreads()
@@ -57,7 +81,10 @@ def one_thread_inside() -> Iterator[None]:
 
 
 class Stopwatch:
-    """Adds up seconds by stage. What runs in a pool counts for its share of the pool, so that stages add up to the whole."""
+    """Adds up seconds by stage.
+
+    Time in a thread of a pool is divided by the number of threads, so that the stages of a level add up to its duration.
+    """
 
     def __init__(self, threads: int) -> None:
         self._threads = threads

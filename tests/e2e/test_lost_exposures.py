@@ -73,7 +73,7 @@ def test_a_longer_part_without_texture_is_named(run: Callable, with_a_wall: Call
         r"level 1: \d+ of \d+ pairs of exposures could not be located, so that frames 0 to 149 cannot be tied to the rest",
         lines[0],
     )
-    assert lines[1] == "Tied together are frames 150 to 299; frames 0 to 49."
+    assert lines[1] == "Parts that are tied together: frames 150 to 299; frames 0 to 49."
     assert lines[2:5] == [pair("50 to 74", "0 to 24"), pair("50 to 74", "25 to 49"), pair("75 to 99", "25 to 49")]
     assert re.fullmatch(r"  \.\.\. and \d+ more", lines[8])
     assert lines[9:] == [

@@ -1,4 +1,4 @@
-"""The adjustment of a motion graph: the least squares behind `graph.solve`, and how far its solution can be trusted."""
+"""Robust least squares of a motion graph, and the uncertainty of its solution."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from photonpano.values import BoolArray, FloatArray, Located
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3
 CAUCHY = 2.385
-"""Residuals of so many typical ones weigh half (95 % efficiency for Gaussian noise)."""
-CONTRADICTION = 8.0
-"""An edge that disagrees with the others by more than so many typical residuals is dropped."""
+"""Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise)."""
+OUTLIER = 8.0
+"""An edge whose residual exceeds this many scales is an outlier."""
 MEDIAN_NORM = 0.958
 """The median of the root mean square of eight Gaussian numbers of unit variance."""
 SAMPLES = 64
-"""Solutions drawn to tell how far the true one may lie: standard deviations are known to a few per cent."""
+"""Solutions drawn to estimate the expected error of each node, to a few per cent."""
 
 
 class Adjustment:
-    """Residuals and steps of a connected graph; the unknowns of a node are p1..p8 in coordinates of about unit size.
+    """The least-squares problem of a connected graph.
 
-    A node changes by a small homography of its own frame, so that its unknowns mean the same wherever it lies.
+    The unknowns of a node are p1..p8 of a small homography of its own frame, in coordinates of about unit size, so that their
+    meaning does not depend on where the frame lies.
     """
 
     def __init__(
@@ -53,8 +54,8 @@ class Adjustment:
         Args:
             pairs: (E, 2) the moving and the fixed node of each edge.
             anchor: the node that does not change.
-            observed: (E, 3, 3) what was measured, pixels of the moving frame to pixels of the fixed one.
-            motions: where it comes from, with its information.
+            observed: (E, 3, 3) homographies of the edges, pixels of the moving frame to pixels of the fixed one.
+            motions: the motions of the edges, with their information.
             frame_shape: (height, width) of a frame.
         """
         self._moving, self._fixed = pairs.T
@@ -69,13 +70,13 @@ class Adjustment:
         self._generators = generators(frame_shape)
 
     def minimise(self, homographies: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return the (N, 3, 3) homographies that agree best, and the whitened residual of each edge, (E,).
+        """Return the homographies of least cost, (N, 3, 3), and the norm of the whitened residual of each edge, (E,).
 
         Args:
             homographies: (N, 3, 3) where to start.
-            kept: (E,) the edges that have a say.
+            kept: (E,) False for outliers.
         """
-        # All edges weigh the same at first: a start that agrees perfectly with half of them would outvote the others for good.
+        # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
         weights = kept.astype(np.float64)
         for _ in range(MAX_ITERATIONS):
             jacobians, residuals = self._linearised(homographies, weights)
@@ -87,28 +88,28 @@ class Adjustment:
             weights = self._robust_weights(self._norms(homographies), kept)
             if np.abs(step).max() * self._half < CONVERGED_PX:
                 break
-        # The anchor does not move, but rounding may show in its last digits.
+        # The anchor is fixed; this removes rounding errors.
         homographies[self._anchor] = np.eye(3)
         return homographies, self._norms(homographies)
 
-    def agreeing(self, norms: FloatArray) -> BoolArray:
-        """Tell which edges do not contradict the others, from their whitened residuals: (E,)."""
-        return np.asarray(norms <= CONTRADICTION * self._typical(norms, np.ones(len(norms), dtype=bool)))
+    def inliers(self, norms: FloatArray) -> BoolArray:
+        """Return which edges are no outliers, from the norms of their whitened residuals: (E,)."""
+        return np.asarray(norms <= OUTLIER * self._residual_scale(norms, np.ones(len(norms), dtype=bool)))
 
     def residuals_px(self, homographies: FloatArray) -> FloatArray:
-        """Return the root mean square distance of the corners, for each edge: (E,)."""
+        """Return the root mean square residual at the corners, for each edge: (E,) in px."""
         return np.asarray(np.sqrt(np.mean(np.sum(self._residuals(homographies) ** 2, axis=-1), axis=-1)))
 
-    def uncertainty(self, homographies: FloatArray, norms: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def assess(self, homographies: FloatArray, norms: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the information on each node while the others are held, and the expected error of its corners.
 
-        The error is that of solutions drawn from what the information of the edges allows, each aligned with the best one as
-        an evaluation would align planes. Where the edges disagree by more than their information says, it is as much larger.
+        The error is that of solutions drawn from the covariance, each aligned with the best one as an evaluation aligns planes.
+        If residuals exceed what the information of the edges predicts, the covariance is scaled up accordingly.
 
         Returns:
             (N, 8, 8) inverse covariances of p1..p8 of the homographies; (N,) in px.
         """
-        misfit = self._typical(norms, kept) / MEDIAN_NORM
+        misfit = self._residual_scale(norms, kept) / MEDIAN_NORM
         jacobians, _ = self._linearised(homographies, self._robust_weights(norms, kept) / misfit**2)
         normal, free = jacobians.T @ jacobians, self._free
         nodes = np.arange(self._n_nodes)
@@ -120,21 +121,21 @@ class Adjustment:
 
     @property
     def _free(self) -> BoolArray:
-        """The unknowns that may change: (8 N,)."""
+        """The unknowns of all nodes but the anchor: (8 N,)."""
         return np.repeat(np.arange(self._n_nodes) != self._anchor, 8)
 
     def _corner_std_px(self, homographies: FloatArray, changes: FloatArray) -> FloatArray:
-        """Return the root mean square distance of corners that (8 N, S) changes cause, after the best alignment: (N,)."""
+        """Return the root mean square displacement of corners by (8 N, S) changes, after the best alignment of planes: (N,)."""
         here = np.broadcast_to(self._rows, (self._n_nodes, 3, 4))
         to_corners = slopes(here, np.broadcast_to(self._generators @ self._rows, (self._n_nodes, 8, 3, 4)))
-        # What a change of the plane does to the corners of each frame.
-        seen = inverse(homographies)[:, None] @ self._generators @ homographies[:, None] @ self._rows
-        of_plane = slopes(here, seen).reshape(-1, 8)
+        # Derivatives of the corners of each frame with respect to a change of the plane.
+        by_plane = inverse(homographies)[:, None] @ self._generators @ homographies[:, None] @ self._rows
+        of_plane = slopes(here, by_plane).reshape(-1, 8)
         errors = (to_corners @ changes.reshape(self._n_nodes, 8, -1)).reshape(len(of_plane), -1)
         scale = np.linalg.norm(of_plane, axis=0)
         best = np.linalg.lstsq(of_plane / scale, errors, rcond=None)[0]
-        left = errors - of_plane / scale @ best
-        return np.asarray(np.sqrt((left**2).reshape(self._n_nodes, -1).sum(axis=1) / (4 * left.shape[1])))
+        remaining = errors - of_plane / scale @ best
+        return np.asarray(np.sqrt((remaining**2).reshape(self._n_nodes, -1).sum(axis=1) / (4 * remaining.shape[1])))
 
     def _in_parameters(self, homographies: FloatArray, blocks: FloatArray) -> FloatArray:
         """Convert (N, 8, 8) information on changes of nodes to that on p1..p8 of their homographies."""
@@ -144,18 +145,18 @@ class Adjustment:
         to_change = np.linalg.inv(to_parameters)
         return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)
 
-    def _typical(self, norms: FloatArray, kept: BoolArray) -> float:
-        """Return the size of a typical error of an edge: at least what its information says, which is about 1."""
-        # Each node takes up as many residuals as an edge has; what is left over tells the typical size of an error. Robust
-        # weights can make half of the edges agree exactly and the rest outliers, so that the median alone would not do.
+    def _residual_scale(self, norms: FloatArray, kept: BoolArray) -> float:
+        """Return the robust scale of the whitened residuals: at least that of unit variance, which the information predicts."""
+        # Each node absorbs the residuals of one edge; the redundant edges determine the scale. The median alone would be too
+        # small where robust weights make half of the edges fit exactly.
         n_edges = int(kept.sum())
-        left = n_edges - self._n_nodes + 1
-        spread = float(np.median(norms[kept])) * float(np.sqrt(n_edges / left)) if left > 0 else 0.0
-        return max(spread, MEDIAN_NORM)
+        redundancy = n_edges - self._n_nodes + 1
+        scale = float(np.median(norms[kept])) * float(np.sqrt(n_edges / redundancy)) if redundancy > 0 else 0.0
+        return max(scale, MEDIAN_NORM)
 
     def _robust_weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
         """Return the Cauchy weights of the edges, 0 for those that are not kept: (E,)."""
-        scale = self._typical(norms, kept) * CAUCHY
+        scale = self._residual_scale(norms, kept) * CAUCHY
         return np.asarray(np.where(kept, 1 / (1 + (norms / scale) ** 2), 0.0))
 
     def _relative(self, homographies: FloatArray) -> FloatArray:
@@ -176,7 +177,7 @@ class Adjustment:
         d_fixed = -self._generators @ mapped[:, None]
         root = np.sqrt(weights)[:, None, None] * self._whitening
         n_edges = len(weights)
-        # Each residual depends on the eight unknowns of both nodes of its edge, and on no others.
+        # Each residual depends on the eight unknowns of both nodes of its edge alone.
         entries = np.concatenate([root @ slopes(mapped, d) for d in (d_moving, d_fixed)], axis=2)
         unknowns = (8 * np.stack([self._moving, self._fixed], axis=1)[..., None] + np.arange(8)).reshape(n_edges, 1, 16)
         columns = np.broadcast_to(unknowns, entries.shape).astype(np.int32)
@@ -187,7 +188,7 @@ class Adjustment:
 
 
 def _solved(normal: sparse.csr_array, right: FloatArray) -> FloatArray:
-    """Solve a positive definite system: rows and columns are reordered alike, which leaves a graph with closures sparse."""
+    """Solve a positive definite system; the symmetric ordering keeps the factors of a graph with loop closures sparse."""
     factors = splu(
         normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
     )
@@ -195,18 +196,18 @@ def _solved(normal: sparse.csr_array, right: FloatArray) -> FloatArray:
 
 
 def _whitening(motions: Sequence[Located], rows: FloatArray) -> FloatArray:
-    """Return the maps from errors of the corners, in px, to errors of unit variance: (E, 8, 8).
+    """Return the maps from residuals at the corners, in px, to residuals of unit variance: (E, 8, 8).
 
     Args:
         motions: of the edges.
         rows: (3, 4) the corners in homogeneous coordinates.
     """
     whitening = np.array([np.eye(8) / max(motion.residual_px or 1.0, 1e-3) for motion in motions])
-    told = [index for index, motion in enumerate(motions) if motion.information is not None]
-    if told:
-        information = np.array([motions[index].information for index in told])
-        mapped = np.array([motions[index].homography for index in told]) @ rows
+    informed = [index for index, motion in enumerate(motions) if motion.information is not None]
+    if informed:
+        information = np.array([motions[index].information for index in informed])
+        mapped = np.array([motions[index].homography for index in informed]) @ rows
         changes = (from_parameters(np.eye(8)) - np.eye(3)) @ rows
-        to_corners = slopes(mapped, np.broadcast_to(changes, (len(told), *changes.shape)))
-        whitening[told] = np.linalg.cholesky(information).transpose(0, 2, 1) @ np.linalg.inv(to_corners)
+        to_corners = slopes(mapped, np.broadcast_to(changes, (len(informed), *changes.shape)))
+        whitening[informed] = np.linalg.cholesky(information).transpose(0, 2, 1) @ np.linalg.inv(to_corners)
     return whitening

@@ -1,4 +1,4 @@
-"""Attribute errors to the plugin that caused them: sources and trajectories whose errors name it, not the caller."""
+"""Attribution of errors: name the plugin that caused an error, not its caller."""
 
 from __future__ import annotations
 
@@ -14,23 +14,29 @@ from photonpano.source_wrapper import ArrayT, SourceWrapper, capabilities_of, wi
 from photonpano.values import FloatArray, FrameSpan
 
 
+class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
+    """What a component returned although its protocol does not allow it, as a clause; raised inside `attributing`."""
+
+
 @contextmanager
-def attributing(origin: str, level: int) -> Iterator[None]:
-    """Name a component in what it raises by mistake.
+def attributing(origin: str, where: str) -> Iterator[None]:
+    """Attribute errors of the block to a component. Errors that are written for users pass unchanged.
 
     Args:
-        origin: who provides it, such as "merger 'photon-mle' of photonpano 0.1.0".
-        level: the number of the level that it works for.
+        origin: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
+        where: what it works on, such as "level 2" or "frames 0 to 15".
 
     Raises:
-        PluginError: the block raised something that was not made for users.
+        PluginError: the component failed, or broke its contract.
     """
     try:
         yield
     except PhotonpanoError:
         raise
+    except BrokenContract as error:
+        raise PluginError(f"{origin} broke its contract at {where}: {error}") from None
     except Exception as error:
-        raise PluginError(f"{origin} failed at level {level}: {type(error).__name__}: {error}") from error
+        raise PluginError(f"{origin} failed at {where}: {type(error).__name__}: {error}") from error
 
 
 def attributed(source: Source, origin: str) -> AttributedSource:
@@ -57,19 +63,15 @@ class AttributedSource(SourceWrapper):
 
     def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
         """See `SourceWrapper`."""
-        try:
+        with attributing(self._origin, str(span)):
             found = method(span)
-        except PhotonpanoError:
-            raise
-        except Exception as error:
-            raise PluginError(f"{self._origin} failed at {span}: {type(error).__name__}: {error}") from error
-        if np.shape(found) != shape:
-            raise PluginError(f"{self._origin} broke its contract at {span}: expected the shape {shape}, got {np.shape(found)}")
-        return found
+            if np.shape(found) != shape:
+                raise BrokenContract(f"expected the shape {shape}, got {np.shape(found)}")
+            return found
 
 
 class AttributedTrajectory:
-    """A trajectory whose interpolator is named in its errors, and which is checked to give a homography for every instant.
+    """A trajectory whose errors name its interpolator, and whose homographies are checked.
 
     Args:
         trajectory: what the interpolator fitted.
@@ -86,17 +88,16 @@ class AttributedTrajectory:
         """Return the homographies of N instants: (N, 3, 3).
 
         Raises:
-            PluginError: the trajectory failed in its own way, or gave something else.
+            PluginError: the trajectory failed, or returned anything but N finite homographies.
         """
-        with attributing(self._origin, self._level):
-            found = np.asarray(self._trajectory.at(frame_indices), dtype=np.float64)
         frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
-        problem = None
-        if found.shape != (len(frames), 3, 3):
-            problem = f"expected homographies of the shape ({len(frames)}, 3, 3), got {found.shape}"
-        elif (bad := ~np.isfinite(found).all(axis=(1, 2)) | (found[:, 2, 2] == 0)).any():
-            first = int(np.argmax(bad))
-            problem = f"a homography is finite with h33 = 1, that of frame {frames[first]:g} is {found[first].tolist()}"
-        if problem:
-            raise PluginError(f"{self._origin} broke its contract at level {self._level}: {problem}")
-        return found
+        with attributing(self._origin, f"level {self._level}"):
+            found = np.asarray(self._trajectory.at(frame_indices), dtype=np.float64)
+            if found.shape != (len(frames), 3, 3):
+                raise BrokenContract(f"expected homographies of the shape ({len(frames)}, 3, 3), got {found.shape}")
+            if (bad := ~np.isfinite(found).all(axis=(1, 2)) | (found[:, 2, 2] == 0)).any():
+                first = int(np.argmax(bad))
+                raise BrokenContract(
+                    f"a homography is finite with h33 = 1, that of frame {frames[first]:g} is {found[first].tolist()}"
+                )
+            return found

@@ -1,4 +1,4 @@
-"""Loop closures: which exposures may show a place seen before, and whether two exposures show the same place."""
+"""Loop closures: find exposures that may show a place seen before, and measure the similarity of two exposures."""
 
 from __future__ import annotations
 
@@ -9,65 +9,63 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.geometry import apply, corners, inverse, rescaled, rescaling, translation
+from photonpano.motion.graph import GraphOptions, GraphSolution
+from photonpano.motion.level import FrameHomography
 from photonpano.motion.pairs import instants_of, lengths_of
 from photonpano.photometry import noise_free_correlation
-from photonpano.values import BoolArray, FloatArray, FluxImage, Group, Homography, VirtualExposure
+from photonpano.values import FloatArray, FluxImage, Group, VirtualExposure
 
+MIN_SIMILARITY = 0.7
+"""Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5."""
 _GRID = 8
-"""The overlap of two fields of view is counted on so many points squared."""
-_CLOSURE_SKIP = 2.0
-"""Places seen again lie so many times further away in time than the most distant skip."""
+"""The overlap of two fields of view is counted on a grid of this many points along each axis."""
+_MIN_SKIP = 2.0
+"""The exposures of a loop closure are at least this many times as far apart in time as the longest skip."""
 _PROMINENCE = 0.25
-"""Between two visits the overlap falls by at least this: a camera that only trembles has not been away. It is what two
-columns of the grid hold."""
-_MOST_REVISITS = 3
-"""An exposure is registered with so many earlier visits at most, those that it shares most with."""
-_MOST_RETURNS = 64
-"""So many exposures, spread over the capture, are registered with earlier visits at most. Neighbours tie the others to them."""
+"""Between two visits of a place the overlap falls by at least this share, two columns of the grid; a tremor does not count."""
+_MAX_CLOSURES = 3
+"""Most loop closures of an exposure with earlier ones; those of the largest overlap are taken."""
+_MAX_EXPOSURES = 64
+"""Most exposures of a level with loop closures to earlier ones, spread over the capture. Neighbours tie the others to them."""
 _BLOCK = 4
-"""Averages of so many pixels squared are compared: what motion blurs differently does not count, and noise counts less."""
+"""Exposures are compared by averages of blocks of this side, px: these have less noise, and hide differences of motion blur."""
 
 
-def revisits(
-    groups: Sequence[Group],
-    homographies: FloatArray,
-    located: BoolArray,
-    frame_shape: tuple[int, int],
-    skips: Sequence[float],
-    min_overlap: float,
+def closure_candidates(
+    groups: Sequence[Group], solution: GraphSolution, frame_shape: tuple[int, int], graph: GraphOptions
 ) -> list[tuple[int, int]]:
-    """Return pairs (moving, fixed) of exposures that see one place at different times: candidates for loop closures.
+    """Return pairs (moving, fixed) of exposures that overlap at different times, ordered by the moving one.
 
-    For an exposure, the best view of each earlier visit counts: going back in time, the overlap first falls and then rises.
-    Exposures that lie denser than their length are thinned out, since they say the same; of very many, some will do.
+    An exposure is paired with the best view of each earlier visit: a prominent maximum of the overlap, as a function of time.
+    Exposures that are denser than their length are thinned out.
 
     Args:
         groups: the groups of the level, in order of their instants.
-        homographies: (N, 3, 3) frame pixels to a common plane.
-        located: (N,) which of them are known.
+        solution: the homographies of the exposures.
         frame_shape: (height, width) of a frame.
-        skips: the pairs that are registered anyway, in group lengths.
-        min_overlap: the least share of the field of view that both see.
+        graph: the least overlap, as a share of the field of view, and the skips of the pairs that are registered anyway.
     """
+    if graph.closure_overlap is None:
+        return []
     instants, lengths = instants_of(groups), lengths_of(groups)
     length = float(np.median(lengths))
     spacing = float(np.median(np.diff(instants))) if len(groups) > 1 else length
-    chosen = np.flatnonzero(located & (lengths == length))[:: max(1, round(length / spacing))]
-    away = _CLOSURE_SKIP * max([1.0, *skips]) * length
+    chosen = np.flatnonzero(solution.located & (lengths == length))[:: max(1, round(length / spacing))]
+    min_interval = _MIN_SKIP * max([1.0, *graph.skips]) * length
     pairs: list[tuple[int, int]] = []
-    every = -(-len(chosen) // _MOST_RETURNS)
-    for position, moving in list(enumerate(chosen))[::every]:
+    step = -(-len(chosen) // _MAX_EXPOSURES)
+    for position, moving in list(enumerate(chosen))[::step]:
         earlier = chosen[:position]
-        overlap = _overlaps(homographies[moving], homographies[earlier], frame_shape)
-        peaks = _visits(overlap, min_overlap)
-        peaks = peaks[instants[earlier[peaks]] <= instants[moving] - away]
-        best = peaks[np.argsort(-overlap[peaks], kind="stable")[:_MOST_REVISITS]]
+        overlap = _overlaps(solution.homographies[moving], solution.homographies[earlier], frame_shape)
+        peaks = _visits(overlap, graph.closure_overlap)
+        peaks = peaks[instants[earlier[peaks]] <= instants[moving] - min_interval]
+        best = peaks[np.argsort(-overlap[peaks], kind="stable")[:_MAX_CLOSURES]]
         pairs += [(int(moving), int(fixed)) for fixed in np.sort(earlier[best])]
     return pairs
 
 
-def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homography) -> float:
-    """Return how alike two exposures are under a motion: the correlation they would have without photon noise.
+def exposure_similarity(moving: VirtualExposure, fixed: VirtualExposure, homography: FrameHomography) -> float:
+    """Return the similarity of two exposures under a motion: the correlation they would have without photon noise.
 
     Args:
         moving: one exposure.
@@ -75,13 +73,14 @@ def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homog
         homography: (3, 3), pixels of the moving exposure's frame to pixels of the fixed one's.
 
     Returns:
-        1 for the same place, around 0 for different ones; 0 where little is seen by both, or only noise is.
+        1 for the same place, around 0 for different ones; 0 where the overlap is small, or the scene does not stand out from
+        the noise.
     """
     height, width = (side // _BLOCK for side in moving.flux.shape)
     if not height * width:
         return 0.0
-    # From numbers of blocks to the top left pixels of the averages in the other exposure that lie closest: interpolation
-    # between averages would change their noise.
+    # From block numbers to the top left pixels of the nearest blocks of the other exposure: interpolation between averages
+    # would change their noise.
     half = (_BLOCK - 1) / 2
     to_fixed = translation(-half, -half) @ rescaled(homography, moving.scale) @ rescaling(_BLOCK)
     first, first_variance = (image[::_BLOCK, ::_BLOCK][:height, :width] for image in _averages(moving))
@@ -98,14 +97,14 @@ def agreement(moving: VirtualExposure, fixed: VirtualExposure, homography: Homog
 
 
 def _averages(exposure: VirtualExposure) -> tuple[FluxImage, FluxImage]:
-    """Return the average of the block that starts at each pixel, on the scale on which noise is uniform, and its variance.
+    """Return the average of the block that starts at each pixel, on the scale where noise is uniform, and its variance.
 
-    They are NaN where not all of the block was seen.
+    Both are NaN where part of the block was not seen.
     """
-    known = exposure.weight > 0
-    values = np.where(known, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(np.nan))
+    seen = exposure.weight > 0
+    values = np.where(seen, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(np.nan))
     variance = np.full_like(values, np.nan)
-    variance[known] = exposure.response.stabilised_std(exposure.weight[known]) ** 2 / _BLOCK**2
+    variance[seen] = exposure.response.stabilised_std(exposure.weight[seen]) ** 2 / _BLOCK**2
     kernel = np.full((_BLOCK, _BLOCK), 1 / _BLOCK**2)
     rows, columns = (side - _BLOCK + 1 for side in values.shape)
     mean, mean_variance = (
@@ -114,28 +113,30 @@ def _averages(exposure: VirtualExposure) -> tuple[FluxImage, FluxImage]:
     return mean, mean_variance
 
 
-def _visits(overlap: FloatArray, least: float) -> NDArray[np.integer]:
-    """Return where overlap is largest in each earlier visit: it is at least `least`, and prominent.
+def _visits(overlap: FloatArray, min_overlap: float) -> NDArray[np.integer]:
+    """Return the positions of the prominent maxima of the overlap: the best view of each earlier visit.
 
-    As `scipy.signal.find_peaks` does, whose import alone takes a second.
+    Equal to `scipy.signal.find_peaks`, whose import takes a second.
     """
-    # Between nothing before the first exposure and the exposure itself.
+    # Bounded by no overlap before the first exposure, and the full overlap of the exposure with itself.
     profile = np.concatenate([[0.0], overlap, [1.0]])
     peaks = []
-    for peak in np.flatnonzero((profile[1:-1] >= least) & (profile[1:-1] > profile[:-2]) & (profile[1:-1] >= profile[2:])) + 1:
-        before, after = (np.flatnonzero(side > profile[peak]) for side in (profile[:peak], profile[peak:]))
-        start, stop = before[-1] if before.size else 0, peak + (after[0] if after.size else len(profile) - peak)
-        rises = profile[peak] - max(profile[start:peak].min(), profile[peak:stop].min())
-        if rises >= _PROMINENCE:
-            level = int(np.argmax(profile[peak:] != profile[peak]))
-            peaks.append(peak - 1 + (level - 1) // 2)
+    inner = profile[1:-1]
+    for peak in np.flatnonzero((inner >= min_overlap) & (inner > profile[:-2]) & (inner >= profile[2:])) + 1:
+        higher_before, higher_after = (np.flatnonzero(side > profile[peak]) for side in (profile[:peak], profile[peak:]))
+        start = higher_before[-1] if higher_before.size else 0
+        stop = peak + (higher_after[0] if higher_after.size else len(profile) - peak)
+        prominence = profile[peak] - max(profile[start:peak].min(), profile[peak:stop].min())
+        if prominence >= _PROMINENCE:
+            plateau = int(np.argmax(profile[peak:] != profile[peak]))
+            peaks.append(peak - 1 + (plateau - 1) // 2)
     return np.array(peaks, dtype=int)
 
 
 def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
     """Return the share of one field of view that each of N others sees: (N,)."""
     low, high = corners(frame_shape)[[0, 2]]
-    # Centres of cells: on the border, points would leave the field of view at the least motion.
+    # Centres of cells: points on the border would leave the field of view at the least motion.
     x, y = (low[axis] + (high[axis] - low[axis]) * (np.arange(_GRID) + 0.5) / _GRID for axis in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     seen = apply(inverse(fixed) @ moving, points)

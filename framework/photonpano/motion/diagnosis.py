@@ -1,4 +1,4 @@
-"""Why exposures could not be located, in words: what failed, with which numbers, and what to try."""
+"""Diagnosis of exposures that could not be located: which pairs failed, with which numbers, and what to try."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from photonpano.errors import LocationError
 from photonpano.photometry import signal_to_noise
+from photonpano.text import listed
 from photonpano.values import BoolArray, Edge, FrameSpan, Group, NotLocated, VirtualExposure, true_spans
 
 TOLERATED_RUN = 2
-"""So many exposures in a row may be lost: the motion is interpolated across them."""
+"""Most exposures in a row that may be lost: the motion is interpolated across them."""
 _NOISY, _CLEAR = 0.25, 2.0
-"""Below the first ratio of signal to noise darkness is to blame, above the second blur is; between them either may be. Any of
-them may be for want of texture."""
+"""Below the first signal-to-noise ratio the likely cause is darkness, above the second it is blur, in between either. Lack of
+texture may be the cause at any ratio."""
 _SHOWN = 6
+"""Most pairs, spans or parts that a message lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +28,8 @@ class Contrast:
     """How much there is to see in an exposure.
 
     Attributes:
-        signal_to_noise: see `photonpano.photometry.signal_to_noise`.
-        blank: why there is nothing to see at all; None if there is something.
+        signal_to_noise: standard deviation of the scene over that of a pixel's noise, see `photonpano.photometry`.
+        blank: why nothing can be seen in it; None if something can.
     """
 
     signal_to_noise: float
@@ -35,18 +37,18 @@ class Contrast:
 
 
 def contrast_of(exposure: VirtualExposure) -> Contrast:
-    """Measure how far the variations of an exposure exceed its photon noise."""
+    """Measure how much there is to see in an exposure."""
     longest = exposure.weight.max()
     if longest == 0:
         return Contrast(0.0, "no pixel was seen")
-    # Unlike max and min, these pass over what is unknown.
+    # Unlike max and min, these skip NaN.
     if np.fmax.reduce(exposure.flux, axis=None) <= 0:
-        return Contrast(0.0, "no pixel saw a photon; is the shutter closed, or the file the right one?")
+        return Contrast(0.0, "no pixel detected a photon; is the shutter closed, or is it the wrong file?")
     darkest = exposure.response.mean_count(np.fmin.reduce(exposure.flux, axis=None, keepdims=True))
     brightest = exposure.response.mean_count(np.array([np.inf], np.float32))
-    # Half a frame is taken to be dark in a pixel that is always lit; one whole dark frame is the next there can be.
+    # For a pixel lit in every frame, half a frame is taken to be dark; with one dark frame, the difference is larger.
     if brightest.item() - darkest.item() < 0.75 / longest:
-        return Contrast(0.0, "every pixel is as bright as can be told, so that its flux is unknown; use a darker aperture")
+        return Contrast(0.0, "every pixel is saturated, so that its flux is unknown; use a smaller aperture")
     return Contrast(signal_to_noise(exposure))
 
 
@@ -58,21 +60,21 @@ def require_tied(
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
 ) -> None:
-    """Refuse to go on when too many exposures are not tied to the others.
+    """Refuse a level where too many exposures are not tied to the others.
 
-    Single exposures may be lost, since the motion is interpolated across them. A longer run is an error unless the spec
-    asks for the largest part; less than two located exposures is always one.
+    Up to two exposures in a row may be lost, since the motion is interpolated across them. A longer run is an error, unless
+    `disconnected` is "largest". Fewer than two located exposures are always an error.
 
     Args:
         level: from 1.
         groups: the groups of the level.
         edges: the pairs that were tried.
-        parts: (N,) number of the part that each exposure is tied to, 0 for the largest.
+        parts: (N,) number of the connected component of each exposure, 0 for the largest.
         contrasts: how much there is to see in each exposure.
-        disconnected: what the spec asks for.
+        disconnected: the option of the spec.
 
     Raises:
-        LocationError: says which frames are lost, which are tied together, and why pairs failed.
+        LocationError: names the frames that are lost, those that are tied together, and why pairs failed.
     """
     tied = parts == 0
     if len(groups) == 1:
@@ -82,15 +84,17 @@ def require_tied(
     if tied.sum() >= 2 and (longest <= TOLERATED_RUN or disconnected == "largest"):
         return
     failures = [edge for edge in edges if isinstance(edge.motion, NotLocated)]
-    lost = [_frames(run) for run in runs]
+    lost = [_frames(run) for run in runs[:_SHOWN]]
+    if len(runs) > _SHOWN:
+        lost.append(f"{len(runs) - _SHOWN} more spans")
     lines = [
         f"level {level}: {len(failures)} of {len(edges)} pairs of exposures could not be located, "
-        f"so that {_listed(lost)} cannot be tied to the rest"
+        f"so that {listed(lost)} cannot be tied to the rest"
         if tied.sum() >= 2
         else f"level {level}: none of the {len(edges)} pairs of exposures could be located"
     ]
     if tied.sum() >= 2:
-        lines.append(f"Tied together are {_tied_together(groups, parts)}.")
+        lines.append(f"Parts that are tied together: {_tied_together(groups, parts)}.")
     lines += [_pair(edge, groups) for edge in failures[:_SHOWN]]
     if len(failures) > _SHOWN:
         lines.append(f"  ... and {len(failures) - _SHOWN} more")
@@ -101,12 +105,12 @@ def require_tied(
 
 
 def _tied_together(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
-    """List the parts of at least two exposures by the frames that they hold, the largest first."""
+    """List the frames of each part of at least two exposures, the largest part first."""
     sizes = np.bincount(parts)
-    held = [
+    named = [
         " with ".join(_frames(run) for run in _runs(groups, parts == part)) for part in np.flatnonzero(sizes >= 2)[: _SHOWN + 1]
     ]
-    return "; ".join(held[:_SHOWN]) + ("; and others" if len(held) > _SHOWN else "")
+    return "; ".join(named[:_SHOWN]) + ("; and others" if len(named) > _SHOWN else "")
 
 
 def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Contrast]) -> list[str]:
@@ -144,9 +148,3 @@ def _runs(groups: Sequence[Group], flags: BoolArray) -> list[Sequence[Group]]:
 
 def _frames(groups: Sequence[Group]) -> str:
     return str(FrameSpan(groups[0].span.start, groups[-1].span.stop))
-
-
-def _listed(parts: Sequence[str]) -> str:
-    if len(parts) > _SHOWN:
-        return f"{', '.join(parts[:_SHOWN])} and {len(parts) - _SHOWN} more spans"
-    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)

@@ -1,10 +1,10 @@
-"""The motion graph: exposures are nodes, pairwise motions are edges; one homography a node makes them agree best."""
+"""The motion graph: exposures are nodes, pairwise motions are edges; it is solved for one homography a node."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Literal, Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 
 class GraphOptions(Protocol):
-    """Which pairs of exposures are registered, and what happens when too few are located."""
+    """Which pairs of exposures are registered, and whether some exposures may remain disconnected."""
 
     @property
     def skips(self) -> tuple[float, ...]:
@@ -27,18 +27,18 @@ class GraphOptions(Protocol):
 
     @property
     def closure_overlap(self) -> float | None:
-        """The least share of the field of view that the exposures of a loop closure share; None registers no closures."""
+        """Least overlap of a loop closure, as a share of the field of view; None registers no loop closures."""
         ...
 
     @property
     def disconnected(self) -> Literal["error", "largest"]:
-        """Whether to stop when the graph falls apart, or to go on with its largest part."""
+        """Whether a graph that falls apart is an error, or its largest part is used."""
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class GraphSolution:
-    """Where the exposures lie.
+    """The homographies of the exposures.
 
     Convention:
         Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity.
@@ -46,55 +46,37 @@ class GraphSolution:
     Attributes:
         homographies: (N, 3, 3), NaN for nodes that are not tied to the anchor.
         located: (N,) True for nodes that are tied to the anchor.
-        contradictions: positions, in the list that was solved, of edges that were dropped because the others outvote them.
-        residual_px: root mean square disagreement of the other edges at the corners, 0 for a tree.
-        assess: makes `information` and `std_px`, which takes about as long as to solve the graph.
+        outliers: positions, in the list that was solved, of edges that were dropped because they contradict the others.
+        residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
+        assess: returns, for the L located nodes, the inverse covariances of p1..p8 while all other nodes are held, (L, 8, 8),
+            and the expected error of the corners after the best alignment of the planes, (L,) in px. NaN for a single node.
+            It takes about as long as to solve the graph.
     """
 
     homographies: FloatArray
     located: BoolArray
-    contradictions: tuple[int, ...]
+    outliers: tuple[int, ...]
     residual_px: float
     assess: Callable[[], tuple[FloatArray, FloatArray]]
 
-    @property
-    def information(self) -> FloatArray:
-        """Inverse covariances of p1..p8 of each node while all others are held, (N, 8, 8), NaN where not located."""
-        return self._assessed[0]
-
-    @property
-    def std_px(self) -> FloatArray:
-        """How far a corner of the frame is expected to be from where it should, after the best alignment of the two planes.
-
-        (N,), NaN where not located.
-        """
-        return self._assessed[1]
-
-    @cached_property
-    def _assessed(self) -> tuple[FloatArray, FloatArray]:
-        information, std_px = np.full((len(self.located), 8, 8), np.nan), np.full(len(self.located), np.nan)
-        if self.located.sum() > 1:
-            information[self.located], std_px[self.located] = self.assess()
-        return information, std_px
-
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
-    """Number the sets of nodes that located edges tie together, the largest first: (N,)."""
+    """Number the connected components of the located edges, the largest first: (N,)."""
     _, labels = connected_components(_adjacency(n_nodes, _pairs(edges)), directed=False)
     by_size = np.argsort(-np.bincount(labels), kind="stable")
     return np.asarray(np.argsort(by_size)[labels])
 
 
 def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> GraphSolution:
-    """Find the homographies that agree best with all located edges.
+    """Solve the graph: find the homographies with the least residuals of all located edges.
 
-    Robust least squares on where each edge sends the corners of its frame, weighted by the edge's information where it has
-    one; Gauss-Newton with Cauchy weights, from a spanning tree of edges to the nearest exposures. Edges that contradict the
-    solution are dropped, unless the graph would fall apart, and it is solved again.
+    Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
+    with Cauchy weights, from a spanning tree of edges to the nearest exposures. Outliers are dropped, unless the graph would
+    fall apart, and it is solved again.
 
     Args:
         n_nodes: number of exposures.
-        edges: what the locator said; failures are skipped.
+        edges: pairs of exposures; those that are not located are skipped.
         anchor: the node whose homography is the identity.
         frame_shape: (height, width) of a frame.
     """
@@ -109,7 +91,7 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
     homographies = np.full((n_nodes, 3, 3), np.nan)
     homographies[anchor] = np.eye(3)
     if not tied:
-        return GraphSolution(homographies, located, (), 0.0, lambda: (np.empty((0, 8, 8)), np.empty(0)))
+        return GraphSolution(homographies, located, (), 0.0, lambda: (np.full((1, 8, 8), np.nan), np.full(1, np.nan)))
     pairs = pairs[tied]
     observed = np.array([motion.homography for motion in motions])
     _compose_tree(homographies, order[1:], parents, pairs, observed)
@@ -118,16 +100,14 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
     adjustment = Adjustment(compact[pairs], int(compact[anchor]), observed, motions, frame_shape)
     kept = np.ones(len(tied), dtype=bool)
     found, norms = adjustment.minimise(homographies[located], kept)
-    agreeing = adjustment.agreeing(norms)
-    if not agreeing.all() and _connected(len(order), compact[pairs][agreeing]):
-        kept = agreeing
+    inliers = adjustment.inliers(norms)
+    if not inliers.all() and _connected(len(order), compact[pairs][inliers]):
+        kept = inliers
         found, norms = adjustment.minimise(found, kept)
     homographies[located] = found
     residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[kept] ** 2)))
-    contradictions = tuple(int(position) for position in positions[~kept])
-    return GraphSolution(
-        homographies, located, contradictions, residual_px, partial(adjustment.uncertainty, found, norms, kept)
-    )
+    outliers = tuple(int(position) for position in positions[~kept])
+    return GraphSolution(homographies, located, outliers, residual_px, partial(adjustment.assess, found, norms, kept))
 
 
 def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:

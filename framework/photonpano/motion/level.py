@@ -1,13 +1,23 @@
-"""The components of one level of the loop, built and ready to run."""
+"""The components of one level of the loop, and the scale of its exposures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NewType
 
+import numpy as np
+
+from photonpano.geometry import rescaled
 from photonpano.motion.attribution import attributing
 from photonpano.protocols import Interpolator, Locator, Merger, Resampler
+from photonpano.values import FloatArray, Located
+
+FrameHomography = NewType("FrameHomography", FloatArray)
+"""A homography in pixels of frames, as the motion graph and trajectories have it."""
+ExposureHomography = NewType("ExposureHomography", FloatArray)
+"""A homography in pixels of a level's exposures, as locators have it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +42,7 @@ class Level:
     Attributes:
         number: from 1.
         scale: pixels of the level's exposures per pixel of a frame.
-        locators: at least one; a pair that one of them loses is offered to the next.
+        locators: at least one; a pair that one of them does not locate is passed to the next.
         origins: who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0".
     """
 
@@ -45,10 +55,25 @@ class Level:
     origins: Mapping[str, str]
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
-        """Name a component, given as its kind (such as "merger") or as a locator, in what it raises by mistake.
+        """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator.
 
         Raises:
-            PluginError: the block raised something that was not made for users.
+            PluginError: the component failed, or broke its contract.
         """
         origin = self.origins[component] if isinstance(component, str) else component.origin
-        return attributing(origin, self.number)
+        return attributing(origin, f"level {self.number}")
+
+    def in_exposure_px(self, homography: FrameHomography) -> ExposureHomography:
+        """Convert a homography from pixels of frames to pixels of the level's exposures."""
+        return ExposureHomography(rescaled(homography, self.scale))
+
+    def in_frame_px(self, motion: Located) -> Located:
+        """Convert a motion from pixels of the level's exposures to pixels of frames."""
+        homography = rescaled(motion.homography, 1 / self.scale)
+        information = motion.information
+        if information is not None:
+            # To first order, the unit of length matters to translation (p5, p6) and perspective (p7, p8) alone.
+            units = np.array([1, 1, 1, 1, self.scale, self.scale, 1 / self.scale, 1 / self.scale])
+            information = information * np.outer(units, units)
+        residual_px = None if motion.residual_px is None else motion.residual_px / self.scale
+        return replace(motion, homography=homography, information=information, residual_px=residual_px)

@@ -1,79 +1,66 @@
-"""The locate step: register pairs of exposures, and find where all of them lie."""
+"""The locate step: register pairs of exposures, and solve for the homography of each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from photonpano.context import Context
-from photonpano.motion.closures import revisits
+from photonpano.motion.checks import require_motion
+from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
-from photonpano.motion.level import Level
 from photonpano.motion.merge import VirtualExposures
-from photonpano.motion.pairs import pairs_of
-from photonpano.motion.registration import Registrar, require_motion
-from photonpano.protocols import Trajectory
-from photonpano.threads import Stopwatch
+from photonpano.motion.pairs import instants_of, pairs_of
+from photonpano.motion.registration import Registrar
+from photonpano.threads import thread_pool
 from photonpano.values import Edge, FloatArray, FrameSpan, Group, NotLocated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedLevel:
-    """Where the exposures of a level lie.
+    """The exposures of a level, located.
 
     Attributes:
         groups: the groups of the level.
         edges: every pair that was tried, with its motion or the reason why there is none.
-        n_revisits: how many of them, at the end, are pairs that may see one place at different times.
-        solution: one homography an exposure.
+        closures: those of them, at the end, that are candidates for loop closures.
+        solution: one homography for each exposure.
+        information: (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held; None for a
+            single exposure.
+        std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
         frame_shape: (height, width) of a frame.
     """
 
     groups: Sequence[Group]
     edges: tuple[Edge, ...]
-    n_revisits: int
+    closures: tuple[Edge, ...]
     solution: GraphSolution
+    information: FloatArray | None
+    std_px: FloatArray
     frame_shape: tuple[int, int]
 
     @property
     def instants(self) -> FloatArray:
         """The reference instants of the located exposures: (N,)."""
-        return np.array([group.reference for group in self.groups])[self.solution.located]
+        return instants_of(self.groups)[self.solution.located]
 
     @property
     def homographies(self) -> FloatArray:
-        """Their homographies to the plane of one of them: (N, 3, 3)."""
+        """The homographies of the located exposures to the plane of one of them: (N, 3, 3)."""
         return self.solution.homographies[self.solution.located]
 
     @property
-    def information(self) -> FloatArray | None:
-        """What is known of each of them while the others are held, as inverse covariances of p1..p8: (N, 8, 8).
-
-        None for a single exposure, which nothing ties to others.
-        """
-        return self.solution.information[self.solution.located] if self.n_located > 1 else None
-
-    @property
-    def revisits(self) -> tuple[Edge, ...]:
-        """The pairs that may see one place at different times."""
-        return self.edges[len(self.edges) - self.n_revisits :]
-
-    @property
     def covered(self) -> FrameSpan:
-        """The frames from the first to the last that located exposures hold.
-
-        Their motion is known: an exposure tells of all its frames, also of those beyond the last instant that was located.
-        """
+        """The frames from the first to the last of all located exposures; trajectories are extrapolated to the outermost."""
         spans = [group.span for group, located in zip(self.groups, self.solution.located, strict=True) if located]
         return FrameSpan(min(span.start for span in spans), max(span.stop for span in spans))
 
     @property
     def n_located(self) -> int:
-        """How many exposures are tied together."""
+        """How many exposures are located."""
         return int(self.solution.located.sum())
 
     @property
@@ -82,43 +69,36 @@ class LocatedLevel:
         return tuple(edge for edge in self.edges if isinstance(edge.motion, NotLocated))
 
 
-def locate(
-    level: Level,
-    exposures: VirtualExposures,
-    known: Trajectory | None,
-    graph: GraphOptions,
-    clock: Stopwatch,
-    context: Context,
-) -> LocatedLevel:
-    """Register the pairs of a level, and solve the motion graph.
+def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -> LocatedLevel:
+    """Register the pairs of a level, and solve the motion graph (paper, section 4, "Locate").
 
-    Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and forgotten after the last.
-    What the first locator loses is offered to the next. Where the motion leads back to places seen before, pairs of such
-    exposures close loops. Only for these two are exposures merged and described once more.
+    Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and released after its last
+    pair. A pair that the first locator does not locate is passed to the next. Once the graph is solved, pairs of exposures that
+    overlap at different times are registered as loop closures, and the graph is solved again. Fallback locators and loop
+    closures need exposures that were released; these are merged again.
 
     Raises:
-        LocationError: exposures cannot be tied to each other, and the settings do not allow to go on without them.
-        PluginError: a locator failed in its own way, or returned what is no motion.
+        LocationError: exposures cannot be tied to each other, and `graph.disconnected` is "error".
+        PluginError: a locator failed, or broke its contract.
     """
-    groups, shape = exposures.groups, exposures.frame_shape
-    registrar = Registrar(level, exposures, known, clock)
+    level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
+    registrar = Registrar(exposures)
     pairs = pairs_of(groups, graph.skips)
-    title = f"level {level.number}: merge and locate"
-    with ThreadPoolExecutor(context.threads) as pool:
+    with thread_pool(context.threads) as pool:
+        title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
         require_motion(level, edges)
-        with clock("locate"):
+        with exposures.clock("locate"):
             labels = components(len(groups), edges)
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
-            candidates = np.flatnonzero(labels == 0)
-            anchor = int(candidates[len(candidates) // 2])
+            largest = np.flatnonzero(labels == 0)
+            anchor = int(largest[len(largest) // 2])
             solution = solve(len(groups), edges, anchor, shape)
-            again: list[tuple[int, int]] = []
-            if graph.closure_overlap is not None:
-                again = revisits(groups, solution.homographies, solution.located, shape, graph.skips, graph.closure_overlap)
-        closures = tuple(registrar.revisits(again, solution.homographies, pool))
-    if closures:
-        with clock("locate"):
+            candidates = closure_candidates(groups, solution, shape, graph)
+        closures = tuple(registrar.closures(candidates, solution.homographies, pool))
+    with exposures.clock("locate"):
+        if closures:
             solution = solve(len(groups), edges + closures, anchor, shape)
-    return LocatedLevel(groups, edges + closures, len(closures), solution, shape)
+        information, std_px = solution.assess()
+    return LocatedLevel(groups, edges + closures, closures, solution, information if len(std_px) > 1 else None, std_px, shape)

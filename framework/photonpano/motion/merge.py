@@ -1,62 +1,58 @@
-"""The merge step: virtual exposures of a level, made when they are asked for, so that no level is held in memory."""
+"""The merge step: plan the virtual exposures of a level; each is merged when it is needed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-from photonpano.errors import PluginError
+from photonpano.motion.attribution import BrokenContract
 from photonpano.motion.level import Level
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
 from photonpano.values import Group, VirtualExposure
 
 
-def merge(
-    level: Level, source: Source, groups: Sequence[Group], known: Trajectory | None, clock: Stopwatch
-) -> VirtualExposures:
-    """Merge the groups of a level along the motion known so far (paper, section 4, "Merge"), each when it is asked for.
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualExposures:
+    """The virtual exposures of a level, planned. May be used from several threads.
 
-    Args:
+    Attributes:
         level: the components of the level.
         source: the capture.
-        groups: what is merged.
-        known: the motion known so far; None at the first level.
-        clock: is told the time that merging takes.
-    """
-    return VirtualExposures(level, source, groups, known, clock)
-
-
-class VirtualExposures:
-    """The virtual exposures of a level: `exposures[i]` merges group i along the motion known so far.
-
-    Nothing is kept: an exposure that is asked for again is merged again. May be used from several threads.
+        groups: the frames of each exposure.
+        previous: the motion known so far; None at the first level.
+        clock: adds up the time that merging takes.
     """
 
-    def __init__(
-        self, level: Level, source: Source, groups: Sequence[Group], known: Trajectory | None, clock: Stopwatch
-    ) -> None:
-        self._level = level
-        self._source = source
-        self._known = known
-        self._clock = clock
-        self.groups = groups
-        self.frame_shape = source.info.frame_shape
+    level: Level
+    source: Source
+    groups: Sequence[Group]
+    previous: Trajectory | None
+    clock: Stopwatch
 
-    def __len__(self) -> int:
-        return len(self.groups)
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Height and width of a frame."""
+        return self.source.info.frame_shape
 
-    def __getitem__(self, index: int) -> VirtualExposure:
-        level = self._level
-        with self._clock("merge"), level.attributing("merger"):
-            exposure = level.merger.merge(self._source, self.groups[index], self._known, level.scale)
-        if not isinstance(exposure, VirtualExposure):
-            raise PluginError(
-                f"{level.origins['merger']} broke its contract at level {level.number}: "
-                f"expected a VirtualExposure, got {type(exposure).__name__}"
-            )
-        if exposure.scale != level.scale:
-            raise PluginError(
-                f"{level.origins['merger']} broke its contract at level {level.number}: "
-                f"expected an exposure of scale {level.scale:g}, got {exposure.scale:g}"
-            )
-        return exposure
+    def merged(self, index: int) -> VirtualExposure:
+        """Merge a group along the motion known so far. Nothing is cached: a second call merges it again.
+
+        Raises:
+            PluginError: the merger failed, or returned anything but an exposure of the level's scale.
+        """
+        level = self.level
+        with self.clock("merge"), level.attributing("merger"):
+            exposure = level.merger.merge(self.source, self.groups[index], self.previous, level.scale)
+            if not isinstance(exposure, VirtualExposure):
+                raise BrokenContract(f"expected a VirtualExposure, got {type(exposure).__name__}")
+            if exposure.scale != level.scale:
+                raise BrokenContract(f"expected an exposure of scale {level.scale:g}, got {exposure.scale:g}")
+            return exposure
+
+
+def merge(
+    level: Level, source: Source, groups: Sequence[Group], previous: Trajectory | None, clock: Stopwatch
+) -> VirtualExposures:
+    """Plan the virtual exposures of a level: its groups, merged along the motion known so far (paper, section 4, "Merge")."""
+    return VirtualExposures(level, source, groups, previous, clock)

@@ -1,4 +1,4 @@
-"""How far a trajectory may be from the true one, frame by frame."""
+"""The expected error of a trajectory, frame by frame."""
 
 from __future__ import annotations
 
@@ -11,61 +11,61 @@ from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray
 
 _COMPARED = 1000
-"""Two levels are compared at so many frames."""
-_UNSETTLED = 0.25
-"""The share of what a level still changed that is taken to be wrong after it: each level takes away three quarters or more."""
-_BLURRED = 0.02
-"""The share of the way within a group by which the first level errs, where nothing else is known: it sees that much blurred."""
+"""Number of frames at which two levels are compared."""
+_REMAINING_SHARE = 0.25
+"""Error after a level, as a share of the change it made: each level removes at least three quarters of the error."""
+_BLUR_SHARE = 0.02
+"""Error after the first level, as a share of the motion within a group, by which its exposures are blurred."""
 
 
 class Uncertainty:
     """The expected corner error of a trajectory at any frame, in px, after the best alignment of the planes.
 
-    Three things add up: what the photons leave open at the located instants; beyond the first and the last of them, the
-    velocity, which is held; and what the last level still changed, since groups merged along a wrong motion confirm it.
+    It combines the expected error at the located instants, due to photon noise; the extrapolation at constant velocity beyond
+    the first and the last of them; and a share of the last change, since exposures merged along a wrong motion confirm it.
 
     Attributes:
-        change_px: how far the level moved the corners of the frames, on average, in px of a frame; None at the first.
+        change_px: mean displacement of the corners since the previous level, px of a frame; None at the first level.
     """
 
     change_px: float | None
 
-    def __init__(self, located: LocatedLevel, after: Trajectory, before: Trajectory | None, n_frames: int) -> None:
+    def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, n_frames: int) -> None:
         """Compare a level with the one before.
 
         Args:
-            located: what the level measured.
-            after: the motion known after the level.
-            before: the motion known before it, None at the first level.
+            located: the exposures of the level.
+            trajectory: the motion after the level.
+            previous: the motion after the level before; None at the first level.
             n_frames: length of the capture.
         """
         self._instants = located.instants
-        self._std_px = located.solution.std_px[located.solution.located]
+        self._std_px = located.std_px
         self._frames = np.unique(np.linspace(0, n_frames - 1, _COMPARED).round())
-        shape, second = located.frame_shape, after.at(self._frames)
-        if before is None:
+        shape, current = located.frame_shape, trajectory.at(self._frames)
+        if previous is None:
             half = np.median([len(group.span) for group in located.groups]) / 2
-            way = inverse(after.at(self._frames - half)) @ after.at(self._frames + half)
+            within_group = inverse(trajectory.at(self._frames - half)) @ trajectory.at(self._frames + half)
             self.change_px = None
-            self._unsettled_px = _BLURRED * corner_displacements(way, np.eye(3), shape).mean(axis=-1)
+            self._remaining_px = _BLUR_SHARE * corner_displacements(within_group, np.eye(3), shape).mean(axis=-1)
         else:
-            first = before.at(self._frames)
-            moved = inverse(first) @ align_planes(second, first, shape) @ second
-            changes_px = corner_displacements(moved, np.eye(3), shape).mean(axis=-1)
+            before = previous.at(self._frames)
+            change = inverse(before) @ align_planes(current, before, shape) @ current
+            changes_px = corner_displacements(change, np.eye(3), shape).mean(axis=-1)
             self.change_px = float(changes_px.mean())
-            self._unsettled_px = _UNSETTLED * changes_px
+            self._remaining_px = _REMAINING_SHARE * changes_px
 
     @property
     def mean_px(self) -> float:
-        """The expected corner error without what the level still changed, on average over the frames."""
-        return float(self._measured(self._frames).mean())
+        """Mean over the frames of the expected corner error due to photon noise and extrapolation alone."""
+        return float(self._noise_px(self._frames).mean())
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
-        """Return the expected corner error at N instants, in px: (N,). Infinite where a single exposure tells of no motion."""
+        """Return the expected corner error at N instants, in px: (N,). Infinite if a single exposure was located."""
         frames = np.asarray(frame_indices, dtype=np.float64)
-        return np.asarray(np.hypot(self._measured(frames), np.interp(frames, self._frames, self._unsettled_px)))
+        return np.asarray(np.hypot(self._noise_px(frames), np.interp(frames, self._frames, self._remaining_px)))
 
-    def _measured(self, frames: FloatArray) -> FloatArray:
+    def _noise_px(self, frames: FloatArray) -> FloatArray:
         if len(self._instants) < 2:
             return np.full(frames.shape, np.inf)
         inside = np.interp(frames, self._instants, self._std_px)

@@ -136,7 +136,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     for number, level in enumerate(plan.levels, start=1):
         resampler: Resampler = _built(level.resample, context)
         try:
-            with attributing(level.resample.label, number):
+            with attributing(level.resample.label, f"level {number}"):
                 foreseen.append(resampler.groups(source.info.n_frames, number))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
@@ -154,7 +154,7 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     threads = thread_count(plan.run.threads)
     context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
     resampler: Resampler = _built(choice, context)
-    with attributing(choice.label, 1):
+    with attributing(choice.label, "level 1"):
         resampler.groups(source.info.n_frames, 1)
     return decisions
 

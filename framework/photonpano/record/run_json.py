@@ -171,10 +171,10 @@ def level_record(result: LevelResult) -> LevelRecord:
             if isinstance(edge.motion, NotLocated)
         ],
         "revisits": {
-            "pairs": located.n_revisits,
-            "located": sum(isinstance(edge.motion, Located) for edge in located.revisits),
+            "pairs": len(located.closures),
+            "located": sum(isinstance(edge.motion, Located) for edge in located.closures),
         },
-        "contradictions": [_pair(groups, located.edges[index]) for index in located.solution.contradictions],
+        "contradictions": [_pair(groups, located.edges[index]) for index in located.solution.outliers],
         "change_px": result.change_px,
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
@@ -222,8 +222,8 @@ def level_warnings(results: Sequence[LevelResult]) -> list[str]:
                 f"level {result.level.number}: {len(lost)} of {len(groups)} exposures are not located "
                 f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
             )
-        if located.solution.contradictions:
-            dropped = [located.edges[index] for index in located.solution.contradictions]
+        if located.solution.outliers:
+            dropped = [located.edges[index] for index in located.solution.outliers]
             first = f"{groups[dropped[0].moving]} onto {groups[dropped[0].fixed]}"
             warnings.append(
                 f"level {result.level.number}: {len(dropped)} of {len(located.edges)} pairs contradict the others and were "

@@ -9,7 +9,7 @@ import pytest
 
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.motion.closures import agreement
+from photonpano.motion.closures import exposure_similarity
 from photonpano.photometry import BinaryResponse
 
 SHAPE = (128, 160)
@@ -57,7 +57,7 @@ def test_the_same_place_agrees_whatever_the_noise(flux: float, scale: float) -> 
 
     def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(plane, place, flux, rng, scale=scale) for place in (HERE, NEARBY))
-        return agreement(moving, fixed, inverse(NEARBY) @ HERE)
+        return exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE)
 
     found = several(alike)
     assert found.mean() == pytest.approx(1, abs=0.005)
@@ -67,7 +67,7 @@ def test_the_same_place_agrees_whatever_the_noise(flux: float, scale: float) -> 
 def test_in_the_dark_it_agrees_or_does_not_tell() -> None:
     def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(plane, place, 0.002, rng) for place in (HERE, NEARBY))
-        return agreement(moving, fixed, inverse(NEARBY) @ HERE)
+        return exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE)
 
     found = several(alike)
     assert np.all((found == 0) | (found > 0.7))
@@ -79,7 +79,7 @@ def test_in_the_dark_it_agrees_or_does_not_tell() -> None:
 def test_different_places_do_not_agree(flux: float, scale: float) -> None:
     def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(plane, place, flux, rng, scale=scale) for place in (HERE, ELSEWHERE))
-        return agreement(moving, fixed, inverse(NEARBY) @ HERE)
+        return exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE)
 
     assert np.abs(several(alike)).max() < 0.6
 
@@ -89,7 +89,7 @@ def test_different_places_do_not_agree(flux: float, scale: float) -> None:
 def test_where_there_is_only_noise_nothing_agrees(flux: float, motion: np.ndarray) -> None:
     def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(np.ones_like(plane), HERE, flux, rng) for _ in range(2))
-        return agreement(moving, fixed, motion)
+        return exposure_similarity(moving, fixed, motion)
 
     np.testing.assert_array_equal(several(alike), 0)
 
@@ -97,7 +97,7 @@ def test_where_there_is_only_noise_nothing_agrees(flux: float, motion: np.ndarra
 def test_a_wrong_motion_agrees_less_the_further_it_is_off() -> None:
     rng = np.random.default_rng(0)
     moving, fixed = (seen(scene(0), place, 0.1, rng) for place in (HERE, NEARBY))
-    found = [agreement(moving, fixed, translation(off_px, 0) @ inverse(NEARBY) @ HERE) for off_px in (0, 2, 4, 8, 16)]
+    found = [exposure_similarity(moving, fixed, translation(off_px, 0) @ inverse(NEARBY) @ HERE) for off_px in (0, 2, 4, 8, 16)]
     assert found == sorted(found, reverse=True)
     assert found[0] > 0.99
     assert found[-1] < 0.5
@@ -107,14 +107,14 @@ def test_a_camera_that_rolls_and_tilts_sees_the_same_place() -> None:
     roll = np.array([[np.cos(0.35), -np.sin(0.35), 90], [np.sin(0.35), np.cos(0.35), 30], [2e-4, 0, 1]])
     rng = np.random.default_rng(0)
     moving, fixed = (seen(scene(0), place, 0.1, rng) for place in (roll, translation(80, 60)))
-    assert agreement(moving, fixed, inverse(translation(80, 60)) @ roll) == pytest.approx(1, abs=0.02)
+    assert exposure_similarity(moving, fixed, inverse(translation(80, 60)) @ roll) == pytest.approx(1, abs=0.02)
 
 
 def test_exposures_of_different_lengths_agree() -> None:
     rng = np.random.default_rng(0)
     short, long = seen(scene(0), HERE, 0.1, rng, frames=60), seen(scene(0), NEARBY, 0.1, rng, frames=1000)
-    assert agreement(short, long, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.02)
-    assert agreement(long, short, inverse(HERE) @ NEARBY) == pytest.approx(1, abs=0.02)
+    assert exposure_similarity(short, long, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.02)
+    assert exposure_similarity(long, short, inverse(HERE) @ NEARBY) == pytest.approx(1, abs=0.02)
 
 
 def test_pixels_that_were_not_seen_do_not_count() -> None:
@@ -124,7 +124,7 @@ def test_pixels_that_were_not_seen_do_not_count() -> None:
     columns[:, 70:90] = columns[5, 5] = rows[20:40] = True
     moving = seen(scene(0), HERE, 0.1, rng, unseen=columns)
     fixed = seen(scene(0), NEARBY, 0.1, rng, unseen=rows)
-    assert agreement(moving, fixed, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.01)
+    assert exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.01)
 
 
 def test_what_hardly_overlaps_or_is_hardly_seen_does_not_agree() -> None:
@@ -132,10 +132,10 @@ def test_what_hardly_overlaps_or_is_hardly_seen_does_not_agree() -> None:
     exposure = seen(scene(0), HERE, 1.0, rng)
     sliver = np.ones(SHAPE, bool)
     sliver[:6] = False
-    assert agreement(exposure, exposure, np.eye(3)) == pytest.approx(1, abs=0.02)
-    assert agreement(exposure, exposure, translation(155, 0)) == 0
-    assert agreement(exposure, exposure, translation(500, 0)) == 0
-    assert agreement(exposure, seen(scene(0), HERE, 1.0, rng, unseen=sliver), np.eye(3)) == 0
-    assert agreement(exposure, seen(scene(0), HERE, 1.0, rng, unseen=np.ones(SHAPE, bool)), np.eye(3)) == 0
+    assert exposure_similarity(exposure, exposure, np.eye(3)) == pytest.approx(1, abs=0.02)
+    assert exposure_similarity(exposure, exposure, translation(155, 0)) == 0
+    assert exposure_similarity(exposure, exposure, translation(500, 0)) == 0
+    assert exposure_similarity(exposure, seen(scene(0), HERE, 1.0, rng, unseen=sliver), np.eye(3)) == 0
+    assert exposure_similarity(exposure, seen(scene(0), HERE, 1.0, rng, unseen=np.ones(SHAPE, bool)), np.eye(3)) == 0
     tiny = seen(scene(0), HERE, 1.0, rng, scale=0.02)
-    assert agreement(tiny, tiny, np.eye(3)) == 0
+    assert exposure_similarity(tiny, tiny, np.eye(3)) == 0

@@ -25,7 +25,7 @@ def exposed(counts: np.ndarray, frames: int) -> VirtualExposure:
 @given(st.integers(1, 100_000))
 def test_an_exposure_that_is_lit_in_every_frame_is_blank(frames: int) -> None:
     assert contrast_of(exposed(np.full((4, 6), frames), frames)).blank == (
-        "every pixel is as bright as can be told, so that its flux is unknown; use a darker aperture"
+        "every pixel is saturated, so that its flux is unknown; use a smaller aperture"
     )
 
 
@@ -38,7 +38,7 @@ def test_one_dark_frame_of_one_pixel_is_not(frames: int) -> None:
 
 def test_an_exposure_without_photons_is_blank() -> None:
     assert contrast_of(exposed(np.zeros((4, 6)), 100)).blank == (
-        "no pixel saw a photon; is the shutter closed, or the file the right one?"
+        "no pixel detected a photon; is the shutter closed, or is it the wrong file?"
     )
 
 
@@ -51,7 +51,7 @@ def test_an_exposure_that_saw_nothing_is_blank() -> None:
 N = 10
 GROUPS = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(N))
 CLEAR, DARK = Contrast(12.34), Contrast(0.17)
-BLANK = Contrast(0.0, "no pixel saw a photon")
+BLANK = Contrast(0.0, "no pixel detected a photon")
 
 
 def require(
@@ -96,7 +96,7 @@ def test_a_part_without_texture_is_named_with_its_pairs() -> None:
     assert refusal((4, 5, 6)) == golden(
         """
         level 2: 4 of 9 pairs of exposures could not be located, so that frames 400 to 699 cannot be tied to the rest
-        Tied together are frames 0 to 399 with frames 700 to 999.
+        Parts that are tied together: frames 0 to 399 with frames 700 to 999.
           frames 400 to 499 onto frames 300 to 399: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
           frames 500 to 599 onto frames 400 to 499: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
           frames 600 to 699 onto frames 500 to 599: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
@@ -144,15 +144,15 @@ def parts_refusal(parts: list[int]) -> str:
 def test_the_parts_are_named_by_what_they_hold_the_largest_first() -> None:
     """Exposures that are tied to no other make no part."""
     assert parts_refusal([1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2]) == (
-        "Tied together are frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099."
+        "Parts that are tied together: frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099."
     )
-    assert parts_refusal([0, 0, 1, 2, 3]) == "Tied together are frames 0 to 199."
+    assert parts_refusal([0, 0, 1, 2, 3]) == "Parts that are tied together: frames 0 to 199."
 
 
 def test_a_long_list_of_parts_is_cut() -> None:
     shown = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
-    assert parts_refusal([part for part in range(6) for _ in range(2)]) == f"Tied together are {shown}."
-    assert parts_refusal([part for part in range(7) for _ in range(2)]) == f"Tied together are {shown}; and others."
+    assert parts_refusal([part for part in range(6) for _ in range(2)]) == f"Parts that are tied together: {shown}."
+    assert parts_refusal([part for part in range(7) for _ in range(2)]) == f"Parts that are tied together: {shown}; and others."
 
 
 def test_a_long_list_of_pairs_is_cut() -> None:
@@ -161,8 +161,8 @@ def test_a_long_list_of_pairs_is_cut() -> None:
 
 
 def test_blank_exposures_need_no_advice() -> None:
-    assert refusal((4, 5, 6), BLANK, reason="frames 400 to 499: no pixel saw a photon").splitlines()[-2:] == [
-        "  frames 700 to 799 onto frames 600 to 699: frames 400 to 499: no pixel saw a photon",
+    assert refusal((4, 5, 6), BLANK, reason="frames 400 to 499: no pixel detected a photon").splitlines()[-2:] == [
+        "  frames 700 to 799 onto frames 600 to 699: frames 400 to 499: no pixel detected a photon",
         "To go on with the largest part alone, set graph.disconnected to largest.",
     ]
 

@@ -8,8 +8,10 @@ from scipy.signal import find_peaks
 
 from photonpano import FrameSpan, Group
 from photonpano.geometry import translation
-from photonpano.motion.closures import _PROMINENCE, _visits, revisits
+from photonpano.motion.closures import _PROMINENCE, _visits, closure_candidates
+from photonpano.motion.graph import GraphSolution
 from photonpano.motion.pairs import pairs_of, shared_share
+from photonpano.specs.settings import GraphSettings
 
 SHAPE = (40, 60)
 
@@ -95,13 +97,25 @@ def test_the_share_of_common_frames(first: tuple[int, int], second: tuple[int, i
     assert shared_share(FrameSpan(*second), FrameSpan(*first)) == share
 
 
+def candidates(
+    spread: list[Group],
+    homographies: np.ndarray,
+    located: np.ndarray,
+    skips: tuple[float, ...] = (1.0, 2.0),
+    min_overlap: float | None = 0.5,
+) -> list[tuple[int, int]]:
+    solution = GraphSolution(homographies, located, (), 0.0, lambda: (np.empty((0, 8, 8)), np.empty(0)))
+    graph = GraphSettings(skips=skips, closure_overlap=min_overlap)
+    return closure_candidates(spread, solution, SHAPE, graph)
+
+
 def again(
     places: np.ndarray, *, step: int = 100, skips: tuple[float, ...] = (1.0, 2.0), min_overlap: float = 0.5
 ) -> list[tuple[int, int]]:
     """Visit (x, y) places with exposures of 100 frames, `step` frames apart."""
     homographies = np.array([translation(x, y) for x, y in places])
     spread = groups(*range(0, step * len(places), step))
-    return revisits(spread, homographies, np.ones(len(places), bool), SHAPE, skips, min_overlap)
+    return candidates(spread, homographies, np.ones(len(places), bool), skips, min_overlap)
 
 
 def line(*x_px: float) -> np.ndarray:
@@ -192,7 +206,7 @@ def test_what_is_not_located_meets_nothing() -> None:
     located = np.ones(40, bool)
     located[[5, 30]] = False
     homographies[~located] = np.nan
-    pairs = revisits(groups(*range(0, 4000, 100)), homographies, located, SHAPE, (1.0, 2.0), 0.5)
+    pairs = candidates(groups(*range(0, 4000, 100)), homographies, located)
     assert not {5, 30} & {index for pair in pairs for index in pair}
     assert len(pairs) >= 16
 
@@ -202,7 +216,7 @@ def test_groups_of_another_length_meet_nothing() -> None:
     places = line(*FORTH, *BACK)
     homographies = np.array([translation(x, y) for x, y in places])
     spread = [Group(FrameSpan(0, 50), 0.0), *groups(*range(100, 4000, 100))]
-    pairs = revisits(spread, homographies, np.ones(40, bool), SHAPE, (1.0, 2.0), 0.5)
+    pairs = candidates(spread, homographies, np.ones(40, bool))
     assert {index for pair in pairs for index in pair} == set(range(1, 18)) | set(range(22, 40))
 
 

@@ -30,10 +30,9 @@ def source(memory_source: type) -> Any:
 
 @pytest.fixture
 def run(source: Any) -> Callable[..., LocatedLevel]:
-    def run(level: Level, known: Trajectory | None = None, graph: GraphSettings = CHAIN, threads: int = 2) -> LocatedLevel:
+    def run(level: Level, previous: Trajectory | None = None, graph: GraphSettings = CHAIN, threads: int = 2) -> LocatedLevel:
         groups = level.resampler.groups(N_FRAMES, level.number)
-        clock = Stopwatch(threads)
-        return locate(level, VirtualExposures(level, source, groups, known, clock), known, graph, clock, Context(threads))
+        return locate(VirtualExposures(level, source, groups, previous, Stopwatch(threads)), graph, Context(threads))
 
     return run
 

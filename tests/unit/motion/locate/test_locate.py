@@ -154,7 +154,7 @@ def test_a_blank_exposure_is_not_shown_to_the_locator(run: Callable, make_level:
     found = run(replace(level, merger=Shuttered()))
     assert 40 not in shown
     assert {edge.motion.reason for edge in found.failures} == {
-        "frames 40 to 49: no pixel saw a photon; is the shutter closed, or the file the right one?"
+        "frames 40 to 49: no pixel detected a photon; is the shutter closed, or is it the wrong file?"
     }
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from photonpano import Group, Located, NotLocated, PluginError
 from photonpano.geometry import rescaled, translation
-from photonpano.motion.registration import broken_promise
+from photonpano.motion.checks import require_valid
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -47,17 +47,19 @@ BROKEN = [
 def test_what_is_no_motion_is_refused_with_the_name_of_the_locator(
     run: Callable, make_level: Callable, pan: Callable, answer: Any, problem: str
 ) -> None:
-    assert broken_promise(answer) == problem
     with pytest.raises(PluginError) as caught:
         run(make_level(pan(0.3), lambda *_: answer))
     assert str(caught.value) == f"locator 'toy' of toys 1.0 broke its contract at level 1: {problem}"
 
 
 def test_a_motion_that_keeps_its_promise() -> None:
-    assert broken_promise(Located(np.eye(3), np.eye(8))) is None
-    assert broken_promise(Located(rescaled(translation(3, 1), 2))) is None
-    assert broken_promise(Located(translation(3, 1), evidence={"inliers": np.int64(3), "ncc": np.float32(0.5)})) is None
-    assert broken_promise(NotLocated("lost", {"matches": 3})) is None
+    for motion in (
+        Located(np.eye(3), np.eye(8)),
+        Located(rescaled(translation(3, 1), 2)),
+        Located(translation(3, 1), evidence={"inliers": np.int64(3), "ncc": np.float32(0.5)}),
+        NotLocated("lost", {"matches": 3}),
+    ):
+        assert require_valid(motion) is motion
 
 
 def in_whole_pixels(moving: Group, fixed: Group, found: Located) -> Located:

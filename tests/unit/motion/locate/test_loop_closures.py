@@ -15,9 +15,9 @@ import pytest
 from photonpano import Group, Located, NotLocated, Trajectory, VirtualExposure
 from photonpano.context import Context
 from photonpano.geometry import inverse, rescaling, translation
+from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import VirtualExposures
-from photonpano.motion.registration import MIN_AGREEMENT
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import Level
 from photonpano.specs.settings import GraphSettings
@@ -81,26 +81,26 @@ def run(memory_source: type) -> Callable[..., LocatedLevel]:
     source = memory_source(np.zeros((10 * N, *SHAPE)))
 
     def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
-        groups, clock = level.resampler.groups(10 * N, level.number), Stopwatch(threads)
+        groups = level.resampler.groups(10 * N, level.number)
         graph = GraphSettings(skips=(1.0, 2.0), closure_overlap=closure_overlap)
-        return locate(level, VirtualExposures(level, source, groups, None, clock), None, graph, clock, Context(threads))
+        return locate(VirtualExposures(level, source, groups, None, Stopwatch(threads)), graph, Context(threads))
 
     return run
 
 
-def is_revisit(moving: Group, fixed: Group) -> bool:
+def is_closure(moving: Group, fixed: Group) -> bool:
     return moving.reference - fixed.reference > 20
 
 
 def drifting(moving: Group, fixed: Group, found: Located) -> Located:
     """Neighbours err by 0.05 px of an exposure for each group length, all in one direction; views of one place do not."""
-    off_px = 0.0 if is_revisit(moving, fixed) else DRIFT_PX * (moving.reference - fixed.reference) / 10
+    off_px = 0.0 if is_closure(moving, fixed) else DRIFT_PX * (moving.reference - fixed.reference) / 10
     return replace(found, homography=translation(0, off_px) @ found.homography, evidence={"inliers": 30})
 
 
-def at_revisits(change: Callable[[Located], Located | NotLocated]) -> Callable[..., Any]:
+def at_closures(change: Callable[[Located], Located | NotLocated]) -> Callable[..., Any]:
     def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
-        return change(found) if is_revisit(moving, fixed) else drifting(moving, fixed, found)
+        return change(found) if is_closure(moving, fixed) else drifting(moving, fixed, found)
 
     return answer
 
@@ -110,24 +110,24 @@ def drift_px(found: LocatedLevel) -> float:
     return abs(float(found.homographies[-1, 1, 2] - found.homographies[0, 1, 2]))
 
 
-def revisits_of(found: LocatedLevel) -> list[tuple[int, int]]:
-    return [(edge.moving, edge.fixed) for edge in found.revisits]
+def closures_of(found: LocatedLevel) -> list[tuple[int, int]]:
+    return [(edge.moving, edge.fixed) for edge in found.closures]
 
 
 def test_places_seen_again_stop_the_drift(run: Callable, level: Callable) -> None:
     with_them, without = run(level()), run(level(), closure_overlap=None)
-    assert revisits_of(with_them) == PAIRS
-    assert revisits_of(without) == []
+    assert closures_of(with_them) == PAIRS
+    assert closures_of(without) == []
     assert len(with_them.edges) == len(without.edges) + len(PAIRS)
     assert drift_px(without) == pytest.approx(DRIFT_PX * (N - 1), rel=0.02)
     assert drift_px(with_them) < 0.1 * drift_px(without)
 
 
 def test_what_was_accepted_tells_how_alike_the_two_are(run: Callable, level: Callable) -> None:
-    for edge in run(level()).revisits:
+    for edge in run(level()).closures:
         assert edge.locator == "toy"
         assert edge.motion.evidence["inliers"] == 30
-        assert 0.9 < edge.motion.evidence["revisit_agreement"] < 1.05
+        assert 0.9 < edge.motion.evidence["closure_similarity"] < 1.05
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
@@ -143,33 +143,33 @@ def test_the_search_starts_where_the_other_pairs_put_them(run: Callable, level: 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_pairs_that_show_another_place_are_refused(run: Callable, level: Callable, scale: float) -> None:
-    wrong = at_revisits(lambda found: replace(found, homography=translation(7, 9) @ found.homography, evidence={"inliers": 12}))
+    wrong = at_closures(lambda found: replace(found, homography=translation(7, 9) @ found.homography, evidence={"inliers": 12}))
     found = run(level(wrong, scale=scale))
-    assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS == revisits_of(found)
+    assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS == closures_of(found)
     for edge in found.failures:
         assert edge.locator == ""
         assert edge.motion.evidence["inliers"] == 12
-        alike = edge.motion.evidence["revisit_agreement"]
-        assert alike < MIN_AGREEMENT
-        assert edge.motion.reason == f"they may show one place, but agree by {alike:.2f} only (at least 0.7 is needed)"
+        similarity = edge.motion.evidence["closure_similarity"]
+        assert similarity < MIN_SIMILARITY
+        assert edge.motion.reason == f"the similarity of the exposures of this loop closure is {similarity:.2f}, less than 0.7"
     np.testing.assert_array_equal(found.homographies, run(level(wrong, scale=scale), closure_overlap=None).homographies)
 
 
 def test_some_that_are_right_stop_the_drift_though_others_are_refused(run: Callable, level: Callable) -> None:
     def answer(moving: Group, fixed: Group, found: Located) -> Located:
-        wrong = is_revisit(moving, fixed) and moving.span.start // 10 % 2
+        wrong = is_closure(moving, fixed) and moving.span.start // 10 % 2
         return (
             replace(drifting(moving, fixed, found), homography=translation(7, 9)) if wrong else drifting(moving, fixed, found)
         )
 
     found = run(level(answer))
     assert [(edge.moving, edge.fixed) for edge in found.failures] == [pair for pair in PAIRS if pair[0] % 2]
-    assert found.solution.contradictions == ()
+    assert found.solution.outliers == ()
     assert drift_px(found) < 0.15
 
 
 def test_what_no_locator_finds_keeps_its_reason(run: Callable, level: Callable) -> None:
-    found = run(level(at_revisits(lambda _: NotLocated("3 matches", {"matches": 3}))))
+    found = run(level(at_closures(lambda _: NotLocated("3 matches", {"matches": 3}))))
     assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS
     assert {edge.motion.reason for edge in found.failures} == {"3 matches"}
     assert found.n_located == N
@@ -182,11 +182,11 @@ def test_a_fallback_is_asked_and_checked_as_well(
         return NotLocated("3 matches")
 
     still = make_level(known_motion(lambda _: np.eye(3))).locators[0].component
-    found = run(level(at_revisits(lost), fallbacks={"second": still}))
-    assert {edge.locator for edge in found.revisits} == {"second"}
+    found = run(level(at_closures(lost), fallbacks={"second": still}))
+    assert {edge.locator for edge in found.closures} == {"second"}
     astray = make_level(known_motion(lambda frame: translation(0.1 * frame, 0))).locators[0].component
-    found = run(level(at_revisits(lost), fallbacks={"second": astray}))
-    assert all("they may show one place" in edge.motion.reason for edge in found.failures)
+    found = run(level(at_closures(lost), fallbacks={"second": astray}))
+    assert all("of this loop closure" in edge.motion.reason for edge in found.failures)
     assert (len(PAIRS) - 2) <= len(found.failures) <= len(PAIRS)
 
 
@@ -199,10 +199,10 @@ def test_a_contradiction_that_looks_right_is_outvoted_and_found_among_all_pairs(
         return replace(motion, homography=translation(PERIOD_PX, 0) @ motion.homography) if wrong else motion
 
     found = run(level(answer))
-    (position,) = found.solution.contradictions
+    (position,) = found.solution.outliers
     edge = found.edges[position]
     assert (edge.moving, edge.fixed) == PAIRS[5]
-    assert edge.motion.evidence["revisit_agreement"] > 0.9
+    assert edge.motion.evidence["closure_similarity"] > 0.9
     assert found.failures == ()
     assert drift_px(found) < 0.15
 
@@ -211,7 +211,7 @@ def test_a_contradiction_that_looks_right_is_outvoted_and_found_among_all_pairs(
 def test_any_number_of_threads_finds_the_same(run: Callable, level: Callable, threads: int) -> None:
     alone, several = run(level(), threads=1), run(level(), threads=threads)
     np.testing.assert_array_equal(several.homographies, alone.homographies)
-    np.testing.assert_array_equal(several.solution.std_px, alone.solution.std_px)
+    np.testing.assert_array_equal(several.std_px, alone.std_px)
     assert [(each.moving, each.fixed, each.locator) for each in several.edges] == [
         (each.moving, each.fixed, each.locator) for each in alone.edges
     ]
@@ -230,8 +230,8 @@ def test_an_exposure_that_several_pairs_need_is_merged_again_once(run: Callable,
     sweeps = known_motion(lambda frame: translation(20 + 0.9 * abs((frame + 80) % 160 - 80), 20))
     toy = level(merger=Scenery(sweeps), locator=level().locators[0].component.__class__(sweeps, drifting))
     found = run(toy, threads=1)
-    needed = {index for pair in revisits_of(found) for index in pair}
-    assert len(revisits_of(found)) > len(needed) / 2
+    needed = {index for pair in closures_of(found) for index in pair}
+    assert len(closures_of(found)) > len(needed) / 2
     assert sorted(toy.merger.merged[N:]) == sorted(needed)
 
 
