@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from threading import Lock
 from typing import Any
 
-from photonpano.geometry import why_implausible, inverse
+from photonpano.geometry import inverse, why_implausible
 from photonpano.motion.checks import require_no_standstill, require_valid
 from photonpano.motion.closures import MIN_SIMILARITY, exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
