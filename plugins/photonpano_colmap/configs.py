@@ -1,4 +1,4 @@
-"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+"""Config of the locator; light enough to be imported when plugins are listed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class PycolmapTwoViewConfig(KeypointConfig):
         2000,
         ge=16,
         le=32_768,
-        description="the largest keypoints of an exposure that are kept; matching takes time with their square",
+        description="number of keypoints kept of an exposure, the largest; the time of matching grows with its square",
     )
     peak_threshold: float = Field(
         0.0067, ge=0, le=1, description="keypoints with less contrast after a blur of 1 px are dropped; white is 1"

@@ -1,4 +1,4 @@
-"""Locator `pycolmap-two-view`: what COLMAP does with a pair of images, for homographies."""
+"""Locator `pycolmap-two-view`: COLMAP's features, matcher and LO-RANSAC for homographies."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised
-from photonpano.locating import blur_against_noise, motion_from_points, stabilised_8_bit
+from photonpano.locating import blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
 from photonpano_colmap.configs import PycolmapTwoViewConfig
 
 CENTRE_OF_FIRST_PIXEL = 0.5
-"""In COLMAP pixel centres lie at halves; here they are integers."""
+"""Position of the first pixel's centre in COLMAP; ours is 0."""
 MAX_TRIALS = 10_000
-"""RANSAC finds a motion with which a fifth of the matches agree in half as many; chance is not to take longer."""
+"""RANSAC finds a homography with 20 % inliers in half as many trials; unrelated images would take far more."""
 _SEEDS = 2**31
-"""The library takes seeds below this."""
+"""Seeds of the library are below this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,10 +27,9 @@ class Features:
 
     Attributes:
         points: (N, 2) float64, pixel centres are integers.
-        sizes: (N,) float64, scales of the keypoints in px; their positions err in proportion.
-        keypoints: the points and scales as the library wants them. What it does with them is the same wherever the origin
-            is, so they are ours.
-        descriptors: of the library too, (N, 128) uint8.
+        sizes: (N,) float64, scales of the keypoints in px; position errors are proportional to them.
+        keypoints: the points and scales in the library's type, with our pixel centres; matching does not depend on the origin.
+        descriptors: (N, 128) uint8, in the library's type.
         shape: (height, width) of the exposure.
     """
 
@@ -42,44 +41,44 @@ class Features:
 
 
 class TwoViewLocator:
-    """Extracts once, matches near where the motion is known or everywhere, finds a consensus, and fits all inliers.
+    """Extracts features once, matches them near the current motion or in the whole image, and fits all inliers.
 
-    The library's threads are not used, since the framework has its own. It holds the interpreter's lock while it extracts and
-    matches, so that pairs do not overlap in time.
+    The library's own threads are off. It holds the GIL while it extracts and matches, so that pairs are not processed in
+    parallel.
     """
 
     def __init__(self, config: PycolmapTwoViewConfig, seed: int) -> None:
         self._config = config
         self._seed = seed % _SEEDS
-        # It would tell on stderr of every extractor and matcher that is made.
+        # It would log every extractor and matcher on stderr.
         pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, int(pycolmap.logging.WARNING))
 
     def describe(self, exposure: VirtualExposure) -> Features:
-        """Detect keypoints on the variance-stabilised image, and keep the largest where it was seen."""
+        """Detect keypoints on the variance-stabilised image, and keep the largest outside of masked areas."""
         config = self._config
         blur_px = blur_against_noise(exposure, config.blur_px)
         image, mask = stabilised_8_bit(exposure, blur_px)
         options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = config.max_keypoints
         options.sift.peak_threshold = config.peak_threshold / max(1.0, blur_px)
-        # A place with two orientations would be matched twice, and count twice.
+        # A keypoint with two orientations would be matched twice.
         options.sift.max_num_orientations = 1
-        # One for each call: the library does not promise that an extractor may be shared by threads.
+        # An extractor for each call: the library does not guarantee thread safety.
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         found, descriptors = extractor.extract_from_uint8_array(image)
-        places = np.array([(each.x, each.y, each.compute_scale()) for each in found], dtype=np.float64).reshape(-1, 3)
-        places[:, :2] -= CENTRE_OF_FIRST_PIXEL
-        x, y = (np.clip(np.rint(places[:, axis]).astype(np.intp), 0, image.shape[1 - axis] - 1) for axis in (0, 1))
-        # The library stops counting at the end of a scale, so there may be more than asked for.
-        largest = np.argsort(-places[:, 2], kind="stable")
+        positions = np.array([(each.x, each.y, each.compute_scale()) for each in found], dtype=np.float64).reshape(-1, 3)
+        positions[:, :2] -= CENTRE_OF_FIRST_PIXEL
+        x, y = (np.clip(np.rint(positions[:, axis]).astype(np.intp), 0, image.shape[1 - axis] - 1) for axis in (0, 1))
+        # The library checks the limit after each scale, so there may be more.
+        largest = np.argsort(-positions[:, 2], kind="stable")
         kept = largest[mask[y, x][largest] > 0][: config.max_keypoints]
         keypoints = [found[int(index)] for index in kept]
         for keypoint in keypoints:
             keypoint.x -= CENTRE_OF_FIRST_PIXEL
             keypoint.y -= CENTRE_OF_FIRST_PIXEL
         return Features(
-            points=places[kept, :2],
-            sizes=places[kept, 2],
+            points=positions[kept, :2],
+            sizes=positions[kept, 2],
             keypoints=pycolmap.FeatureKeypoints(keypoints),
             descriptors=pycolmap.FeatureDescriptors(descriptors.type, descriptors.data[kept]),
             shape=(image.shape[0], image.shape[1]),
@@ -96,14 +95,14 @@ class TwoViewLocator:
             motion = self._motion(moving, fixed, self._matched_nearby(moving, fixed, initial))
             if isinstance(motion, Located):
                 return motion
-        # No motion is known yet, or it is further off than the search reaches.
+        # At level 1, or where the current motion is wrong by more than the search radius.
         return self._motion(moving, fixed, self._matched_everywhere(moving, fixed))
 
     def _matcher(self) -> pycolmap.FeatureMatcher:
         options = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
         options.sift.max_ratio = self._config.ratio
         options.sift.cross_check = True
-        # The approximate one is no faster for so few keypoints.
+        # The approximate matcher is no faster for a few thousand keypoints.
         options.sift.cpu_brute_force_matcher = True
         return pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
 
@@ -113,11 +112,11 @@ class TwoViewLocator:
         return np.asarray(pairs, np.intp).reshape(-1, 2)
 
     def _matched_nearby(self, moving: Features, fixed: Features, initial: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return the indices of matches near where a motion puts them: (K, 2)."""
+        """Return the indices of matches near the positions that a motion predicts: (K, 2)."""
         geometry = pycolmap.TwoViewGeometry()
         geometry.config = pycolmap.TwoViewGeometryConfiguration.PLANAR
         geometry.H = initial
-        # It must be given a camera, which plays no part where the geometry is a homography.
+        # The required camera has no effect on a homography.
         height, width = moving.shape
         camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.0, width, height)
         first, second = ((each.keypoints, each.descriptors, camera) for each in (moving, fixed))
@@ -130,15 +129,11 @@ class TwoViewLocator:
         counts = {"keypoints_moving": len(moving.points), "keypoints_fixed": len(fixed.points), "matches": len(pairs)}
         evidence = {name: float(count) for name, count in counts.items()}
         if len(pairs) < config.min_inliers:
-            return NotLocated(
-                f"{len(pairs)} matches, fewer than min_inliers = {config.min_inliers} "
-                f"({len(moving.points)} and {len(fixed.points)} keypoints)",
-                evidence,
-            )
+            return too_few_matches(len(pairs), config, evidence)
         here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
         options = pycolmap.RANSACOptions(max_error=config.threshold_px, max_num_trials=MAX_TRIALS, random_seed=self._seed)
         consensus = pycolmap.estimate_homography_matrix(here, there, options)
         if consensus is None or not consensus["H"][2, 2]:
-            return NotLocated(f"no motion explains any of {len(pairs)} matches", evidence)
+            return NotLocated(f"no motion agrees with any of {len(pairs)} matches", evidence)
         start, sizes = normalised(consensus["H"]), moving.sizes[pairs[:, 0]]
         return motion_from_points(here, there, start, moving.shape, config, sizes=sizes, evidence=evidence)

@@ -1,4 +1,4 @@
-"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+"""Configs of the locators; light enough to be imported when plugins are listed."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from photonpano.locating import AlignmentConfig, KeypointConfig, MatchingConfig,
 
 
 class TorchConfig(Config):
-    """What all locators of this plugin can be told."""
+    """Keys that all locators of this plugin share."""
 
-    device: Literal["cpu", "cuda"] = Field("cpu", description="where torch computes")
+    device: Literal["cpu", "cuda"] = Field("cpu", description="device of torch")
 
 
 class KorniaRegistratorConfig(TorchConfig, PyramidConfig, AlignmentConfig):
-    """Descent of the squared difference in brightness, coarse to fine."""
+    """Minimisation of the squared difference in brightness, coarse to fine."""
 
-    max_iterations: int = Field(20, ge=1, le=1000, description="steps of L-BFGS at each level of the pyramid")
-    converged_px: float = Field(0.01, gt=0, le=1, description="the alignment is done when a step moves no corner further")
+    max_iterations: int = Field(20, ge=1, le=1000, description="largest number of L-BFGS steps on a level of the pyramid")
+    converged_px: float = Field(0.01, gt=0, le=1, description="converged when a step moves no corner further than this")
 
 
 class KorniaFeaturesConfig(TorchConfig, KeypointConfig):
@@ -28,21 +28,25 @@ class KorniaFeaturesConfig(TorchConfig, KeypointConfig):
 
     upright: bool = Field(
         True,
-        description="keypoints have no orientation of their own, which suits cameras that roll by less than some 15 degrees",
+        description="keypoints without an orientation, for cameras that roll by less than about 15 degrees",
     )
     matcher: Literal["smnn", "adalam"] = Field(
-        "smnn", description="smnn asks for mutual nearest neighbours, adalam also for neighbours that move alike"
+        "smnn", description="smnn keeps mutual nearest neighbours, adalam those whose neighbours move consistently"
     )
     ratio: float = Field(
-        0.85, gt=0, le=1, description="smnn: a match must be so many times nearer than the second best, seen from both sides"
+        0.85,
+        gt=0,
+        le=1,
+        description="smnn: Lowe's ratio test in both directions: a match is kept if its distance is below this fraction of "
+        "that of the second best",
     )
 
 
 class KorniaLoftrConfig(TorchConfig, MatchingConfig):
     """LoFTR with weights from a file, RANSAC, least squares."""
 
-    weights: SpecPath = Field(description="a file of weights for LoFTR; nothing is downloaded")
+    weights: SpecPath = Field(description="file with the weights of LoFTR; nothing is downloaded")
     corrected_positions: bool = Field(
-        False, description="whether the weights were trained with the corrected encoding of positions, as `indoor_ds_new` was"
+        False, description="whether the weights were trained with the corrected positional encoding, as `indoor_ds_new` was"
     )
-    min_confidence: float = Field(0.2, ge=0, le=1, description="a match of which LoFTR is less certain than this is dropped")
+    min_confidence: float = Field(0.2, ge=0, le=1, description="matches with a lower confidence are dropped")

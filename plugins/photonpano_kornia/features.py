@@ -1,4 +1,4 @@
-"""SIFT keypoints as kornia finds them, matched by SMNN or AdaLAM."""
+"""Locator `kornia-features`: kornia's SIFT keypoints, matched by SMNN or AdaLAM."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scipy.spatial.distance import cdist
 
 from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
-from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano.locating import Matches, blur_against_noise, stabilised_8_bit
 from photonpano_kornia.configs import KorniaFeaturesConfig
-from photonpano_kornia.consensus import Matches, motion_of
+from photonpano_kornia.consensus import motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
 
 _FAR = 1e3
-"""The distance between the descriptors of keypoints that lie too far apart; those of others differ by 2 at most."""
+"""Descriptor distance assigned to keypoints beyond the search radius; true distances are at most 2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class SiftFeatures:
     """Keypoints of one exposure.
 
     Attributes:
-        frames: (N, 2, 3) float32, kornia's local affine frames: the last column is the place, the others its surroundings.
+        frames: (N, 2, 3) float32, kornia's local affine frames: the last column is the position, the others the shape.
         descriptors: (N, 128) float16, RootSIFT.
         shape: (height, width) of the exposure.
     """
@@ -38,7 +38,7 @@ class SiftFeatures:
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """(N, 2) places; as everywhere in kornia's features, pixel centres are integers."""
+        """(N, 2) positions; in kornia's features pixel centres are integers."""
         return self.frames[:, :, 2].astype(np.float64)
 
     @property
@@ -48,7 +48,7 @@ class SiftFeatures:
 
 
 class FeatureLocator:
-    """Detects once, matches, finds a consensus, and fits all inliers."""
+    """Detects keypoints once, matches them, finds a consensus, and fits all inliers."""
 
     def __init__(self, config: KorniaFeaturesConfig, seed: int) -> None:
         self._config = config
@@ -56,18 +56,18 @@ class FeatureLocator:
         self._device = device_of(config.device)
 
     def describe(self, exposure: VirtualExposure) -> SiftFeatures:
-        """Detect keypoints on the variance-stabilised image, where it was seen."""
+        """Detect keypoints on the variance-stabilised image, outside of masked areas."""
         config = self._config
         image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure, config.blur_px))
         if not mask.any():
             return SiftFeatures(np.zeros((0, 2, 3), np.float32), np.zeros((0, 128), np.float16), mask.shape)
         with one_thread(), torch.inference_mode():
-            # A detector for each call: kornia does not promise that one may be shared by threads.
+            # A detector for each call: kornia does not guarantee thread safety.
             sift = SIFTFeatureScaleSpace(
                 config.max_keypoints, config.upright, device=self._device, descriptor_backend="pyramid"
             )
             frames, _, descriptors = sift(images_on(self._device, image) / 255, images_on(self._device, mask) > 0)
-            # kornia returns as many as were asked for, and leaves those empty that it did not find.
+            # kornia pads its result with empty frames.
             filled = laf_is_filled(frames)[0]
             return SiftFeatures(
                 frames[0, filled].cpu().numpy(), descriptors[0, filled].half().cpu().numpy(), (mask.shape[0], mask.shape[1])
@@ -82,10 +82,10 @@ class FeatureLocator:
         """
         evidence = {"keypoints_moving": float(len(moving.frames)), "keypoints_fixed": float(len(fixed.frames))}
         with one_thread(), torch.inference_mode():
-            return motion_of(self._tries(moving, fixed, initial), moving.shape, self._config, self._seed, evidence)
+            return motion_of(self._attempts(moving, fixed, initial), moving.shape, self._config, self._seed, evidence)
 
-    def _tries(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Iterator[Matches]:
-        """Match near where the motion known so far puts keypoints; then, should that not do, everywhere."""
+    def _attempts(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Iterator[Matches]:
+        """Match near the positions that the current motion predicts, then in the whole image."""
         for guide in [initial, None] if initial is not None else [None]:
             pairs = self._matched(moving, fixed, guide)
             here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
@@ -105,7 +105,7 @@ class FeatureLocator:
             _, pairs = match_smnn(here, there, self._config.ratio, distances)
         else:
             frames = (torch.tensor(each.frames, device=self._device)[None] for each in (moving, fixed))
-            # AdaLAM draws its samples from the global generator.
+            # AdaLAM samples from the global generator.
             with seeded(self._seed, self._device):
                 _, pairs = match_adalam(here, there, *frames, hw1=moving.shape, hw2=fixed.shape, dm=distances)
         found = np.asarray(pairs.cpu().numpy(), np.intp)

@@ -1,4 +1,4 @@
-"""What this plugin contributes."""
+"""Hooks of the plugin."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from photonpano import Locator, StageContext, StreamInfo
 
 REQUIRES = (Requirement("kornia", "photonpano[kornia]"),)
-"""kornia is never without torch."""
+"""kornia installs torch."""
 
 
 @hookimpl
@@ -35,7 +35,7 @@ def photonpano_locators() -> Iterator[LocatorContribution]:
     )
     yield LocatorContribution(
         name="kornia-loftr",
-        summary="LoFTR's learned matches with weights from a file of yours, RANSAC, and a least-squares fit",
+        summary="LoFTR's learned matches with weights from your file, RANSAC, and a least-squares fit of the inliers",
         config=KorniaLoftrConfig,
         build=_build_loftr,
         check=_check_loftr,
@@ -66,4 +66,4 @@ def _check_loftr(config: KorniaLoftrConfig, stream: StreamInfo) -> Sequence[str]
     del stream
     if config.weights.is_file():
         return ()
-    return (f"there is no file {config.weights} with weights for LoFTR; nothing is downloaded, so get one and name it",)
+    return (f"there is no file {config.weights} with weights of LoFTR, and nothing is downloaded: set `weights` to your file",)

@@ -1,4 +1,4 @@
-"""LoFTR: matches without keypoints, learned from photographs (Sun et al. 2021)."""
+"""Locator `kornia-loftr`: LoFTR, learned matching without keypoints (Sun et al. 2021)."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
-from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano.locating import Matches, blur_against_noise, stabilised_8_bit
 from photonpano_kornia.configs import KorniaLoftrConfig
-from photonpano_kornia.consensus import Matches, motion_of
+from photonpano_kornia.consensus import motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 from photonpano_kornia.weights import loftr_from
 
 _SMALLEST_SIDE = 32
-"""An image has at least so many px, which are four cells of those that LoFTR matches first."""
+"""Least side of an image in px: four of the cells that LoFTR matches first."""
 
 
 class Picture(NamedTuple):
-    """An exposure as LoFTR sees it. The maps that the network makes of it would take fifty times the memory.
+    """An exposure as input of LoFTR. Its feature maps would take fifty times the memory.
 
     Attributes:
-        image: (H, W) uint8; where nothing was seen, the mean of what was.
-        seen: (H, W) bool.
+        image: (H, W) uint8; masked pixels have the mean of the others.
+        seen: (H, W) bool, False for masked pixels.
     """
 
     image: NDArray[np.uint8]
@@ -34,7 +34,7 @@ class Picture(NamedTuple):
 
 
 class LoftrLocator:
-    """Asks the network for matches, finds a consensus, and fits all inliers."""
+    """Matches with the network, finds a consensus, and fits all inliers."""
 
     def __init__(self, config: KorniaLoftrConfig, seed: int) -> None:
         self._config = config
@@ -64,34 +64,34 @@ class LoftrLocator:
         """
         if min(moving.image.shape) < _SMALLEST_SIDE:
             height, width = moving.image.shape
-            return NotLocated(f"LoFTR needs images of {_SMALLEST_SIDE} px and more, these have {height} x {width}")
+            return NotLocated(f"the images have {height} x {width} px, LoFTR needs at least {_SMALLEST_SIDE} along each side")
         if not (moving.seen.any() and fixed.seen.any()):
-            return NotLocated("nothing was seen")
+            return NotLocated("all pixels are masked")
         with one_thread(), torch.inference_mode():
             here, there = self._matched(moving, fixed)
             shape = (moving.image.shape[0], moving.image.shape[1])
-            return motion_of(self._tries(here, there, initial), shape, self._config, self._seed, {})
+            return motion_of(self._attempts(here, there, initial), shape, self._config, self._seed, {})
 
-    def _tries(
+    def _attempts(
         self, here: NDArray[np.float64], there: NDArray[np.float64], initial: NDArray[np.float64] | None
     ) -> Iterator[Matches]:
-        """Give the matches near where the motion known so far puts them; then, should those not do, all."""
+        """Return the matches near the positions that the current motion predicts, then all."""
         if initial is not None:
             near = np.linalg.norm(apply(initial, here) - there, axis=1) <= self._config.search_px
             yield Matches(here[near], there[near], guided=True)
         yield Matches(here, there, guided=False)
 
     def _matched(self, moving: Picture, fixed: Picture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the points of both images, (N, 2) each, that LoFTR thinks are the same, where both were seen."""
+        """Return the matched points of both images, (N, 2) each, that are not masked in either."""
         images = (images_on(self._device, each.image) / 255 for each in (moving, fixed))
         answer = self._network(dict(zip(("image0", "image1"), images, strict=True)))
-        # LoFTR was trained with the centre of the first pixel at (0.5, 0.5).
+        # LoFTR has the centre of the first pixel at (0.5, 0.5).
         here, there = (answer[key].cpu().numpy().astype(np.float64) - 0.5 for key in ("keypoints0", "keypoints1"))
         counts = _seen_at(moving.seen, here) & _seen_at(fixed.seen, there)
         return here[counts], there[counts]
 
 
 def _seen_at(seen: NDArray[np.bool_], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which points (N, 2) lie on pixels that were seen; those outside count as the nearest pixel."""
+    """Return which points (N, 2) lie on unmasked pixels: (N,) bool; a point outside of the image takes the nearest pixel."""
     columns, rows = (np.clip(np.rint(points[:, axis]).astype(int), 0, seen.shape[1 - axis] - 1) for axis in (0, 1))
     return np.asarray(seen[rows, columns])

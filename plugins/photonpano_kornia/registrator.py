@@ -1,13 +1,13 @@
-"""Alignment by gradient descent through kornia's warper, coarse to fine.
+"""Locator `kornia-registrator`: minimise the squared difference in brightness by L-BFGS through kornia's warper.
 
-kornia's own `ImageRegistrator` has no masks and no start other than the identity. Its steps of Adam stop 0.2 to 0.3 px from
-where L-BFGS ends on parameters that are scaled until the loss is round, or take thirty times as long. So only its warper is
-used here.
+kornia's own `ImageRegistrator` has no masks and starts from the identity only. Its Adam steps stop 0.2 to 0.3 px from the
+minimum that L-BFGS reaches on whitened parameters, or take thirty times as long. So only its warper is used here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from kornia.geometry.transform import HomographyWarper
 from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from photonpano import Located, NotLocated, VirtualExposure
+from photonpano import Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import (
     corner_displacements,
     corners,
@@ -28,19 +28,24 @@ from photonpano.geometry import (
     translation,
     why_implausible,
 )
-from photonpano.locating import View, blur_against_noise, motion_from_images, view_pyramid
+from photonpano.locating import (
+    NO_TEXTURE,
+    NOTHING_SEEN,
+    SMALLEST_SIDE,
+    View,
+    blur_against_noise,
+    coarse_to_fine,
+    free_parameters,
+    motion_from_images,
+    view_pyramid,
+)
 from photonpano_kornia.configs import KorniaRegistratorConfig
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 
-_SMALLEST_SIDE = 24
-"""The pyramid ends before an image gets smaller than this, in px."""
-_ALL = (0, 1, 2, 3, 4, 5, 6, 7)
-_COARSE_MODELS = ((4, 5), (0, 1, 2, 3, 4, 5))
-"""Which of p1..p8 are free in the coarsest layer (shift) and in the next (affine): few pixels bear few parameters."""
 _COARSE_TOLERANCE = 4
-"""Coarse layers only start the finest, and may stop this much earlier."""
+"""Tolerance of the coarser layers, which only initialise the finest, relative to `converged_px`."""
 _ROUNDS = 3
-"""How often the weights of pixels are taken anew at where a descent ended, at most."""
+"""Largest number of descents on a layer; the weights of pixels are updated between them."""
 
 
 def unit_square(shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -55,79 +60,75 @@ def unit_square(shape: tuple[int, int]) -> NDArray[np.float64]:
 
 
 class RegistratorLocator:
-    """Descends to the homography under which two exposures differ least."""
+    """Finds the homography under which two exposures differ least."""
 
     def __init__(self, config: KorniaRegistratorConfig) -> None:
         self._config = config
         self._device = device_of(config.device)
-        # The first optimizer imports the better part of torch, which threads must not do at the same time.
+        # The first optimizer imports most of torch, which is not safe from several threads at once.
         torch.optim.LBFGS([torch.zeros(1, requires_grad=True)])
 
     def describe(self, exposure: VirtualExposure) -> tuple[View, ...]:
         """Return the pyramid of the exposure on the scale on which photon noise is uniform, finest first."""
         blur_px = blur_against_noise(exposure, self._config.blur_px)
-        return view_pyramid(exposure, blur_px, self._config.pyramid_levels, _SMALLEST_SIDE)
+        return view_pyramid(exposure, blur_px, self._config.pyramid_levels, SMALLEST_SIDE)
 
-    def register(
-        self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: NDArray[np.float64] | None
-    ) -> Located | NotLocated:
+    def register(self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: Homography | None) -> Located | NotLocated:
         """Align; see `photonpano.Locator`.
 
         Returns:
-            `NotLocated` with the numbers that decided when no layer of the pyramid can be aligned, or when the images do not
-            look alike where it ends.
+            `NotLocated` with the numbers that decided when the finest layer of the pyramid cannot be aligned, or when the
+            images differ after alignment.
         """
         if not (moving[-1].seen.any() and fixed[-1].seen.any()):
-            return NotLocated("nothing was seen far enough from what was not")
-        homography = _shifted(moving[-1], fixed[-1]) if initial is None else initial
-        lost, evaluations = "", 0
-        for depth in reversed(range(len(moving))):
-            pixel = moving[depth].pixel
-            descent = _Descent(moving[depth], fixed[depth], _free(depth, len(moving)), self._device)
-            with one_thread():
-                found = descent.from_start(rescaled(homography, 1 / pixel), self._config, coarse=depth > 0)
-            evaluations += descent.evaluations
-            if isinstance(found, str):
-                # A layer that leads nowhere is passed over: the start may be good enough for the next, finer one.
-                lost = found
-            else:
-                homography, lost = rescaled(found, pixel), ""
-        if lost:
-            return NotLocated(lost)
-        return motion_from_images(moving[0], fixed[0], homography, self._config, evidence={"evaluations": float(evaluations)})
+            return NotLocated(NOTHING_SEEN)
+        start = _shift_between(moving[-1], fixed[-1]) if initial is None else initial
+        evaluations: list[int] = []
+        found, failure = coarse_to_fine(moving, fixed, start, partial(self._aligned, len(moving), evaluations))
+        if failure is not None:
+            return failure
+        evidence = {"evaluations": float(sum(evaluations))}
+        return motion_from_images(moving[0], fixed[0], found[-1], self._config, evidence=evidence)
+
+    def _aligned(
+        self, layers: int, evaluations: list[int], moving: View, fixed: View, start: Homography, depth: int
+    ) -> Homography | NotLocated:
+        descent = _Descent(moving, fixed, free_parameters(depth, layers), self._device)
+        with one_thread():
+            found = descent.from_start(start, self._config, coarse=depth > 0)
+        evaluations.append(descent.evaluations)
+        return found
 
 
 class _Descent:
-    """The alignment of one layer."""
+    """Alignment of one layer."""
 
     def __init__(self, moving: View, fixed: View, free: tuple[int, ...], device: torch.device) -> None:
         self._moving, self._fixed, self._free, self._device = moving, fixed, list(free), device
         self._here, self._there = images_on(device, moving.image), images_on(device, fixed.image)
-        # Beyond its edge the image goes on, so that no border pulls; which pixels count is a matter of weights.
+        # The image is continued beyond its border, which would bias the alignment; weights mask these pixels.
         self._warper = HomographyWarper(*moving.shape, padding_mode="border", align_corners=False)
         self._unit = unit_square(moving.shape)
         self.evaluations = 0
 
-    def from_start(
-        self, homography: NDArray[np.float64], config: KorniaRegistratorConfig, coarse: bool
-    ) -> NDArray[np.float64] | str:
-        """Return the homography at the end of the descent, in px of the layer, or why there is none."""
+    def from_start(self, homography: Homography, config: KorniaRegistratorConfig, coarse: bool) -> Homography | NotLocated:
+        """Return the homography at the minimum, in pixels of the layer."""
         tolerance_px = config.converged_px * (_COARSE_TOLERANCE if coarse else 1)
         root: torch.Tensor | None = None
         for _ in range(_ROUNDS):
             weights = self._weights(homography)
             root = self._root_of_curvature(weights) if root is None else root
             if root is None:
-                return "where the images overlap, if they do, there is no texture"
-            before, homography = homography, self._round(homography, weights, root, tolerance_px, config.max_iterations)
+                return NotLocated(NO_TEXTURE)
+            previous, homography = homography, self._round(homography, weights, root, tolerance_px, config.max_iterations)
             if reason := why_implausible(homography, self._moving.shape, config.min_overlap):
-                return f"the alignment diverges: {reason}"
-            if corner_displacements(homography, before, self._moving.shape).max() < tolerance_px:
+                return NotLocated(f"the alignment diverges: {reason}")
+            if corner_displacements(homography, previous, self._moving.shape).max() < tolerance_px:
                 break
         return homography
 
-    def _weights(self, homography: NDArray[np.float64]) -> torch.Tensor:
-        """Return the inverse variances of the differences between pixels, 0 where one of them was not seen."""
+    def _weights(self, homography: Homography) -> torch.Tensor:
+        """Return the inverse variances of the differences between pixels, 0 where one of them is masked."""
         there = self._fixed.seen_from(homography)
         both = self._moving.seen & there.seen
         weight = np.zeros(both.shape, np.float32)
@@ -136,26 +137,26 @@ class _Descent:
 
     def _round(
         self,
-        start: NDArray[np.float64],
+        start: Homography,
         weights: torch.Tensor,
         root: torch.Tensor,
         tolerance_px: float,
         max_iterations: int,
-    ) -> NDArray[np.float64]:
-        """Minimise half the weighted sum of squared differences, and return the homography where it is least."""
+    ) -> Homography:
+        """Return the homography that minimises half the weighted sum of squared differences."""
         origin = torch.tensor(self._unit @ start @ inverse(self._unit), device=self._device)
         unit_loss = 2 * self._loss(origin, weights)
         if unit_loss == 0:
             return start
-        # In these parameters the curvature of the scene is the identity, and the loss is 1/2 at the start: L-BFGS, whose first
-        # step is that of gradient descent, then begins with about the step of Gauss and Newton.
+        # In these parameters the Hessian is the identity and the initial loss is 1/2. The first step of L-BFGS, which is one of
+        # gradient descent, is then about a Gauss-Newton step.
         basis = torch.linalg.inv(root).T * torch.sqrt(unit_loss)
         q = torch.zeros(len(self._free), dtype=torch.float64, device=self._device, requires_grad=True)
         optimizer = torch.optim.LBFGS(
             [q],
             max_iter=max_iterations,
             tolerance_grad=0,
-            # torch compares the same number with how much a step would lower the loss, which is the square of its length.
+            # torch compares it with the expected decrease of the loss too, which is the square of the step length.
             tolerance_change=(tolerance_px / self._corner_px(basis.cpu().numpy())) ** 2,
             line_search_fn="strong_wolfe",
         )
@@ -182,8 +183,8 @@ class _Descent:
         """Return half the weighted sum of squared differences.
 
         Args:
-            to_fixed: (3, 3), the moving image to the fixed one, in kornia's coordinates. That is the direction of the warper,
-                too, which asks where a pixel of what it makes is to be looked up.
+            to_fixed: (3, 3), the moving image to the fixed one, in kornia's coordinates. The warper takes this direction too:
+                it maps pixels of its output to its input.
             weights: (1, 1, H, W).
         """
         self.evaluations += 1
@@ -191,7 +192,7 @@ class _Descent:
         return (weights * (warped - self._here) ** 2).sum(dtype=torch.float64) / 2
 
     def _root_of_curvature(self, weights: torch.Tensor) -> torch.Tensor | None:
-        """Return the Cholesky factor of the curvature of the loss, from the moving image; None without texture."""
+        """Return the Cholesky factor of the Hessian of the loss, from the moving image; None without texture."""
         height, width = self._moving.shape
         along = spatial_gradient(self._here, mode="diff")[0, 0]
         gx, gy = along[0] * (width / 2), along[1] * (height / 2)
@@ -199,25 +200,20 @@ class _Descent:
         y = torch.arange(height, device=self._device)[:, None] * self._unit[1, 1] + self._unit[1, 2]
         inwards = gx * x + gy * y
         slopes = torch.stack([gx * x, gy * x, gx * y, gy * y, gx, gy, -inwards * x, -inwards * y])[self._free]
-        # Row by row: the sums of a product of matrices depend on the number of threads that MKL was given.
+        # Row by row: the rounding of a matrix product depends on MKL's number of threads.
         rows = [(slopes * (weights[0, 0] * slope)).sum(dim=(1, 2), dtype=torch.float64) for slope in slopes]
         root, failed = torch.linalg.cholesky_ex(torch.stack(rows))
         return None if failed else root
 
     def _corner_px(self, basis: NDArray[np.float64]) -> float:
-        """Return how far a unit step of one of the scaled parameters moves a corner at most, in px."""
+        """Return the largest displacement of a corner by a unit step of one of the whitened parameters, in px."""
         unit_corners = corners(self._moving.shape) @ self._unit[:2, :2].T + self._unit[:2, 2]
         moved = jacobian(np.eye(3), unit_corners)[..., self._free] @ basis
         return float(np.linalg.norm(moved * (np.array(self._moving.shape[::-1]) / 2)[:, None], axis=1).max())
 
 
-def _shifted(moving: View, fixed: View) -> NDArray[np.float64]:
-    """Return the shift between two images by masked cross-correlation (Padfield 2012), in px of the finest layer."""
+def _shift_between(moving: View, fixed: View) -> Homography:
+    """Return the shift between two images by masked cross-correlation (Padfield 2012), in pixels of the finest layer."""
     correlated: Callable[..., Any] = phase_cross_correlation
     (down, right), *_ = correlated(fixed.image, moving.image, reference_mask=fixed.seen, moving_mask=moving.seen)
     return rescaled(translation(float(right), float(down)), moving.pixel)
-
-
-def _free(depth: int, layers: int) -> tuple[int, ...]:
-    from_coarsest = layers - 1 - depth
-    return _COARSE_MODELS[from_coarsest] if depth > 0 and from_coarsest < len(_COARSE_MODELS) else _ALL

@@ -1,4 +1,4 @@
-"""How torch is used in a run: on which device, without threads of its own, and without touching the global generator."""
+"""Run torch on a device, without threads of its own, and without side effects on the global random generator."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from threadpoolctl import ThreadpoolController
 from photonpano import InputError
 
 _GENERATOR = Lock()
-"""Held while the global generator is borrowed: all threads share it."""
+"""Held while the global generator is seeded, since all threads share it."""
 
 
 def device_of(name: str) -> torch.device:
     """Return the device of a config.
 
     Raises:
-        InputError: torch finds no such device.
+        InputError: torch does not find the device.
     """
     with warnings.catch_warnings():
-        # A torch that was built for GPUs warns where there is no driver; what is wrong is said below.
+        # A CUDA build of torch warns if there is no driver; the error below says so.
         warnings.simplefilter("ignore")
         if name == "cuda" and not torch.cuda.is_available():
             raise InputError(
-                f"device: cuda is asked for, but torch {torch.__version__} finds no GPU here; say device: cpu, or install "
-                "a torch that was built for the GPU and its driver"
+                f"device: cuda is not available: torch {torch.__version__} finds no GPU; use device: cpu, or install a "
+                "torch for the GPU and its driver"
             )
     return torch.device(name)
 
 
 def images_on(device: torch.device, *images: NDArray[Any]) -> torch.Tensor:
-    """Copy (H, W) images into a float32 tensor of kornia's order: (1, C, H, W)."""
+    """Copy (H, W) images into a float32 tensor of shape (1, C, H, W)."""
     return torch.stack([torch.tensor(image, dtype=torch.float32, device=device) for image in images])[None]
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep torch from starting threads under those of the run: they would fight, and sums would depend on their number.
+    """Keep torch from starting threads of its own, on whose number the rounding of sums depends.
 
-    `torch.set_num_threads` would change the number for the whole process; that of OpenMP belongs to the calling thread.
+    `torch.set_num_threads` acts on the whole process, the limit of OpenMP on the calling thread only.
     """
-    # Where a thread first uses torch, torch sets the number itself; asking for it makes that happen now.
+    # On its first use in a thread, torch sets the number; this call makes that happen before the limit is set.
     torch.get_num_threads()
     with _openmp().limit(limits=1):
         yield
@@ -55,13 +55,13 @@ def one_thread() -> Iterator[None]:
 
 @cache
 def _openmp() -> ThreadpoolController:
-    """Return the OpenMP libraries that are loaded, torch's among them."""
+    """Return the loaded OpenMP libraries, torch's among them."""
     return ThreadpoolController().select(user_api="openmp")
 
 
 @contextmanager
 def seeded(seed: int, device: torch.device) -> Iterator[None]:
-    """Seed the global generators for what draws from them without being asked, and put them back."""
+    """Seed the global generators for code that samples from them, and restore them."""
     with _GENERATOR, torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
         yield

@@ -1,4 +1,4 @@
-"""LoFTR with weights from a file."""
+"""Load LoFTR with weights from a file."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from photonpano_kornia.runtime import seeded
 
 
 def loftr_from(path: Path, device: torch.device, *, corrected_positions: bool, min_confidence: float) -> LoFTR:
-    """Return LoFTR with the weights of a file, ready to be asked.
+    """Return LoFTR with the weights of a file, ready for inference.
 
     Args:
-        path: what `torch.save` wrote: the weights by their names, or a checkpoint that holds them under `state_dict`. Only
-            tensors are read from it, and no code is run.
-        device: where it computes.
-        corrected_positions: whether the weights were trained with the corrected encoding of positions.
-        min_confidence: matches of which it is less certain are not returned.
+        path: a file of `torch.save`: tensors by name, or a checkpoint with these under `state_dict`. Only tensors are read, no
+            code is run.
+        device: device of the network.
+        corrected_positions: whether the weights were trained with the corrected positional encoding.
+        min_confidence: matches with a lower confidence are dropped.
 
     Raises:
         InputError: the file cannot be read, or does not hold the weights of LoFTR.
@@ -32,7 +32,7 @@ def loftr_from(path: Path, device: torch.device, *, corrected_positions: bool, m
     config = copy.deepcopy(default_cfg)
     config["coarse"]["temp_bug_fix"] = corrected_positions
     config["match_coarse"]["thr"] = min_confidence
-    # A new network is filled with random numbers.
+    # Construction initialises the weights at random.
     with seeded(0, torch.device("cpu")):
         network = LoFTR(pretrained=None, config=config)
     if reason := _mismatch(network.state_dict(), weights):
@@ -45,22 +45,22 @@ def _read(path: Path) -> dict[str, torch.Tensor]:
     try:
         loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise InputError(f"there is no file {path} with weights for LoFTR") from None
-    except Exception as error:  # what it raises depends on where the file stops to be one
-        raise InputError(f"{path} holds no weights that torch can read: {type(error).__name__}") from error
+        raise InputError(f"there is no file {path} with weights of LoFTR; check the path") from None
+    except Exception as error:  # its type depends on where the file is damaged
+        raise InputError(f"torch cannot read weights from {path}: {type(error).__name__}") from error
     if isinstance(loaded, Mapping):
         loaded = loaded.get("state_dict", loaded)
     if not isinstance(loaded, Mapping) or not all(isinstance(each, torch.Tensor) for each in loaded.values()):
-        raise InputError(f"{path} does not hold the weights of LoFTR: expected tensors by their names, or under state_dict")
+        raise InputError(f"{path} does not hold the weights of LoFTR: expected tensors by name, or under state_dict")
     return {str(name).removeprefix("matcher."): tensor for name, tensor in loaded.items()}
 
 
 def _mismatch(expected: Mapping[str, torch.Tensor], given: Mapping[str, torch.Tensor]) -> str | None:
-    """Tell what is missing, what is too much, or what has another shape; None if all is as it should be."""
+    """Return which tensor is missing, unknown or of another shape; None if all match."""
     if missing := [name for name in expected if name not in given]:
-        return f"it lacks {len(missing)} of {len(expected)} tensors, such as {missing[0]}"
+        return f"{len(missing)} of {len(expected)} tensors are missing, such as {missing[0]}"
     if unknown := [name for name in given if name not in expected]:
-        return f"{len(unknown)} of its {len(given)} tensors are none of LoFTR's, such as {unknown[0]}"
+        return f"{len(unknown)} of its {len(given)} tensors do not belong to LoFTR, such as {unknown[0]}"
     for name, tensor in expected.items():
         if given[name].shape != tensor.shape:
             return f"{name} has the shape {tuple(given[name].shape)}, expected {tuple(tensor.shape)}"

@@ -1,4 +1,4 @@
-"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+"""Configs of the locators; light enough to be imported when plugins are listed."""
 
 from __future__ import annotations
 
@@ -25,28 +25,34 @@ class OpencvOrbConfig(KeypointConfig):
         20,
         ge=1,
         le=255,
-        description="a corner differs from the circle around it by more than this, of 255 between black and white",
+        description="least difference between a corner and the circle around it; black is 0, white is 255",
     )
-    pyramid_levels: int = Field(8, ge=1, le=16, description="sizes at which corners are looked for")
-    pyramid_scale: float = Field(1.2, gt=1, le=2, description="how much coarser each of them is than the one before")
+    pyramid_levels: int = Field(8, ge=1, le=16, description="number of scales on which corners are detected")
+    pyramid_scale: float = Field(1.2, gt=1, le=2, description="ratio of one scale to the one before")
 
 
 class OpencvEccConfig(PyramidConfig, AlignmentConfig):
     """Alignment that maximises the enhanced correlation coefficient, coarse to fine."""
 
-    max_iterations: int = Field(50, ge=1, le=1000, description="steps at each level of the pyramid")
+    max_iterations: int = Field(50, ge=1, le=1000, description="largest number of steps on a level of the pyramid")
     converged: float = Field(
-        1e-5, gt=0, le=0.1, description="the alignment is done when a step changes the correlation coefficient by less"
+        1e-5, gt=0, le=0.1, description="converged when a step changes the correlation coefficient by less than this"
     )
 
 
 class PhaseCorrelationConfig(AlignmentConfig):
-    """The shift at which the phases of two images agree."""
+    """Shift by phase correlation."""
 
     peak_px: float = Field(
-        1.5, ge=0.5, le=16, description="standard deviation of the peak that is looked for, in px: wider ones stand more noise"
+        1.5,
+        ge=0.5,
+        le=16,
+        description="standard deviation of the correlation peak, in px: wider is more robust against noise",
     )
     max_rounds: int = Field(
-        5, ge=1, le=20, description="how often the images are shifted by what was found, and correlated again"
+        5,
+        ge=1,
+        le=20,
+        description="largest number of rounds, each of which shifts the images and correlates them again",
     )
-    converged_px: float = Field(0.05, gt=0, le=1, description="the shift is found when a round changes it by less")
+    converged_px: float = Field(0.05, gt=0, le=1, description="converged when a round changes the shift by less than this")

@@ -1,4 +1,4 @@
-"""Alignment by the enhanced correlation coefficient (Evangelidis and Psarakis 2008), as OpenCV has it, coarse to fine."""
+"""Locator `opencv-ecc`: OpenCV's enhanced correlation coefficient (Evangelidis and Psarakis 2008), coarse to fine."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ import re
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano import Located, NotLocated, VirtualExposure
+from photonpano import Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised, rescaled, translation, why_implausible
-from photonpano.locating import View, blur_against_noise, motion_from_images, view_pyramid
+from photonpano.locating import (
+    NO_TEXTURE,
+    View,
+    blur_against_noise,
+    coarse_to_fine,
+    motion_from_images,
+    shift_between,
+    view_pyramid,
+)
 from photonpano_opencv.configs import OpencvEccConfig
-from photonpano_opencv.phase import NOTHING_TO_HOLD, shift_between
 
 _SMALLEST_SIDE = 32
-"""The pyramid ends before an image gets smaller than this, in px."""
-_PEAK_PX = 1.5
-"""Standard deviation of the peak of the phase correlation that finds where to start."""
+"""The images of the pyramid have at least this many pixels along a side."""
 
 
 class EccLocator:
-    """Climbs to the homography under which two exposures correlate most."""
+    """Finds the homography under which two exposures correlate most."""
 
     def __init__(self, config: OpencvEccConfig) -> None:
         self._config = config
@@ -31,36 +35,27 @@ class EccLocator:
         blur_px = blur_against_noise(exposure, self._config.blur_px)
         return view_pyramid(exposure, blur_px, self._config.pyramid_levels, _SMALLEST_SIDE)
 
-    def register(
-        self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: NDArray[np.float64] | None
-    ) -> Located | NotLocated:
+    def register(self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: Homography | None) -> Located | NotLocated:
         """Align; see `photonpano.Locator`.
 
         Returns:
-            `NotLocated` with the numbers that decided when OpenCV finds no way up at any level of the pyramid, or when the
-            images do not look alike where it ends.
+            `NotLocated` with the numbers that decided when OpenCV converges on no layer of the pyramid, or when the images
+            differ after alignment.
         """
-        config, lost = self._config, ""
-        homography = initial
-        if homography is None:
-            shift = shift_between(moving[-1], fixed[-1], _PEAK_PX)
+        if initial is None:
+            shift = shift_between(moving[-1], fixed[-1])
             if shift is None:
-                return NotLocated(NOTHING_TO_HOLD)
-            homography = rescaled(translation(*shift), moving[-1].pixel)
-        aligned = 0
-        for here, there in zip(reversed(moving), reversed(fixed), strict=True):
-            found = self._climbed(here, there, rescaled(homography, 1 / here.pixel))
-            if isinstance(found, str):
-                # A level that leads nowhere is passed over: the start may be good enough for the next, finer one.
-                lost = found
-                continue
-            homography, aligned = rescaled(found, here.pixel), aligned + 1
-        if not aligned:
-            return NotLocated(lost)
-        return motion_from_images(moving[0], fixed[0], homography, config, evidence={"aligned_levels": float(aligned)})
+                return NotLocated(NO_TEXTURE)
+            initial = rescaled(translation(*shift), moving[-1].pixel)
+        aligned, failure = coarse_to_fine(moving, fixed, initial, self._aligned)
+        if failure is not None and not aligned:
+            return failure
+        evidence = {"aligned_levels": float(len(aligned))}
+        return motion_from_images(moving[0], fixed[0], aligned[-1], self._config, evidence=evidence)
 
-    def _climbed(self, moving: View, fixed: View, start: NDArray[np.float64]) -> NDArray[np.float64] | str:
-        """Return the homography under which two images correlate most, from a start nearby, or why there is none."""
+    def _aligned(self, moving: View, fixed: View, start: Homography, depth: int) -> Homography | NotLocated:
+        """Return the homography near `start` under which two images correlate most."""
+        del depth
         config = self._config
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, config.max_iterations, config.converged)
         here, there = (np.where(view.seen, np.uint8(255), np.uint8(0)) for view in (moving, fixed))
@@ -69,17 +64,17 @@ class EccLocator:
                 moving.image, fixed.image, here, there, start.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, 1
             )
         except cv2.error as error:
-            # What OpenCV does where it does not converge, in the midst of images that are right.
-            return f"the correlation cannot be maximised: {_sentence_of(error)}"
+            # OpenCV also raises where the iteration does not converge on valid images.
+            return NotLocated(f"the correlation cannot be maximised: {_sentence_of(error)}")
         homography = np.asarray(found, np.float64)
         reason = why_implausible(homography, moving.shape, config.min_overlap)
-        return f"the alignment diverges: {reason}" if reason else normalised(homography)
+        return NotLocated(f"the alignment diverges: {reason}") if reason else normalised(homography)
 
 
 def _sentence_of(error: cv2.error) -> str:
-    """Return what OpenCV says, without its own files and functions.
+    """Return OpenCV's message without the names of its files and functions.
 
-    From the text: the attributes of the exception belong to its class, and are those of whichever thread failed last.
+    It is taken from the text: attributes of `cv2.error` are shared by all threads.
     """
     found = re.search(r"error: \([^)]*\) (.*?)\.? in function", str(error))
     return found[1] if found else str(error)

@@ -1,4 +1,4 @@
-"""What this plugin contributes."""
+"""Hooks of the plugin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @hookimpl
 def photonpano_locators() -> Iterator[LocatorContribution]:
-    """Offer features, and alignment by brightness."""
+    """Offer keypoints and alignment of brightness."""
     yield LocatorContribution(
         name="opencv-sift",
         summary="SIFT keypoints, ratio test, MAGSAC, and a least-squares fit of the inliers",

@@ -1,4 +1,4 @@
-"""Which keypoint is which: mutual nearest neighbours with the ratio test, everywhere or near where they should be."""
+"""Match descriptors: mutual nearest neighbours with Lowe's ratio test, in the whole image or near predicted positions."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def match_everywhere(moving: NDArray[np.float32], fixed: NDArray[np.float32], ra
     similarity[rows, best] = -1
     second = similarity.max(axis=1)
     # Unit vectors: the squared distance is 2 - 2 * similarity, and Lowe's ratio is one of distances.
-    clear = (1 - first) <= ratio**2 * (1 - second)
-    chosen = np.flatnonzero(mutual & clear)
+    distinct = (1 - first) <= ratio**2 * (1 - second)
+    chosen = np.flatnonzero(mutual & distinct)
     return np.stack([chosen, best[chosen]], axis=1)
 
 
@@ -44,15 +44,15 @@ def match_nearby(
     radius_px: float,
     ratio: float,
 ) -> NDArray[np.intp]:
-    """Match unit descriptors among fixed keypoints within a radius of where the moving ones are predicted: pairs (K, 2).
+    """Match unit descriptors within a radius of predicted positions: pairs of indices (K, 2).
 
     Args:
         moving: (M, D) descriptors.
         fixed: (N, D) descriptors.
-        predicted: (M, 2) where the moving keypoints should lie in the fixed image, px.
-        points: (N, 2) where the fixed keypoints lie, px.
-        radius_px: how far to look.
-        ratio: of the distances to the best and to the second best candidate; a single candidate needs no second.
+        predicted: (M, 2) predicted positions of the moving keypoints in the fixed image, px.
+        points: (N, 2) positions of the fixed keypoints, px.
+        radius_px: search radius.
+        ratio: of Lowe's test; without a second candidate its similarity is taken as -1.
     """
     if min(len(moving), len(fixed)) == 0:
         return np.zeros((0, 2), dtype=np.intp)
@@ -64,15 +64,15 @@ def match_nearby(
     k = first[first >= 0]
     second = best[i[k], 1]
     mutual = partner[j[k]] == k
-    clear = (1 - similarity[k]) <= ratio**2 * (1 - second)
-    k = k[mutual & clear]
+    distinct = (1 - similarity[k]) <= ratio**2 * (1 - second)
+    k = k[mutual & distinct]
     return np.stack([i[k], j[k]], axis=1)
 
 
 def _best_two(
     owner: NDArray[np.intp], similarity: NDArray[np.float32], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Return, for each owner, which candidate is best (-1 if none), and the similarities of the best and second best."""
+    """Return the index of the best candidate of each owner (-1 if none), and the similarities of the best and second best."""
     order = np.lexsort((-similarity, owner))
     starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     best = np.full(count, -1, dtype=np.intp)

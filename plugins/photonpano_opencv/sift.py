@@ -1,4 +1,4 @@
-"""SIFT features, matched and fitted: the off-the-shelf locator of the paper, with its accuracy got back by least squares."""
+"""Locator `opencv-sift`: SIFT features, the off-the-shelf locator of the paper, with a least-squares fit of all inliers."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class SiftLocator(KeypointMatcher):
         self._sift = config
 
     def describe(self, exposure: VirtualExposure) -> Keypoints:
-        """Detect keypoints on the variance-stabilised image, where it was seen."""
+        """Detect keypoints on the variance-stabilised image, outside of masked areas."""
         config = self._sift
         blur_px = blur_against_noise(exposure, config.blur_px)
         threshold = config.contrast_threshold / max(1.0, blur_px)
-        # A detector for each call: OpenCV does not promise that one may be shared by threads.
+        # A detector for each call: OpenCV does not guarantee thread safety.
         sift = cv2.SIFT.create(config.max_keypoints, 3, threshold, enable_precise_upscale=True)
         return detected(sift, *stabilised_8_bit(exposure, blur_px), config.max_keypoints)[1]

@@ -1,6 +1,7 @@
-"""What backends are told alike: one name, one bound and one sentence for each key that several of them have.
+"""Config keys shared by several locators, defined once.
 
-The config of a backend derives from these, and goes as `limits` to what judges its motions. Light enough for hook modules.
+The config of a locator derives from these models, and is passed as `limits` to `motion_from_images` or `motion_from_points`.
+Light enough for hook modules.
 """
 
 from __future__ import annotations
@@ -12,64 +13,76 @@ from pydantic import Field
 from photonpano.contributions import Config
 
 BlurPx: TypeAlias = Annotated[float, Field(ge=0, le=16)] | Literal["auto"]
-"""A standard deviation in px, or `auto`: as much as the noise of an exposure asks for."""
+"""A standard deviation in px, or `auto`: according to the noise of an exposure."""
 
 
 class BlurConfig(Config):
-    """How photon noise is quieted before a backend looks at an exposure."""
+    """Blur against photon noise."""
 
     blur_px: BlurPx = Field(
         "auto",
-        description="standard deviation of the Gaussian that quiets photon noise, in px; "
-        "auto takes 1, and up to 2.5 in the dark",
+        description="standard deviation of the Gaussian blur against photon noise, in px; auto is 1, and up to 2.5 in the dark",
     )
 
 
 class ImageLimits(Config):
-    """What an alignment of two images must fulfil to be believed."""
+    """Thresholds of acceptance for two aligned images."""
 
-    min_overlap: float = Field(0.1, gt=0, le=1, description="the least share of the image that both exposures must see")
+    min_overlap: float = Field(0.1, gt=0, le=1, description="least fraction of the image that both exposures must see")
     min_agreement: float = Field(
         0.5,
         ge=0,
         le=1,
-        description="a pair whose images, with photon noise taken out, correlate less than this after alignment is not located",
+        description="a pair is rejected if the correlation of its aligned images, corrected for photon noise, is below this",
     )
     max_std_px: float = Field(
-        15.0, gt=0, description="a pair whose images tell less well than this where the corners of the frame lie is not located"
+        15.0,
+        gt=0,
+        description="a pair is rejected if its images leave the corners of a frame more uncertain than this",
     )
 
 
 class PointLimits(Config):
-    """What matched points must fulfil to be believed."""
+    """Thresholds of acceptance for matched points."""
 
-    threshold_px: float = Field(2.0, gt=0, le=50, description="a match that fits better than this can be an inlier, in px")
-    min_inliers: int = Field(12, ge=5, description="a pair with fewer inliers is not located")
+    threshold_px: float = Field(
+        2.0, gt=0, le=50, description="a match is an inlier if it lies within this distance of the motion"
+    )
+    min_inliers: int = Field(12, ge=5, description="a pair with fewer inliers is rejected")
     max_std_px: float = Field(
-        10.0, gt=0, description="a pair whose matches pin the corners of the frame down less well than this is not located"
+        10.0,
+        gt=0,
+        description="a pair is rejected if its matches leave the corners of a frame more uncertain than this",
     )
 
 
 class MatchingConfig(BlurConfig, PointLimits):
-    """How points are matched, and when their matches are believed."""
+    """How points are matched, and when a motion is accepted."""
 
     search_px: float = Field(
-        12.0, gt=0, description="from the second level on, matches are looked for so far from where the motion known puts them"
+        12.0,
+        gt=0,
+        description="from level 2 on, matches are searched within this radius of the position that the current motion predicts",
     )
 
 
 class KeypointConfig(MatchingConfig):
-    """How keypoints are chosen and matched, and when their matches are believed."""
+    """How keypoints are selected and matched, and when a motion is accepted."""
 
-    max_keypoints: int = Field(2000, ge=16, le=100_000, description="the strongest keypoints of an exposure that are kept")
-    ratio: float = Field(0.8, gt=0, le=1, description="a match must be so many times nearer than the second best (Lowe 2004)")
+    max_keypoints: int = Field(2000, ge=16, le=100_000, description="number of keypoints kept of an exposure, the strongest")
+    ratio: float = Field(
+        0.8,
+        gt=0,
+        le=1,
+        description="Lowe's ratio test: a match is kept if its distance is below this fraction of that of the second best",
+    )
 
 
 class PyramidConfig(Config):
-    """How far an alignment begins from the finest image."""
+    """Size of the image pyramid."""
 
-    pyramid_levels: int = Field(4, ge=1, le=8, description="levels of the pyramid, each half as large as the one before")
+    pyramid_levels: int = Field(4, ge=1, le=8, description="levels of the image pyramid, each half as large as the one before")
 
 
 class AlignmentConfig(BlurConfig, ImageLimits):
-    """How exposures are aligned by their brightness, and when they are believed to show the same."""
+    """How images are blurred before alignment, and when a motion is accepted."""

@@ -11,9 +11,9 @@ from scipy.optimize import least_squares
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
 
 REWEIGHTINGS = 4
-"""Weights of soft L1 settle to a few per cent of the error in so many rounds."""
+"""Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error."""
 MIN_NOISE_PX = 0.02
-"""Keypoints are not located better than this, however well a few of them agree."""
+"""Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,35 +48,35 @@ def fit_homography(
     start: NDArray[np.float64],
     rounding_px: float = 0.0,
 ) -> Fit:
-    """Fit a homography to matches, each weighted by the inverse of its keypoint's size, and robustly against wrong ones.
+    """Fit a homography to matches by robust least squares, weighted by the inverse sizes of the keypoints.
 
     Args:
         moving: (N, 2) points of the moving image.
         fixed: (N, 2) their partners.
-        sizes: (N,) diameters of the keypoints; where a keypoint lies is known in proportion.
-        start: (3, 3) where to start from.
-        rounding_px: standard deviation of what all matches may err alike, however many they are: detectors that know whole
-            pixels only round alike where a camera does little else than shift.
+        sizes: (N,) diameters of the keypoints; position errors are proportional to them.
+        start: (3, 3) initial homography.
+        rounding_px: standard deviation of an error common to all matches: keypoints on whole pixels are all rounded alike where
+            the camera only shifts.
     """
     here, there = moving.astype(np.float64), fixed.astype(np.float64)
     by_size = (np.median(sizes) / sizes).astype(np.float64)
     p = parameters(start)
     residuals = _residuals(p, here, there, by_size)
-    # Reweighting by hand: the robust losses of scipy need a decomposition that costs a hundred times the rest.
+    # Iteratively reweighted: scipy's robust losses need a decomposition that takes a hundred times as long.
     for _ in range(REWEIGHTINGS):
         lengths = np.linalg.norm(residuals.reshape(-1, 2), axis=1)
         weights = by_size / np.sqrt(np.sqrt(1 + (lengths / _spread(residuals)) ** 2))
         solution = least_squares(_residuals, p, _derivatives, method="lm", x_scale="jac", args=(here, there, weights))
         p = solution.x
         residuals = _residuals(p, here, there, by_size)
-    # Of all residuals: the median, which serves the weights above, passes over their tails. With it, squared errors of motions
-    # from SIFT were three times as large as the information said; with all of them they are as large.
+    # The RMS, since the median ignores the tails: with it, squared errors of motions from SIFT are three times as large as the
+    # information predicts; with the RMS they agree.
     spread = max(np.sqrt(np.sum(residuals**2) / max(1, len(residuals) - len(p))), MIN_NOISE_PX)
     j = _derivatives(p, here, there, by_size)
     information = j.T @ j / spread**2
     if rounding_px:
         shifts = np.diag([0, 0, 0, 0, rounding_px**2, rounding_px**2, 0, 0])
-        # The inverse of the covariance with that of the shift added; so written, it needs no inverse where little is known.
+        # (information^-1 + shifts)^-1, without the inverse of an information that may be singular.
         information = information @ np.linalg.inv(np.eye(len(p)) + shifts @ information)
     return Fit(from_parameters(p), information, float(spread))
 
@@ -84,7 +84,7 @@ def fit_homography(
 def _residuals(
     p: NDArray[np.float64], here: NDArray[np.float64], there: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the weighted distances along x and y: (2 N,)."""
+    """Return the weighted residuals along x and y: (2 N,)."""
     return ((apply(from_parameters(p), here) - there) * weights[:, None]).ravel()
 
 
@@ -97,5 +97,5 @@ def _derivatives(
 
 
 def _spread(residuals: NDArray[np.float64]) -> float:
-    """Return the standard deviation, from the median so that wrong matches do not count."""
+    """Return the standard deviation, from the median so that it is robust against outliers."""
     return max(1.4826 * float(np.median(np.abs(residuals))), MIN_NOISE_PX)

@@ -1,4 +1,4 @@
-"""Exposures as backends see them: on the scale on which photon noise is uniform, blurred against it, masked."""
+"""Images of exposures for alignment and keypoints: variance-stabilised, blurred against photon noise, masked."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from photonpano.photometry import signal_to_noise
 from photonpano.values import Homography, VirtualExposure
 
 _CLIPPED = 0.001
-"""Share of pixels at either end that may become black or white: single hot pixels must not flatten the rest."""
+"""Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest."""
 _BORDER = 3
-"""Pixels this near to an edge, in units of the blur, are left out of a view."""
-_WHOLLY = 0.999
-"""An interpolated pixel counts if its neighbours do, but for rounding."""
+"""Pixels nearer to a masked area than this, in units of the blur, are masked in a view."""
+_ALL_SEEN = 0.999
+"""An interpolated pixel is unmasked if its neighbours are, up to rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An exposure as an aligner of brightness sees it.
+    """An exposure as an image for alignment.
 
     Attributes:
-        image: (H, W) float32, on the scale on which photon noise is uniform, blurred; 0 far from what was seen.
+        image: (H, W) float32, on the scale on which photon noise is uniform, blurred; 0 inside of masked areas.
         weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
         blur_px: standard deviation of the blur, in px of the exposure.
         pixel: side of a pixel, in px of the exposure.
@@ -50,7 +50,7 @@ class View:
 
     @cached_property
     def noise_left(self) -> float:
-        """The share of the variance 1 / weight that the blur left in a pixel."""
+        """Fraction of the noise variance 1 / weight that remains in a pixel after the blur."""
         averaged = np.full(self.pixel, 1 / self.pixel)
         if self.blur_px > 0:
             kernel = cv2.getGaussianKernel(2 * math.ceil(4 * self.blur_px) + 1, self.blur_px)
@@ -58,7 +58,7 @@ class View:
         return self.pixel**2 * float(np.sum(averaged**2)) ** 2
 
     def halved(self) -> View:
-        """Average squares of four pixels; a square counts if all of it was seen."""
+        """Average squares of four pixels; a square is masked if one of its pixels is."""
         height, width = (side // 2 * 2 for side in self.shape)
         size = (width // 2, height // 2)
         image, weight, whole = (
@@ -81,18 +81,18 @@ class View:
             )
             for each in (self.image, self.weight, self.seen.astype(np.float32))
         )
-        return View(image, np.where(whole > _WHOLLY, weight, np.float32(0)), self.blur_px, self.pixel)
+        return View(image, np.where(whole > _ALL_SEEN, weight, np.float32(0)), self.blur_px, self.pixel)
 
 
 def view_of(exposure: VirtualExposure, blur_px: float) -> View:
-    """Return an exposure as an aligner of brightness sees it.
+    """Return an exposure as an image for alignment.
 
-    Single pixels that are masked are bridged by their neighbours. What lies nearer to an edge than three times the blur is
-    left out: the blur is one-sided there, and pulls.
+    Single masked pixels are interpolated. Pixels nearer to a masked area or a border than three times the blur are masked: the
+    blur is one-sided there, which biases the alignment.
 
     Args:
         exposure: flux and weight.
-        blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
+        blur_px: standard deviation of the Gaussian blur against photon noise, in px of the exposure.
     """
     known = exposure.weight > 0
     std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
@@ -107,12 +107,12 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
 
 
 def view_pyramid(exposure: VirtualExposure, blur_px: float, levels: int, smallest_side: int) -> tuple[View, ...]:
-    """Return an exposure as an aligner of brightness sees it, and its halves, finest first.
+    """Return the image pyramid of an exposure, finest first.
 
     Args:
         exposure: flux and weight.
-        blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
-        levels: how many views at most.
+        blur_px: standard deviation of the Gaussian blur against photon noise, in px of the exposure.
+        levels: largest number of views.
         smallest_side: the pyramid ends before a side gets shorter than this, in px of a view.
     """
     views = [view_of(exposure, blur_px)]
@@ -121,28 +121,28 @@ def view_pyramid(exposure: VirtualExposure, blur_px: float, levels: int, smalles
     return tuple(views)
 
 
-def blur_against_noise(exposure: VirtualExposure, asked_px: BlurPx = "auto") -> float:
-    """Return the standard deviation of the Gaussian, in px: what is asked for, or for `auto` as much as noise needs.
+def blur_against_noise(exposure: VirtualExposure, blur_px: BlurPx = "auto") -> float:
+    """Return the standard deviation of the Gaussian blur against photon noise, in px: the value given, or that for `auto`.
 
-    That is 1 in the light, and up to 2.5 where noise exceeds the scene. In the light more blur costs accuracy (1.5 px instead
-    of 1 px took a trajectory at flux 0.5 from 0.07 to 0.17 px), in the dark less blur does (at flux 0.02 most keypoints are
-    noise then).
+    `auto` is 1 in the light, and up to 2.5 where noise exceeds the scene. In the light more blur costs accuracy (1.5 px instead
+    of 1 px raised the error of a trajectory at flux 0.5 from 0.07 to 0.17 px), in the dark less blur does (at flux 0.02 most
+    keypoints are noise then).
     """
-    if asked_px != "auto":
-        return asked_px
+    if blur_px != "auto":
+        return blur_px
     return float(np.clip(2 / max(signal_to_noise(exposure), 1e-6), 1.0, 2.5))
 
 
 def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return an exposure on the scale on which its noise is uniform, blurred against noise, stretched to 8 bits.
 
-    Uniform noise gives every keypoint the same chance; on a linear or sRGB scale the dark or the bright parts drown.
+    With uniform noise, keypoints are found in dark and bright parts alike; a linear or sRGB scale would favour one of them.
 
     Returns:
         The image, (H, W) uint8, and the mask of pixels that were seen, (H, W) uint8, 0 or 255.
     """
     known = exposure.weight > 0
-    # Nothing leaks in from where nothing was seen. More weight for pixels that more frames saw would shift what lies between.
+    # Masked pixels have no weight; all others have the same, since weights by numbers of frames would shift structures.
     weighted, weight = _blurred(_stabilised(exposure), known.astype(np.float32), blur_px=blur_px)
     image = weighted / np.maximum(weight, 1e-6)
     mask = np.where(known, np.uint8(255), np.uint8(0))
@@ -154,7 +154,7 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
 
 
 def _stabilised(exposure: VirtualExposure) -> NDArray[np.float32]:
-    """Return the flux on the scale on which its noise is uniform, 0 where nothing was seen."""
+    """Return the flux on the scale on which its noise is uniform, 0 at masked pixels."""
     stabilised = exposure.response.stabilised(exposure.flux, exposure.weight)
     return np.where(exposure.weight > 0, stabilised, np.float32(0))
 

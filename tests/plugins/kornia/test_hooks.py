@@ -45,7 +45,7 @@ def test_weights_that_are_not_there_are_a_problem_of_the_spec(tmp_path: Path) ->
     weights = tmp_path / "loftr.ckpt"
     config = contribution.config(weights=weights)
     assert contribution.check(config, stream) == (
-        f"there is no file {weights} with weights for LoFTR; nothing is downloaded, so get one and name it",
+        f"there is no file {weights} with weights of LoFTR, and nothing is downloaded: set `weights` to your file",
     )
     weights.touch()
     assert contribution.check(config, stream) == ()

@@ -72,29 +72,29 @@ def refused(path: Path) -> str:
 
 def test_a_file_with_something_else_in_it_is_refused(weights: dict[str, torch.Tensor], tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
-    assert refused(path) == f"there is no file {path} with weights for LoFTR"
+    assert refused(path) == f"there is no file {path} with weights of LoFTR; check the path"
     path.write_bytes(b"not weights")
-    assert refused(path) == f"{path} holds no weights that torch can read: UnpicklingError"
+    assert refused(path) == f"torch cannot read weights from {path}: UnpicklingError"
     torch.save({"a": 1, "b": "text"}, path)
-    assert refused(path) == f"{path} does not hold the weights of LoFTR: expected tensors by their names, or under state_dict"
+    assert refused(path) == f"{path} does not hold the weights of LoFTR: expected tensors by name, or under state_dict"
     first, *others = weights
     few = {name: torch.zeros(1) for name in others[:3]}
     torch.save(few, path)
-    lacks = f"it lacks {len(weights) - 3} of {len(weights)} tensors, such as {first}"
-    assert refused(path) == f"{path} does not hold the weights of LoFTR: {lacks}"
+    missing = f"{len(weights) - 3} of {len(weights)} tensors are missing, such as {first}"
+    assert refused(path) == f"{path} does not hold the weights of LoFTR: {missing}"
     small = {name: torch.zeros(()) for name in weights}
     torch.save(small, path)
     shape = f"{first} has the shape (), expected {tuple(weights[first].shape)}"
     assert refused(path) == f"{path} does not hold the weights of LoFTR: {shape}"
     torch.save(small | {"depth.head": torch.zeros(1)}, path)
-    unknown = f"1 of its {len(weights) + 1} tensors are none of LoFTR's, such as depth.head"
+    unknown = f"1 of its {len(weights) + 1} tensors do not belong to LoFTR, such as depth.head"
     assert refused(path) == f"{path} does not hold the weights of LoFTR: {unknown}"
 
 
 def test_no_code_in_a_file_is_run(tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
     torch.save(pytest.approx, path)
-    assert refused(path) == f"{path} holds no weights that torch can read: UnpicklingError"
+    assert refused(path) == f"torch cannot read weights from {path}: UnpicklingError"
 
 
 def test_a_network_that_has_learned_nothing_is_certain_of_nothing(build: Callable, shot: Callable) -> None:
@@ -150,11 +150,11 @@ def test_what_was_not_seen_is_not_matched(build: Callable, shot: Callable, monke
     assert isinstance(motion, Located)
     assert motion.evidence["matches"] == 15 * 11
     half.flux[:], half.weight[:] = np.nan, 0
-    assert locator.register(fixed, locator.describe(half), None) == NotLocated("nothing was seen")
+    assert locator.register(fixed, locator.describe(half), None) == NotLocated("all pixels are masked")
 
 
 def test_tiny_images_are_refused(build: Callable, photograph: Callable) -> None:
     locator = build()
     tiny = locator.describe(photograph(np.full((20, 40), 0.5)))
-    assert locator.register(tiny, tiny, None).reason == "LoFTR needs images of 32 px and more, these have 20 x 40"
+    assert locator.register(tiny, tiny, None).reason == "the images have 20 x 40 px, LoFTR needs at least 32 along each side"
     assert sum(each.nbytes for each in tiny) == 2 * 20 * 40

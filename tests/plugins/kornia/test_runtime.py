@@ -50,8 +50,8 @@ def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(InputError) as caught:
         device_of("cuda")
     assert str(caught.value) == (
-        f"device: cuda is asked for, but torch {torch.__version__} finds no GPU here; say device: cpu, or install "
-        "a torch that was built for the GPU and its driver"
+        f"device: cuda is not available: torch {torch.__version__} finds no GPU; use device: cpu, or install a "
+        "torch for the GPU and its driver"
     )
 
 

@@ -126,8 +126,8 @@ def test_images_that_tell_too_little_are_refused(seen_from: Callable) -> None:
     moving, fixed = (view_of(seen_from(STILL, seed, 0.1), BLUR_PX) for seed in (1, 2))
     failure = motion_from_images(moving, fixed, STILL, ImageLimits(max_std_px=0.01))
     assert isinstance(failure, NotLocated)
-    assert "the images tell where corners lie to 0." in failure.reason
-    assert failure.reason.endswith("px, worse than max_std_px = 0.01")
+    assert "the images leave the corners uncertain by 0." in failure.reason
+    assert failure.reason.endswith("px, more than max_std_px = 0.01")
 
 
 def test_the_information_is_on_the_parameters_of_the_homography(seen_from: Callable) -> None:
