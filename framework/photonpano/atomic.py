@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written under a temporary name, then renamed."""
+"""Write files whole or not at all: under a temporary name, which then becomes the final one."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ import errno
 import os
 import secrets
 import shutil
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from photonpano.errors import OutputError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+from photonpano.text import byte_size
 
 
 @contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
     """Lend a temporary path beside `final`, which becomes `final` when the block ends well.
 
-    When the block raises, Ctrl-C included, the temporary file is removed, and a file that stood under `final` stays as it was.
-    The temporary name keeps the suffix of `final`, by which writers of images and archives choose their format.
+    When the block raises, Ctrl-C included, the temporary file is removed, and an older `final` stays as it was. The temporary
+    name keeps the suffix of `final`, by which writers of images and archives choose their format.
 
     Example:
         ```python
@@ -30,7 +29,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
         ```
 
     Raises:
-        OutputError: the file cannot be written. Every `OSError` of the block is taken to be one of writing.
+        OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
     """
     temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.partial{final.suffix}")
     try:
@@ -42,7 +41,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
 
 
 def part_path(final: Path) -> Path:
-    """Return where a file that can be continued lies until it is whole: `cube.npy.part` for `cube.npy`."""
+    """Return the name that a resumable file has until it is whole: `cube.npy.part` for `cube.npy`."""
     return final.with_name(f"{final.name}.part")
 
 
@@ -50,34 +49,63 @@ def part_path(final: Path) -> Path:
 def resumable_path(final: Path) -> Iterator[Path]:
     """Lend the `part_path` of `final`, which becomes `final` when the block ends well.
 
-    When the block raises, Ctrl-C included, it is left as it is, to be continued. It may be there before, for that reason.
+    When the block raises, Ctrl-C included, the file stays, to be continued by a later call. So it may exist already.
 
     Raises:
-        OutputError: the file cannot be written. Every `OSError` of the block is taken to be one of writing.
+        OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
     """
     with _becoming(final, part_path(final)):
         yield part_path(final)
 
 
 @contextmanager
+def atomic_files(directory: Path, last: str = "") -> Iterator[Path]:
+    """Lend an empty folder whose files move into `directory` when the block ends well.
+
+    The directory is made before the block runs. When the block raises, Ctrl-C included, what was in it stays as it was, and
+    folders that were made for it are removed.
+
+    Args:
+        directory: it may exist, and hold files.
+        last: the file that is moved after all others: once it is new, so are they.
+
+    Raises:
+        OSError: the directory cannot be made or written to.
+    """
+    made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
+    directory.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(prefix=".part-", dir=directory))
+    try:
+        yield staging
+        files = sorted(staging.iterdir(), key=lambda file: file.name == last)
+        for file in files:
+            _flush_to_disk(file)
+        for file in files:
+            file.replace(directory / file.name)
+        made.clear()
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        with suppress(OSError):  # another program has put something there
+            for folder in made:
+                folder.rmdir()
+
+
+@contextmanager
 def atomic_folder(final: Path) -> Iterator[Path]:
-    """Lend an empty folder beside `final`, which becomes `final` when the block ends well, and otherwise is removed.
+    """Lend an empty folder whose files become those of `final`, a folder that is new or empty, when the block ends well.
 
     Raises:
         OutputError: there is something under that name, or the folder cannot be written.
     """
-    place = final.absolute()
-    temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
     try:
         if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
             raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
-        temporary.mkdir()
-        yield temporary
-        temporary.replace(place)
+        if not final.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        with atomic_files(final) as staging:
+            yield staging
     except OSError as error:
         raise OutputError(_message(final, error)) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager
@@ -94,7 +122,7 @@ def _becoming(final: Path, temporary: Path) -> Iterator[None]:
 
 
 def require_space(final: Path, n_bytes: int) -> None:
-    """Refuse to begin a file that its disk has no room for.
+    """Refuse to begin a file that does not fit on its disk.
 
     Raises:
         OutputError: fewer than `n_bytes` are free.
@@ -102,13 +130,13 @@ def require_space(final: Path, n_bytes: int) -> None:
     free = shutil.disk_usage(final.parent).free
     if n_bytes > free:
         raise OutputError(
-            f"cannot write {final}: it takes {_size(n_bytes)}, and its disk has {_size(free)} free; "
+            f"cannot write {final}: it takes {byte_size(n_bytes)}, and its disk has {byte_size(free)} free; "
             "free some space or choose another folder"
         )
 
 
 def _flush_to_disk(path: Path) -> None:
-    """Wait for the disk: some file systems tell only now that they are full, and a rename may overtake the data."""
+    """Wait for the disk: some file systems report only now that they are full, and a rename may overtake the data."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -134,7 +162,3 @@ def _message(final: Path, error: OSError) -> str:
         return f"cannot write {final}: there is no folder {final.parent}; create it or choose another"
     remedy = _REMEDIES.get(error.errno or 0)
     return f"cannot write {final}: {reason}" + (f"; {remedy}" if remedy else "")
-
-
-def _size(n_bytes: int) -> str:
-    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.1f} MB"

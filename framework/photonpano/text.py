@@ -20,6 +20,23 @@ def listed(words: Iterable[str], last: str = "and") -> str:
     return f" {last} ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
+def three_digits(value: float) -> str:
+    """Write a number to three digits, without zeros at the end of its decimals."""
+    decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    text = f"{value:,.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def byte_size(n_bytes: int) -> str:
+    """Write a number of bytes with the unit that fits."""
+    value = float(n_bytes)
+    for unit in ("B", "KiB", "MiB"):
+        if value < 1000:
+            return f"{three_digits(value)} {unit}"
+        value /= 1024
+    return f"{three_digits(value)} GiB"
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Complete "there is no such name": the nearest of the known names, else all of them.
 

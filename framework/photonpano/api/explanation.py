@@ -14,9 +14,10 @@ from photonpano.pipeline.forecast import forecast as forecast_on
 from photonpano.protocols import Source
 from photonpano.registry import KINDS, Catalog, discover
 from photonpano.registry.description import flow
-from photonpano.report.numbers import counted, duration, memory
+from photonpano.report.numbers import counted, duration
 from photonpano.specs import Plan
 from photonpano.specs.tree import joined
+from photonpano.text import byte_size
 
 _DESCRIBED_LEVELS = 3
 """How many levels are described when the number of levels is open."""
@@ -80,10 +81,10 @@ def _forecast_lines(plan: Plan, source: Source) -> list[str]:
         return ["the trial in the middle of the capture failed, as the run may:", *str(error).splitlines()]
     each = ", ".join(f"{name}: {duration(seconds)}" for name, seconds in found.seconds.items())
     total, threads = duration(sum(found.seconds.values())), counted(found.threads, "thread")
-    height, width = found.canvas
+    memory, (height, width) = byte_size(found.memory_bytes), found.canvas
     return [
         f"forecast from a trial on {found.tried}: about {total} with {threads} ({each})",
-        f"memory: about {memory(found.memory_bytes)}, for a panorama of about {width} x {height} px if no place is seen twice",
+        f"memory: about {memory}, for a panorama of about {width} x {height} px if no place is seen twice",
     ]
 
 

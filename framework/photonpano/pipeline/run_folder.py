@@ -6,9 +6,8 @@ import errno
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 import tifffile
 
+from photonpano.atomic import atomic_files
 from photonpano.errors import OutputError
 from photonpano.geometry import Canvas
 from photonpano.merging.panorama import RenderedPanorama, Tile
@@ -79,30 +79,16 @@ def run_folder(directory: Path) -> Iterator[RunFolder]:
     Raises:
         OutputError: the folder cannot be made or written to, or the disk is full.
     """
-    try:
-        missing = [folder for folder in (directory, *directory.parents) if not folder.exists()]
-        directory.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".part-", dir=directory))
-    except OSError as error:
-        raise OutputError(
-            f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
-        ) from error
-    done = False
-    try:
+    with ExitStack() as stack:
+        try:
+            staging = stack.enter_context(atomic_files(directory, last="run.json"))
+        except OSError as error:
+            raise OutputError(
+                f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
+            ) from error
         yield RunFolder(directory, staging)
         with _writing(directory):
-            for file in staging.iterdir():
-                _to_disk(file)
-            # The record comes last: where it is new, everything is.
-            for file in sorted(staging.iterdir(), key=lambda file: file.name == "run.json"):
-                file.replace(directory / file.name)
-        done = True
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if not done:
-            with suppress(OSError):  # somebody else has put something there
-                for folder in missing:
-                    folder.rmdir()
+            stack.close()
 
 
 @contextmanager
@@ -116,12 +102,6 @@ def _writing(directory: Path) -> Iterator[None]:
             f"{directory}: the results could not be written ({reason}); what was there before is unchanged. "
             "Make room, or choose another folder with --output"
         ) from error
-
-
-def _to_disk(file: Path) -> None:
-    """Make sure that the content has arrived before the name does: a full disk may show as late as here."""
-    with file.open("rb+") as stream:
-        os.fsync(stream.fileno())
 
 
 def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None:

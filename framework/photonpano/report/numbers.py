@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from photonpano.text import three_digits
+
 
 def count(number: int) -> str:
     """Write a whole number with a comma at each thousand."""
@@ -17,9 +19,9 @@ def duration(seconds: float) -> str:
     """Write a time with the unit that fits, to three digits."""
     for limit, factor, unit in ((1e-3, 1e6, "µs"), (1, 1e3, "ms")):
         if seconds < limit:
-            return f"{_digits(seconds * factor)} {unit}"
+            return f"{three_digits(seconds * factor)} {unit}"
     if seconds < 59.95:
-        return f"{_digits(seconds)} s"
+        return f"{three_digits(seconds)} s"
     minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:
         return f"{minutes} min {rest:02d} s"
@@ -31,23 +33,13 @@ def rate(hertz: float) -> str:
     """Write a frame rate with the unit that fits."""
     for limit, unit in ((1e6, "MHz"), (1e3, "kHz")):
         if hertz >= limit:
-            return f"{_digits(hertz / limit)} {unit}"
-    return f"{_digits(hertz)} Hz"
-
-
-def memory(size: int) -> str:
-    """Write a number of bytes with the unit that fits."""
-    value = float(size)
-    for unit in ("B", "KiB", "MiB"):
-        if value < 1000:
-            return f"{_digits(value)} {unit}"
-        value /= 1024
-    return f"{_digits(value)} GiB"
+            return f"{three_digits(hertz / limit)} {unit}"
+    return f"{three_digits(hertz)} Hz"
 
 
 def pixels(value: float | None) -> str:
     """Write a distance in pixels; a dash if there is none."""
-    return "\N{EN DASH}" if value is None else f"{value:.2g}" if abs(value) < 0.1 else _digits(value)
+    return "\N{EN DASH}" if value is None else f"{value:.2g}" if abs(value) < 0.1 else three_digits(value)
 
 
 def share(value: float) -> str:
@@ -63,10 +55,3 @@ def share(value: float) -> str:
 def span(start: int, stop: int) -> str:
     """Write a half-open frame span with its first and its last frame."""
     return count(start) if stop - start == 1 else f"{count(start)} to {count(stop - 1)}"
-
-
-def _digits(value: float) -> str:
-    """Write three digits, and never a point without need."""
-    decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
-    text = f"{value:,.{decimals}f}"
-    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -14,6 +14,7 @@ from photonpano.record.schema import RunRecord
 from photonpano.report import figures, numbers
 from photonpano.report.failures import failure_groups
 from photonpano.report.figures import jpeg_uri, shrunk
+from photonpano.text import byte_size
 from photonpano.values import true_spans
 
 PICTURE_PIXELS = 1600
@@ -40,8 +41,9 @@ def render_report(record: RunRecord, motion: FrameMotion | None, panorama: Rende
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for name in ("count", "counted", "duration", "memory", "pixels", "rate", "share", "span"):
+    for name in ("count", "counted", "duration", "pixels", "rate", "share", "span"):
         environment.filters[name] = getattr(numbers, name)
+    environment.filters["memory"] = byte_size
     page: str = environment.get_template("report.html").render(
         record=record,
         title=_title(record),

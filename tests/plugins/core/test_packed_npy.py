@@ -149,7 +149,7 @@ def test_a_disk_without_room_is_told_before_anything_is_unpacked(gzipped: Path, 
         opened(gzipped)
     beside = gzipped.with_name("cube.npy.gz.unpacked.npy")
     assert str(caught.value) == (
-        f"cannot write {beside}: it takes 0.0 MB, and its disk has 0.0 MB free; free some space or choose another folder"
+        f"cannot write {beside}: it takes 848 B, and its disk has 847 B free; free some space or choose another folder"
     )
     assert list(gzipped.parent.iterdir()) == [gzipped]
 

@@ -130,7 +130,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_work(tmp_path: Path, monkey
     with pytest.raises(OutputError) as caught:
         write_packed(RandomSource(100_000, 254, 496, fails_at=0), path)
     assert str(caught.value) == (
-        f"cannot write {path}: it takes 1.6 GB, and its disk has 1.0 GB free; free some space or choose another folder"
+        f"cannot write {path}: it takes 1.47 GiB, and its disk has 954 MiB free; free some space or choose another folder"
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -4,6 +4,7 @@ import pytest
 
 from photonpano.report import numbers
 from photonpano.report.failures import failure_groups
+from photonpano.text import byte_size
 
 
 @pytest.mark.parametrize(
@@ -34,7 +35,7 @@ def test_rates(hertz, text):
     ("size", "text"), [(512, "512 B"), (812 * 2**20, "812 MiB"), (1023 * 2**20, "1 GiB"), (3 * 2**29, "1.5 GiB")]
 )
 def test_memory(size, text):
-    assert numbers.memory(size) == text
+    assert byte_size(size) == text
 
 
 @pytest.mark.parametrize(
