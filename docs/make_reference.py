@@ -18,6 +18,7 @@ from typing import Any
 import typer
 from pydantic import BaseModel
 
+import photonpano
 from photonpano import discover, hookspecs
 from photonpano.cli.app import app
 from photonpano.corrections import CORRECTIONS
@@ -62,6 +63,10 @@ def generated(what: str) -> str:
             return hook(name[0])
         case "components":
             return components()
+        case "functions":
+            return functions(name)
+        case "attributes":
+            return attributes(name[0])
         case _ if kind in KINDS:
             return config_table(discover().find(kind, name[0]).contribution.config)
     raise ValueError(f"no rule makes {what!r}")
@@ -92,7 +97,7 @@ def corrections() -> str:
     rows = []
     for name, model in CORRECTIONS.items():
         shown = f"[`{name}`](#{name})" if model.model_fields else f"`{name}`"
-        rows.append([shown, " ".join((inspect.getdoc(model) or "").partition("\n\n")[0].split())])
+        rows.append([shown, first_sentence(model)])
     return table(["Correction", "What it does"], rows)
 
 
@@ -113,6 +118,31 @@ def command(names: Sequence[str]) -> str:
         remark = "" if default is None else f" Default: `{flags[0] if default else flags[1]}`."
         rows.append([", ".join(f"`{flag}`" for flag in flags), f"{parameter.help}{remark}"])
     return table(["Argument or option", "Meaning"], rows) if rows else "It takes no arguments."
+
+
+def functions(names: Sequence[str]) -> str:
+    """Return how functions of `photonpano` are called, and what they do."""
+    rows = []
+    for name in names:
+        function = getattr(photonpano, name)
+        signature = inspect.signature(function)
+        parameters = [each.replace(annotation=inspect.Parameter.empty) for each in signature.parameters.values()]
+        call = inspect.Signature(parameters)
+        result = re.sub(r"`Iterator\[(.*)\]`", r"context manager of `\1`", f"`{signature.return_annotation}`")
+        rows.append([f"`{name}{call}`", result, first_sentence(function)])
+    return table(["Call", "Returns", "What it does"], rows)
+
+
+def attributes(name: str) -> str:
+    """Return the attributes of a class of `photonpano`, from its docstring."""
+    section = (inspect.getdoc(getattr(photonpano, name)) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
+    rows = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
+    return table(["Attribute", "Meaning"], [[f"`{attribute}`", " ".join(text.split()).rstrip(".")] for attribute, text in rows])
+
+
+def first_sentence(documented: object) -> str:
+    """Return the first paragraph of a docstring in one line."""
+    return " ".join((inspect.getdoc(documented) or "").partition("\n\n")[0].split())
 
 
 def hook(name: str) -> str:

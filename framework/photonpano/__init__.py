@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         PluginError,
         SpecError,
     )
+    from photonpano.evaluation import Evaluation
     from photonpano.hookspecs import hookimpl
     from photonpano.pipeline.components import open_source
     from photonpano.pipeline.forecast import Forecast
@@ -93,6 +94,7 @@ __all__ = [
     "Config",
     "Counts",
     "DarkMeasurement",
+    "Evaluation",
     "FloatArray",
     "FluxImage",
     "Forecast",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import importlib.util
+import inspect
 import itertools
 import re
 import shlex
@@ -22,6 +23,7 @@ import typer
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
+import photonpano
 from photonpano import discover, hookspecs, parse_spec
 from photonpano.captures.writing import truth_path
 from photonpano.cli.app import app
@@ -294,6 +296,12 @@ def test_every_command_has_its_table():
     names = [name for name in main.commands if name != "plugins"]
     names += [f"plugins {name}" for name in main.commands["plugins"].commands]
     assert [name for name in names if f"<!-- generated: command {name} -->" not in page] == []
+
+
+def test_every_function_is_listed():
+    page = (REFERENCE / "python.md").read_text(encoding="utf-8")
+    functions = [name for name in photonpano.__all__ if inspect.isfunction(getattr(photonpano, name))]
+    assert [name for name in functions if f"| `{name}(" not in page] == ["discover"]
 
 
 def test_every_hook_has_its_section():
