@@ -1,4 +1,4 @@
-"""All commands in one program. Commands import what they need when they run, so that help is quick."""
+"""The program `photonpano`. Commands import their modules when they run, to keep `--help` fast."""
 
 import signal
 from typing import Annotated, Any
@@ -23,10 +23,10 @@ from photonpano.cli.warm_up import warm_up
 
 
 class _Commands(TyperGroup):
-    """The commands; whatever goes wrong in one becomes a message and an exit code."""
+    """The commands, with their errors reported."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that the arguments name."""
+        """Run a command; its errors become a message and an exit code."""
         with reported(debug=ctx.params["debug"]):
             return super().invoke(ctx)
 
@@ -60,16 +60,16 @@ def photonpano_options(
         bool, typer.Option("--debug", envvar="PHOTONPANO_DEBUG", help="Show the Python traceback of errors.")
     ] = False,
 ) -> None:
-    """Turn the frames of a single-photon camera into a panorama.
+    """Make panoramas from the frames of single-photon cameras.
 
-    A spec, a YAML file, names the capture and the method. 'check' it, then 'run' it.
+    'info' looks at a capture and prints a spec: a YAML file that names the capture and the method. 'check' it, then 'run' it.
 
-    Exit codes: 0 done, 1 it failed, 2 the spec or the command line is wrong.
+    Exit codes: 0 success, 1 failure, 2 wrong spec or command line.
     """
 
 
 def main() -> None:
     """Run the program with the arguments of the process."""
-    # Batch systems end a job with SIGTERM; it cleans up as after Ctrl-C.
+    # Batch systems end jobs with SIGTERM: clean up as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     app()

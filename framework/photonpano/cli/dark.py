@@ -16,11 +16,15 @@ def dark(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="An .npz file for dark counts, a .npy file for a mask.", show_default=False
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="An .npz file for the dark counts, or a .npy file for a mask.",
+            show_default=False,
         ),
     ],
     threshold: Annotated[
-        float, typer.Option(min=0, metavar="STD", help="How far hot pixels stand out, in standard deviations.")
+        float, typer.Option(min=0, metavar="STD", help="Pixels are hot above the median by this many standard deviations.")
     ] = 10,
     source: SourceName = None,
     keys: Keys = None,

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from photonpano.cli.options import Json
+
 if TYPE_CHECKING:
     from photonpano.evaluation import Evaluation, ImageScore
 
@@ -16,14 +18,14 @@ def evaluate(
     ],
     oracle: Annotated[
         bool,
-        typer.Option("--oracle/--no-oracle", help="Also render along the true motion, which needs the capture and some time."),
+        typer.Option("--oracle/--no-oracle", help="Also render along the true motion; needs the capture, and more time."),
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    as_json: Json = False,
 ) -> None:
-    """Score a run against the known truth.
+    """Score a run against the truth of its capture.
 
-    Corner errors are in pixels of a frame, after the best alignment of the two planes, over the located frames. PSNR and SSIM
-    compare the panorama with the true scene where it was seen. The oracle is the panorama along the true motion.
+    Corner errors are in pixels of a frame, over the located frames, after the best alignment of both reference planes. PSNR
+    and SSIM compare the panorama with the true scene, where it was seen. The oracle is the panorama along the true motion.
 
     Example: photonpano evaluate runs/scan --truth cube.truth.npz
     """

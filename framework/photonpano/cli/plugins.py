@@ -7,10 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from photonpano.cli.options import Json
+
 if TYPE_CHECKING:
     from photonpano.registry import Catalog, Entry, Origin
 
-plugins = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="See what the installed plugins offer.")
+plugins = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="List and describe the components of the installed plugins."
+)
 
 
 class KindName(StrEnum):
@@ -31,10 +35,10 @@ def list_plugins(
     kind: Annotated[
         KindName | None, typer.Option(metavar="KIND", help=f"Only components of this kind: {_KIND_NAMES}.", show_default=False)
     ] = None,
-    broken: Annotated[bool, typer.Option("--broken", help="Only plugins that could not be loaded, and why.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    broken: Annotated[bool, typer.Option("--broken", help="Only plugins that cannot be loaded, with the error.")] = False,
+    as_json: Json = False,
 ) -> None:
-    """List what can be chosen in a spec, and who offers it.
+    """List components that a spec can use, with their plugins.
 
     Example: photonpano plugins list --kind locator
     """
@@ -61,16 +65,16 @@ def list_plugins(
 
 @plugins.command("show")
 def show_plugin(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="What specs call the component.", show_default=False)],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the component in specs.", show_default=False)],
     kind: Annotated[
         KindName | None,
         typer.Option(
-            metavar="KIND", help=f"Its kind, if components of several have the name: {_KIND_NAMES}.", show_default=False
+            metavar="KIND", help=f"The kind, if components of several kinds share the name: {_KIND_NAMES}.", show_default=False
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    as_json: Json = False,
 ) -> None:
-    """Show a component, its keys, and YAML to paste.
+    """Describe a component: its keys, and YAML to paste.
 
     Example: photonpano plugins show opencv-sift
     """
@@ -89,7 +93,7 @@ def show_plugin(
 
 
 def _table(rows: list["Entry"], catalog: "Catalog", with_observers: bool) -> list[list[str]]:
-    """Return the rows of the list: components, plugins that watch runs, and plugins of which nothing is known."""
+    """Return the rows of the list: components, plugins that watch runs, disabled plugins."""
     return [
         *([entry.kind, entry.name, _release(entry.origin), _summary(entry, catalog)] for entry in rows),
         *(
@@ -109,7 +113,7 @@ def _label(origin: "Origin") -> str:
 
 
 def _summary(entry: "Entry", catalog: "Catalog") -> str:
-    """Return the summary of a component, after what keeps it from being used."""
+    """Return the summary of a component, after the reason why it cannot be used, if there is one."""
     if entry.unavailable:
         return f"[not installed: {' '.join(each.install for each in entry.missing)}] {entry.contribution.summary}"
     same = [each for each in catalog.rows if (each.kind, each.name) == (entry.kind, entry.name)]

@@ -13,34 +13,41 @@ def preview(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="OUT", help="A new folder for PNGs, or a file: .mp4 or .webp.", show_default=False
+            "--output", "-o", metavar="OUT", help="A new folder for PNGs, or an .mp4 or .webp file.", show_default=False
         ),
     ],
     source: SourceName = None,
     keys: Keys = None,
     corrections: Corrections = None,
-    group_size: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of an exposure.")] = 256,
+    group_size: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of a picture.")] = 256,
     step: Annotated[
         int | None,
-        typer.Option(min=1, metavar="N", help="Frames from one exposure to the next; by default all.", show_default=False),
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Frames from the start of one picture to the next; by default --group-size.",
+            show_default=False,
+        ),
     ] = None,
     quantile: Annotated[
-        float, typer.Option(min=0, max=1, metavar="Q", help="The share of the pixels that is darker than white.")
+        float, typer.Option(min=0, max=1, metavar="Q", help="The share of the pixels that are darker than white.")
     ] = 0.995,
     white: Annotated[
         float | None,
         typer.Option(
             min=1e-9,
             metavar="FLUX",
-            help="The flux that is white, in place of a quantile; in photons per frame.",
+            help="The flux that is white, in photons per pixel per frame; replaces --quantile.",
             show_default=False,
         ),
     ] = None,
     srgb: Annotated[
-        bool, typer.Option("--srgb/--linear", help="Levels as screens expect them, or in proportion to the flux.")
+        bool, typer.Option("--srgb/--linear", help="sRGB levels for screens, or levels proportional to the flux.")
     ] = True,
-    label: Annotated[bool, typer.Option("--label/--no-label", help="Write frames and time below each picture.")] = True,
-    fps: Annotated[float, typer.Option(min=0.1, max=240, metavar="HZ", help="Pictures a second of a film.")] = 24,
+    label: Annotated[
+        bool, typer.Option("--label/--no-label", help="Write the frame numbers and the time below each picture.")
+    ] = True,
+    fps: Annotated[float, typer.Option(min=0.1, max=240, metavar="HZ", help="Pictures per second of a film.")] = 24,
 ) -> None:
     """Merge frames into pictures, to look at a capture.
 

@@ -1,4 +1,4 @@
-"""Progress on a terminal: a bar for each stage, with its rate and the time left."""
+"""Draw the progress of a command: a bar for each stage, with its rate and the time left."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def progress_for_stderr() -> Progress:
-    """Return bars if somebody watches; pipes, files and continuous integration stay quiet."""
+    """Return bars for a terminal; pipes, files and continuous integration stay quiet."""
     from rich.console import Console
 
     console = Console(stderr=True, highlight=False, markup=False, emoji=False)
@@ -24,14 +24,14 @@ def progress_for_stderr() -> Progress:
 
 
 class Bars:
-    """Draws a bar for each stage, and keeps those that are done with the time they took."""
+    """Draws a bar for each stage; finished bars stay, with the time they took."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
 
     @contextmanager
     def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-        """Draw the bar of a stage of so many units."""
+        """Draw the bar of a stage of `total` units."""
         with _bar(self._console, unit) as bar:
             task = bar.add_task(title, total=total)
             yield lambda done: bar.advance(task, done)
@@ -47,7 +47,7 @@ def _bar(console: Console, unit: str) -> RichProgress:
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        """Units a second."""
+        """Units per second."""
 
         def render(self, task: Task) -> Text:
             speed = task.finished_speed or task.speed

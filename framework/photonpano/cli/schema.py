@@ -9,13 +9,15 @@ import typer
 def schema(
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="Write it to a file instead of printing it.", show_default=False),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write the schema to a file instead of printing it.", show_default=False
+        ),
     ] = None,
 ) -> None:
     """Print the JSON Schema of specs, for editors.
 
-    It knows the keys of all installed plugins. Editors with a YAML language server complete and check specs that start with
-    '# yaml-language-server: $schema=FILE'.
+    The schema holds the keys of all installed plugins. Editors with a YAML language server complete and check specs whose first
+    line is '# yaml-language-server: $schema=FILE'.
 
     Example: photonpano schema --output photonpano.schema.json
     """
