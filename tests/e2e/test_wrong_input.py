@@ -1,4 +1,4 @@
-"""Wrong input through the command line: what it says, how it ends, and that it leaves nothing behind."""
+"""Wrong input on the command line: message, exit code, and no files left."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ class Case:
     """Wrong input.
 
     Attributes:
-        arrange: puts the capture into a folder.
+        arrange: writes the capture into a folder.
         code: the exit code.
-        golden: what stands on stderr; DIR is the folder, and # is any number.
-        change: what is different in the spec.
+        golden: the text on stderr; DIR is the folder, # is any number.
+        change: a text of the spec and its replacement.
     """
 
     arrange: Callable[[Path], None]
@@ -197,7 +197,7 @@ def test_run_accepts_width_not_multiple_of_eight(simulated: Callable[..., Path],
 
 
 def limit_files() -> None:
-    """Let the system cut every file short at 20 kB, as a disk does that is full."""
+    """Limit files to 20 kB, as on a full disk."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
 
 

@@ -17,8 +17,8 @@ def convert(
 ) -> None:
     """Convert a capture of binary frames to a packed .npy file.
 
-    Eight pixels are packed into a byte. Frames are not corrected unless --correct is given. If the conversion is interrupted,
-    the frames written so far stay in CUBE.npy.part, and the same command continues from there.
+    Eight pixels are packed into a byte. The only corrections are those of --correct, or of the spec. If the conversion is
+    interrupted, the frames written so far stay in CUBE.npy.part, and the same command continues from there.
 
     Example: photonpano convert recording/ cube.npy --with frame_rate_hz=96800
     """

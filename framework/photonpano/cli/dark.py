@@ -32,9 +32,9 @@ def dark(
 ) -> None:
     """Measure dark counts and hot pixels, with the lens covered.
 
-    The capture must have been recorded with the lens covered. Corrections that move pixels are applied: in the list of a
-    spec, what is written comes after them. An .npz file holds the dark counts of each pixel, for the corrections dark-counts
-    and hot-pixels; a .npy file holds the mask of the hot pixels.
+    Record the capture with the lens covered. An .npz file holds the dark counts of each pixel, for the corrections hot-pixels
+    and dark-counts; a .npy file holds the mask of the hot pixels. Corrections that move pixels are applied before, so list the
+    file after them in a spec.
 
     Example: photonpano dark covered.npy --output dark.npz
     """

@@ -148,13 +148,14 @@ def _details(entry: "Entry") -> dict[str, Any]:
 
 def _page(entry: "Entry") -> str:
     from photonpano.cli.tables import columns
+    from photonpano.contributions import install_command
     from photonpano.registry import describe
 
     description = describe(entry.contribution)
     facts = [["kind", entry.kind], ["plugin", str(entry.origin)]]
-    if description.install:
-        needs = " ".join(f'"{each}"' for each in description.install)
-        facts.append(["needs", f"pip install {needs} ({'not installed' if entry.missing else 'installed'})"])
+    if modules := ", ".join(each.module for each in entry.contribution.requires):
+        state = f"(not installed): {install_command(entry.missing)}" if entry.missing else "(installed)"
+        facts.append(["needs", f"{modules} {state}"])
     table = [
         [row.key, row.type, "required" if row.default is None else row.default, row.bounds, row.description]
         for row in description.rows

@@ -65,7 +65,6 @@ class Description:
         summary: one line.
         rows: the keys of its config.
         snippet: its section of a spec with its defaults, to paste; what is required stands there as `<...>`.
-        install: what to pass to `pip install` for the libraries that it needs.
     """
 
     kind: str
@@ -73,7 +72,6 @@ class Description:
     summary: str
     rows: tuple[ConfigRow, ...]
     snippet: str
-    install: tuple[str, ...]
 
 
 def describe(contribution: Contribution) -> Description:
@@ -88,7 +86,6 @@ def describe(contribution: Contribution) -> Description:
         contribution.summary,
         config_rows(contribution.config),
         "\n".join(snippet) + "\n",
-        tuple(dict.fromkeys(requirement.install for requirement in contribution.requires)),
     )
 
 

@@ -57,7 +57,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which a capture was simulated to `cube.npy` and run to `run`, with what was printed in `.out` and `.err`."""
+    """A folder with a simulated capture `cube.npy`, its run in `run`, and what both commands printed in `.out` and `.err`."""
     folder = tmp_path_factory.mktemp("finished")
     (folder / "capture.yaml").write_text(CAPTURE)
     (folder / "run.yaml").write_text(RUN)

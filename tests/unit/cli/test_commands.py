@@ -321,7 +321,7 @@ def test_plugins_show_prints_install_line_for_missing_library(invoke: Callable[.
         "far: A toy\n\n"
         "kind    locator\n"
         "plugin  gamma 1.0 (g = gamma.hooks)\n"
-        'needs   pip install "gamma[far]" (not installed)\n\n'
+        'needs   no_such_library (not installed): pip install "gamma[far]"\n\n'
         "KEY    TYPE    DEFAULT  BOUNDS   MEANING\n"
         "ratio  number  0.8      above 0  how far\n\n"
         "locate:\n  use: far\n  with:\n    ratio: 0.8  # how far\n"

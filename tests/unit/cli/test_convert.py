@@ -100,7 +100,7 @@ main()
 
 
 def heed_interrupts() -> None:
-    """Undo what a shell does to its background jobs: they, and what they start, ignore SIGINT."""
+    """Restore SIGINT, which shells disable in their background jobs."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -134,7 +134,7 @@ def test_convert_starts_anew_on_part_of_another_capture(cube: Path, invoke: Call
 
 
 def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:
-    """The old file is read until the new one takes its name."""
+    """The old file stays open until the new one replaces it."""
     before = cube.read_bytes()
     assert invoke("convert", "cube.npy", "cube.npy").exit_code == 0
     assert cube.read_bytes() == before

@@ -1,4 +1,4 @@
-"""What `photonpano dark` writes, prints and refuses."""
+"""Output and errors of `photonpano dark`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SPEC = "version: 1\nsource: {use: packed-npy, with: {path: covered.npy}}\n"
 
 @pytest.fixture
 def hot(folder: Path) -> np.ndarray:
-    """Put frames of a covered camera into the folder, and return its hot pixels."""
+    """Write frames of a covered camera into the folder, and return the mask of its hot pixels."""
     rng = np.random.default_rng(0)
     hot = rng.random(SHAPE) < 0.03
     rates = np.where(hot, 0.5, 0.002)

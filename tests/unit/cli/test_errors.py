@@ -1,4 +1,4 @@
-"""What users read when they made a mistake, word for word."""
+"""Error messages and exit codes of commands."""
 
 from __future__ import annotations
 
@@ -136,14 +136,13 @@ def test_debug_option_shows_traceback(
 
 @pytest.mark.parametrize("debug", [False, True])
 def test_plugin_error_names_debug_option_if_it_has_a_cause(capsys: pytest.CaptureFixture[str], debug: bool) -> None:
-    """Not what it breaks its contract by: no line of it is to blame for that."""
     for cause in (ValueError("out of luck"), None):
         with pytest.raises(typer.Exit), reported(debug=debug):
             raise PluginError("locator 'toy' failed") from cause
-        told = capsys.readouterr().err
-        assert ("Traceback" in told) == debug
-        assert "error: locator 'toy' failed\n" in told
-        assert told.endswith("for the traceback: photonpano --debug ...\n") == (not debug and cause is not None)
+        printed = capsys.readouterr().err
+        assert ("Traceback" in printed) == debug
+        assert "error: locator 'toy' failed\n" in printed
+        assert printed.endswith("for the traceback: photonpano --debug ...\n") == (not debug and cause is not None)
 
 
 @pytest.mark.parametrize("debug", [False, True])
@@ -192,7 +191,7 @@ def test_defects_keep_their_traceback() -> None:
 
 
 def heed_interrupts() -> None:
-    """Undo what a shell does to its background jobs: they, and what they start, ignore SIGINT."""
+    """Restore SIGINT, which shells disable in their background jobs."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

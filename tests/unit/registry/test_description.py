@@ -62,7 +62,6 @@ LOCATOR = LocatorContribution(
 def test_rows_say_type_default_and_bounds():
     described = describe(LOCATOR)
     assert (described.kind, described.name, described.summary) == ("locator", "my-locator", "Finds nothing")
-    assert described.install == ("photonpano[torch]",)
     assert described.rows == (
         ConfigRow("weights", "path", None, "", "a local file"),
         ConfigRow("ratio", "number", "0.8", "above 0 and below 1", "nearest to second match"),
