@@ -1,4 +1,4 @@
-"""A level whose components know the true motion, so that the pipeline is tested without plugins."""
+"""A level whose components know the true motion, to test the loop without plugins."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class SideBySide:
 
 
 class Noise:
-    """Merges nothing: a noisy exposure for each group."""
+    """Returns a noisy exposure for each group, without reading frames."""
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         shape = tuple(max(1, round(side * scale)) for side in source.info.frame_shape)
@@ -74,7 +74,7 @@ def _truth(moving: Group, fixed: Group, found: Located) -> Located:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Let libraries start no threads, as in a run: over the matrices of small graphs they would fight for the cores."""
+    """Keep libraries from starting threads, as in a run."""
     with one_thread_inside():
         yield
 

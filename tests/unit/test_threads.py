@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info
 from photonpano.threads import Stopwatch, in_order, one_thread_inside, thread_count
 
 
-def test_auto_is_a_thread_for_each_core_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thread_count_auto_is_the_number_of_usable_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 2, 5}, raising=False)
     assert thread_count("auto") == 3
     assert thread_count(7) == 7
@@ -38,14 +38,14 @@ def look_inside_and_fail() -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_libraries_keep_to_one_thread_inside_and_get_theirs_back() -> None:
+def test_one_thread_inside_limits_libraries_and_restores_them() -> None:
     before = threads_of_libraries()
     with pytest.raises(ValueError, match="half-way"):
         look_inside_and_fail()
     assert threads_of_libraries() == before
 
 
-def test_a_stopwatch_adds_up_by_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopwatch_adds_up_by_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter([0.0, 1.5, 10.0, 10.25, 20.0, 22.0])
     monkeypatch.setattr(time, "perf_counter", lambda: next(now))
     clock = Stopwatch(2)
@@ -55,8 +55,8 @@ def test_a_stopwatch_adds_up_by_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     assert clock.seconds == {"merge": 1.75, "locate": 2.0}
 
 
-def test_what_runs_in_a_pool_counts_for_its_share() -> None:
-    """Two threads that are busy for the same 0.1 s take 0.1 s together."""
+def test_stopwatch_divides_time_in_a_pool_by_its_threads() -> None:
+    """Two threads that are busy for the same 0.1 s count as 0.1 s."""
     clock, together = Stopwatch(2), threading.Barrier(2)
 
     def work() -> None:
@@ -71,14 +71,14 @@ def test_what_runs_in_a_pool_counts_for_its_share() -> None:
     assert 0.1 <= clock.seconds["merge"] < 0.19
 
 
-def test_the_time_of_a_failure_counts() -> None:
+def test_stopwatch_counts_blocks_that_raise() -> None:
     clock = Stopwatch(1)
     with pytest.raises(ValueError, match="half-way"), clock("merge"):
         raise ValueError("half-way")
     assert set(clock.seconds) == {"merge"}
 
 
-def test_results_come_in_order_and_few_are_waiting() -> None:
+def test_in_order_yields_in_order_and_holds_few_results() -> None:
     made: list[int] = []
 
     def work(item: int) -> int:
@@ -94,7 +94,7 @@ def test_results_come_in_order_and_few_are_waiting() -> None:
     assert max(ahead) <= 4
 
 
-def test_an_error_comes_when_it_is_its_turn() -> None:
+def test_in_order_raises_an_error_in_its_turn() -> None:
     results = in_order(lambda item: 1 / (3 - item), range(9), threads=2)
     assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
     with pytest.raises(ZeroDivisionError):

@@ -1,4 +1,4 @@
-"""Whoever asks a source or a trajectory, what goes wrong carries its name."""
+"""Errors of sources and trajectories name their plugin, whoever calls them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def raising(error: BaseException) -> Callable[..., Any]:
     return fail
 
 
-def test_a_source_is_what_it_was(source: Any) -> None:
+def test_attributed_source_reads_what_the_source_reads(source: Any) -> None:
     named = attributed(source, ORIGIN)
     assert (named.info, named.response) == (source.info, source.response)
     assert named.valid is source.valid
@@ -35,7 +35,7 @@ def test_a_source_is_what_it_was(source: Any) -> None:
     np.testing.assert_array_equal(named.frames(SPAN), source.frames(SPAN))
 
 
-def test_it_has_what_the_source_has(source: Any) -> None:
+def test_attributed_source_has_the_optional_methods_of_the_source(source: Any) -> None:
     assert not isinstance(attributed(source, ORIGIN), PackedSource | LinearlyCorrectedSource)
     source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
     source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
@@ -49,7 +49,7 @@ def test_it_has_what_the_source_has(source: Any) -> None:
         attributed(source, ORIGIN).packed(SPAN)
 
 
-def test_it_closes_what_it_names(source: Any) -> None:
+def test_attributed_source_closes_the_source(source: Any) -> None:
     closed: list[bool] = []
     source.close = lambda: closed.append(True)
     with attributed(source, ORIGIN):
@@ -58,7 +58,7 @@ def test_it_closes_what_it_names(source: Any) -> None:
 
 
 @pytest.mark.parametrize("method", ["counts", "frames"])
-def test_a_source_that_raises_or_gives_another_shape_is_named(source: Any, method: str) -> None:
+def test_attributed_source_names_plugin_on_exception_or_wrong_shape(source: Any, method: str) -> None:
     named = attributed(source, ORIGIN)
     setattr(source, method, raising(OSError("gone")))
     with pytest.raises(PluginError) as caught:
@@ -71,7 +71,7 @@ def test_a_source_that_raises_or_gives_another_shape_is_named(source: Any, metho
     assert str(caught.value) == f"{ORIGIN} broke its contract at frames 2 to 4: expected the shape {expected}, got (6, 4)"
 
 
-def test_what_is_meant_for_users_passes(source: Any) -> None:
+def test_attributed_source_passes_errors_written_for_users(source: Any) -> None:
     error = InputError("the disk was pulled out")
     source.counts = raising(error)
     with pytest.raises(InputError) as caught:
@@ -79,7 +79,7 @@ def test_what_is_meant_for_users_passes(source: Any) -> None:
     assert caught.value is error
 
 
-def test_a_trajectory_is_what_it_was(pan: Callable) -> None:
+def test_attributed_trajectory_returns_what_the_trajectory_returns(pan: Callable) -> None:
     motion = pan(0.3)
     named = AttributedTrajectory(motion, "interpolator 'toy' of toys 1.0", 2)
     for frames in ([3], [0, 2.5, 7], np.arange(4), 3):
@@ -99,7 +99,9 @@ def test_a_trajectory_is_what_it_was(pan: Callable) -> None:
     ],
     ids=["raises", "shape", "h33"],
 )
-def test_the_interpolator_of_a_trajectory_is_named(answer: Callable[..., Any], problem: str) -> None:
+def test_attributed_trajectory_names_interpolator_on_exception_or_broken_contract(
+    answer: Callable[..., Any], problem: str
+) -> None:
     class Odd:
         at = staticmethod(answer)
 

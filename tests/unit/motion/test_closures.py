@@ -6,11 +6,16 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import find_peaks
 
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.motion.closures import exposure_similarity
+from photonpano.motion.closures import _PROMINENCE, _visits, closure_candidates, exposure_similarity
+from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import BinaryResponse
+from photonpano.specs.settings import GraphSettings
 
 SHAPE = (128, 160)
 RESPONSE = BinaryResponse()
@@ -52,49 +57,49 @@ def several(measure: Callable[[np.ndarray, np.random.Generator], float], times: 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("flux", [1.0, 0.1, 0.02])
-def test_the_same_place_agrees_whatever_the_noise(flux: float, scale: float) -> None:
-    """At flux 0.02, most of what varies between pixels is noise: it would pull a plain correlation below 0.9."""
+def test_exposure_similarity_is_1_for_one_place_at_any_noise(flux: float, scale: float) -> None:
+    """At flux 0.02, most of what varies between pixels is noise: a plain correlation would be below 0.9."""
 
-    def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
+    def similarity(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(plane, place, flux, rng, scale=scale) for place in (HERE, NEARBY))
         return exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE)
 
-    found = several(alike)
+    found = several(similarity)
     assert found.mean() == pytest.approx(1, abs=0.005)
     assert 0.97 < found.min() < found.max() < 1.03
 
 
-def test_in_the_dark_it_agrees_or_does_not_tell() -> None:
-    def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
+def test_exposure_similarity_is_0_or_large_for_one_place_in_the_dark() -> None:
+    def similarity(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(plane, place, 0.002, rng) for place in (HERE, NEARBY))
         return exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE)
 
-    found = several(alike)
+    found = several(similarity)
     assert np.all((found == 0) | (found > 0.7))
     assert 0 < np.count_nonzero(found) < len(found)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("flux", [1.0, 0.1, 0.02, 0.002])
-def test_different_places_do_not_agree(flux: float, scale: float) -> None:
-    def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
+def test_exposure_similarity_is_small_for_different_places(flux: float, scale: float) -> None:
+    def similarity(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(plane, place, flux, rng, scale=scale) for place in (HERE, ELSEWHERE))
         return exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE)
 
-    assert np.abs(several(alike)).max() < 0.6
+    assert np.abs(several(similarity)).max() < 0.6
 
 
 @pytest.mark.parametrize("motion", [np.eye(3), translation(2.2, 1.7), translation(40, 0)], ids=["none", "small", "large"])
 @pytest.mark.parametrize("flux", [3.0, 0.1, 0.002])
-def test_where_there_is_only_noise_nothing_agrees(flux: float, motion: np.ndarray) -> None:
-    def alike(plane: np.ndarray, rng: np.random.Generator) -> float:
+def test_exposure_similarity_is_0_for_noise_alone(flux: float, motion: np.ndarray) -> None:
+    def similarity(plane: np.ndarray, rng: np.random.Generator) -> float:
         moving, fixed = (seen(np.ones_like(plane), HERE, flux, rng) for _ in range(2))
         return exposure_similarity(moving, fixed, motion)
 
-    np.testing.assert_array_equal(several(alike), 0)
+    np.testing.assert_array_equal(several(similarity), 0)
 
 
-def test_a_wrong_motion_agrees_less_the_further_it_is_off() -> None:
+def test_exposure_similarity_falls_with_the_error_of_the_motion() -> None:
     rng = np.random.default_rng(0)
     moving, fixed = (seen(scene(0), place, 0.1, rng) for place in (HERE, NEARBY))
     found = [exposure_similarity(moving, fixed, translation(off_px, 0) @ inverse(NEARBY) @ HERE) for off_px in (0, 2, 4, 8, 16)]
@@ -103,21 +108,21 @@ def test_a_wrong_motion_agrees_less_the_further_it_is_off() -> None:
     assert found[-1] < 0.5
 
 
-def test_a_camera_that_rolls_and_tilts_sees_the_same_place() -> None:
+def test_exposure_similarity_is_1_for_one_place_under_roll_and_tilt() -> None:
     roll = np.array([[np.cos(0.35), -np.sin(0.35), 90], [np.sin(0.35), np.cos(0.35), 30], [2e-4, 0, 1]])
     rng = np.random.default_rng(0)
     moving, fixed = (seen(scene(0), place, 0.1, rng) for place in (roll, translation(80, 60)))
     assert exposure_similarity(moving, fixed, inverse(translation(80, 60)) @ roll) == pytest.approx(1, abs=0.02)
 
 
-def test_exposures_of_different_lengths_agree() -> None:
+def test_exposure_similarity_is_1_for_one_place_at_different_lengths() -> None:
     rng = np.random.default_rng(0)
     short, long = seen(scene(0), HERE, 0.1, rng, frames=60), seen(scene(0), NEARBY, 0.1, rng, frames=1000)
     assert exposure_similarity(short, long, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.02)
     assert exposure_similarity(long, short, inverse(HERE) @ NEARBY) == pytest.approx(1, abs=0.02)
 
 
-def test_pixels_that_were_not_seen_do_not_count() -> None:
+def test_exposure_similarity_ignores_pixels_that_were_not_seen() -> None:
     """Columns and single pixels are missing from one exposure, rows from the other."""
     rng = np.random.default_rng(0)
     columns, rows = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
@@ -127,7 +132,7 @@ def test_pixels_that_were_not_seen_do_not_count() -> None:
     assert exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.01)
 
 
-def test_what_hardly_overlaps_or_is_hardly_seen_does_not_agree() -> None:
+def test_exposure_similarity_is_0_for_little_overlap_or_few_seen_pixels() -> None:
     rng = np.random.default_rng(0)
     exposure = seen(scene(0), HERE, 1.0, rng)
     sliver = np.ones(SHAPE, bool)
@@ -139,3 +144,168 @@ def test_what_hardly_overlaps_or_is_hardly_seen_does_not_agree() -> None:
     assert exposure_similarity(exposure, seen(scene(0), HERE, 1.0, rng, unseen=np.ones(SHAPE, bool)), np.eye(3)) == 0
     tiny = seen(scene(0), HERE, 1.0, rng, scale=0.02)
     assert exposure_similarity(tiny, tiny, np.eye(3)) == 0
+
+
+FIELD = (40, 60)
+"""Height and width of the frames whose overlap is counted."""
+
+
+def groups(*starts: int) -> list[Group]:
+    return [Group(FrameSpan(start, start + 100), start + 49.5) for start in starts]
+
+
+def candidates(
+    spread: list[Group],
+    homographies: np.ndarray,
+    located: np.ndarray,
+    skips: tuple[float, ...] = (1.0, 2.0),
+    min_overlap: float | None = 0.5,
+) -> list[tuple[int, int]]:
+    solution = GraphSolution(homographies, located, (), 0.0, lambda: (np.empty((0, 8, 8)), np.empty(0)))
+    graph = GraphSettings(skips=skips, closure_overlap=min_overlap)
+    return closure_candidates(spread, solution, FIELD, graph)
+
+
+def visiting(
+    places: np.ndarray, *, step: int = 100, skips: tuple[float, ...] = (1.0, 2.0), min_overlap: float = 0.5
+) -> list[tuple[int, int]]:
+    """Visit (x, y) places with exposures of 100 frames, `step` frames apart."""
+    homographies = np.array([translation(x, y) for x, y in places])
+    spread = groups(*range(0, step * len(places), step))
+    return candidates(spread, homographies, np.ones(len(places), bool), skips, min_overlap)
+
+
+def line(*x_px: float) -> np.ndarray:
+    return np.array([(x, 0.0) for x in x_px])
+
+
+FORTH = np.arange(20) * 9.0
+BACK = FORTH[::-1]
+
+
+def raster(rows_px: float, n_rows: int = 3) -> np.ndarray:
+    """Sweep over rows at a distance of `rows_px`, forth and back."""
+    x = np.concatenate([FORTH if row % 2 == 0 else BACK for row in range(n_rows)])
+    return np.stack([x, np.repeat(np.arange(n_rows) * rows_px, len(FORTH))], axis=1)
+
+
+def test_candidates_on_the_way_back_pair_exposures_of_one_place() -> None:
+    """Exposure 20 + i shows the place of 19 - i; those around the turn are registered as neighbours."""
+    assert visiting(line(*FORTH, *BACK)) == [(20 + i, 19 - i) for i in range(2, 20)]
+
+
+def test_candidates_of_a_raster_include_all_earlier_rows_that_overlap() -> None:
+    """Rows 8 px apart in a field of 40 px: the third row sees both others, apart from where they turn."""
+    pairs = visiting(raster(8))
+    assert {(40 + i, 39 - i) for i in range(3, 20)} <= set(pairs)
+    assert {(40 + i, i) for i in range(17)} <= set(pairs)
+    assert {(20 + i, 19 - i) for i in range(3, 20)} <= set(pairs)
+    # Rows 24 px apart share less than half of the field of view.
+    assert visiting(raster(24)) == []
+    assert visiting(raster(24), min_overlap=0.3) != []
+
+
+def test_candidates_overlap_by_the_least_share() -> None:
+    """On the way back the first place is missed by 20 of 60 px."""
+    places = line(0, 60, 120, 180, 240, 180, 120, 60, 20)
+    assert visiting(places, min_overlap=0.6) == [(6, 2), (7, 1), (8, 0)]
+    assert visiting(places, min_overlap=0.7) == [(6, 2), (7, 1)]
+
+
+def test_candidates_include_three_visits_of_a_place_at_most() -> None:
+    """Of five visits of the left end, the three of the largest overlap."""
+    far = 200.0
+    places = line(0, far, 2, far, 9, far, 12, far, 20, far, 3)
+    assert [pair for pair in visiting(places, skips=()) if pair[0] == 10] == [(10, 0), (10, 2), (10, 4)]
+
+
+def test_candidates_are_none_for_a_pan() -> None:
+    assert visiting(line(*(np.arange(60) * 9.0))) == []
+    assert visiting(line(*(np.arange(60) * 0.5))) == []
+
+
+@pytest.mark.parametrize("tremor_px", [0, 1e-6, 0.01, 1.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_candidates_are_none_for_a_still_or_trembling_camera(tremor_px: float, seed: int) -> None:
+    assert visiting(np.random.default_rng(seed).normal(scale=tremor_px, size=(60, 2))) == []
+
+
+def test_candidates_are_none_for_a_pan_with_tremor() -> None:
+    tremor = np.random.default_rng(0).normal(scale=1.0, size=(60, 2))
+    assert visiting(line(*(np.arange(60) * 3.0)) + tremor) == []
+
+
+def test_candidates_take_the_best_view_of_a_visit_despite_tremor() -> None:
+    tremor = np.random.default_rng(0).normal(scale=1.0, size=(40, 2))
+    pairs = visiting(line(*FORTH, *BACK) + tremor)
+    assert [moving for moving, _ in pairs] == list(range(22, 40))
+    assert all(abs(moving + fixed - 39) <= 1 for moving, fixed in pairs)
+
+
+def test_candidates_thin_out_dense_exposures() -> None:
+    """Four in a group length: as many pairs as with one."""
+    sparse = visiting(line(*FORTH, *BACK))
+    dense = visiting(line(*np.repeat(np.concatenate([FORTH, BACK]), 4)), step=25)
+    assert {index % 4 for pair in dense for index in pair} == {0}
+    assert len(dense) == len(sparse)
+
+
+def test_candidates_are_at_least_twice_the_longest_skip_apart() -> None:
+    """The longest skip counts in group lengths."""
+    for skips, nearest in (((1.0, 2.0), 5), ((1.0, 4.0), 9), ((6.0,), 13)):
+        pairs = visiting(line(*FORTH, *BACK), skips=skips)
+        assert min(moving - fixed for moving, fixed in pairs) == nearest
+
+
+def test_candidates_skip_exposures_that_are_not_located() -> None:
+    places = line(*FORTH, *BACK)
+    homographies = np.array([translation(x, y) for x, y in places])
+    located = np.ones(40, bool)
+    located[[5, 30]] = False
+    homographies[~located] = np.nan
+    pairs = candidates(groups(*range(0, 4000, 100)), homographies, located)
+    assert not {5, 30} & {index for pair in pairs for index in pair}
+    assert len(pairs) >= 16
+
+
+def test_candidates_skip_groups_of_another_length() -> None:
+    """The first and the last group of a capture may be shorter; their exposures are noisier."""
+    places = line(*FORTH, *BACK)
+    homographies = np.array([translation(x, y) for x, y in places])
+    spread = [Group(FrameSpan(0, 50), 0.0), *groups(*range(100, 4000, 100))]
+    pairs = candidates(spread, homographies, np.ones(40, bool))
+    assert {index for pair in pairs for index in pair} == set(range(1, 18)) | set(range(22, 40))
+
+
+@pytest.mark.parametrize("n_groups", [1, 2])
+def test_candidates_are_none_for_one_or_two_exposures(n_groups: int) -> None:
+    assert visiting(line(*[0.0] * n_groups)) == []
+
+
+@given(
+    places=st.lists(st.tuples(st.floats(-80, 80), st.floats(-40, 40)), min_size=1, max_size=40),
+    step=st.integers(20, 150),
+    skips=st.lists(st.floats(0.1, 4), max_size=3),
+    min_overlap=st.floats(0.05, 0.95),
+)
+def test_candidates_are_ordered_unique_and_beyond_the_skips(
+    places: list[tuple[float, float]], step: int, skips: list[float], min_overlap: float
+) -> None:
+    pairs = visiting(np.array(places), step=step, skips=tuple(skips), min_overlap=min_overlap)
+    assert pairs == sorted(set(pairs))
+    assert all(step * (moving - fixed) >= 200 * max([1.0, *skips]) for moving, fixed in pairs)
+    assert max(np.bincount([moving for moving, _ in pairs]), default=0) <= 3
+    for moving, fixed in pairs:
+        away = np.abs(np.subtract(places[moving], places[fixed]))
+        # Counted on a grid of eight by eight.
+        assert np.prod(np.maximum(0, 1 - away / [59, 39]) + 1 / 8) >= min_overlap
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_visits_equal_the_prominent_peaks_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    overlap = np.cumsum(rng.normal(0, 0.15, rng.integers(1, 60))) % 1.0
+    if seed % 2:
+        overlap = np.round(overlap * 8) / 8
+    expected, _ = find_peaks(np.concatenate([[0.0], overlap, [1.0]]), height=0.5, prominence=_PROMINENCE)
+    np.testing.assert_array_equal(_visits(overlap, 0.5), expected - 1)

@@ -23,26 +23,26 @@ def exposed(counts: np.ndarray, frames: int) -> VirtualExposure:
 
 
 @given(st.integers(1, 100_000))
-def test_an_exposure_that_is_lit_in_every_frame_is_blank(frames: int) -> None:
+def test_contrast_is_blank_if_all_pixels_are_saturated(frames: int) -> None:
     assert contrast_of(exposed(np.full((4, 6), frames), frames)).blank == (
         "every pixel is saturated, so that its flux is unknown; use a smaller aperture"
     )
 
 
 @given(st.integers(1, 100_000))
-def test_one_dark_frame_of_one_pixel_is_not(frames: int) -> None:
+def test_contrast_is_not_blank_if_one_pixel_has_one_dark_frame(frames: int) -> None:
     counts = np.full((4, 6), frames)
     counts[1, 2] -= 1
     assert contrast_of(exposed(counts, frames)).blank is None
 
 
-def test_an_exposure_without_photons_is_blank() -> None:
+def test_contrast_is_blank_without_photons() -> None:
     assert contrast_of(exposed(np.zeros((4, 6)), 100)).blank == (
         "no pixel detected a photon; is the shutter closed, or is it the wrong file?"
     )
 
 
-def test_an_exposure_that_saw_nothing_is_blank() -> None:
+def test_contrast_is_blank_if_no_pixel_was_seen() -> None:
     exposure = exposed(np.zeros((4, 6)), 100)
     exposure.flux[:], exposure.weight[:] = np.nan, 0
     assert contrast_of(exposure).blank == "no pixel was seen"
@@ -60,7 +60,7 @@ def require(
     disconnected: Literal["error", "largest"] = "error",
     reason: str = "3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)",
 ) -> None:
-    """Ask for a chain of ten exposures, of which those that are lost fail in every pair."""
+    """Check a chain of ten exposures; every pair of a lost one failed."""
     found, failed = Located(np.eye(3)), NotLocated(reason)
     edges = [Edge(later, later - 1, failed if {later, later - 1} & set(lost) else found) for later in range(1, N)]
     tied = np.array([0 if index not in lost else 1 + index for index in range(N)])
@@ -69,16 +69,16 @@ def require(
 
 
 @pytest.mark.parametrize("lost", [(), (0,), (4,), (4, 5), (0, 3, 6, 9), (8, 9)])
-def test_single_exposures_may_be_lost(lost: tuple[int, ...]) -> None:
+def test_require_tied_accepts_up_to_two_lost_exposures_in_a_row(lost: tuple[int, ...]) -> None:
     require(lost)
 
 
 @pytest.mark.parametrize("lost", [(4, 5, 6), (0, 1, 2, 3, 4, 5, 6, 7)])
-def test_the_largest_part_is_enough_if_the_spec_says_so(lost: tuple[int, ...]) -> None:
+def test_require_tied_accepts_the_largest_part_with_disconnected_largest(lost: tuple[int, ...]) -> None:
     require(lost, disconnected="largest")
 
 
-def test_a_lone_group_needs_no_ties() -> None:
+def test_require_tied_accepts_a_single_group() -> None:
     require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
 
 
@@ -92,7 +92,7 @@ def golden(text: str) -> str:
     return dedent(text).strip()
 
 
-def test_a_part_without_texture_is_named_with_its_pairs() -> None:
+def test_refusal_names_lost_frames_and_failed_pairs() -> None:
     assert refusal((4, 5, 6)) == golden(
         """
         level 2: 4 of 9 pairs of exposures could not be located, so that frames 400 to 699 cannot be tied to the rest
@@ -109,7 +109,7 @@ texture there.
     )
 
 
-def test_darkness_is_told_from_blur() -> None:
+def test_refusal_advises_larger_groups_at_low_signal_to_noise() -> None:
     assert refusal((0, 1, 2, 7, 8, 9), DARK).splitlines()[-2:] == [
         "In these exposures of 100 frames the scene varies 0.17 times as much as a pixel's photon noise: either they are too "
         "dark (try larger groups, such as resample.with.group_size=200), or the scene has no texture there.",
@@ -117,7 +117,7 @@ def test_darkness_is_told_from_blur() -> None:
     ]
 
 
-def test_where_either_may_be_the_cause_it_says_so() -> None:
+def test_refusal_advises_both_at_medium_signal_to_noise() -> None:
     faint = Contrast(0.8)
     assert refusal((4, 5, 6), faint).splitlines()[-2] == (
         "In these exposures of 100 frames the scene varies 0.8 times as much as a pixel's photon noise: either motion blurs "
@@ -126,7 +126,7 @@ def test_where_either_may_be_the_cause_it_says_so() -> None:
     )
 
 
-def test_several_spans_are_listed() -> None:
+def test_refusal_lists_several_lost_spans() -> None:
     assert refusal((0, 1, 2, 7, 8, 9)).splitlines()[0] == (
         "level 2: 6 of 9 pairs of exposures could not be located, "
         "so that frames 0 to 299 and frames 700 to 999 cannot be tied to the rest"
@@ -141,34 +141,34 @@ def parts_refusal(parts: list[int]) -> str:
     return str(caught.value).splitlines()[1]
 
 
-def test_the_parts_are_named_by_what_they_hold_the_largest_first() -> None:
-    """Exposures that are tied to no other make no part."""
+def test_refusal_lists_parts_by_their_frames_largest_first() -> None:
+    """An exposure without a located pair is no part."""
     assert parts_refusal([1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2]) == (
         "Parts that are tied together: frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099."
     )
     assert parts_refusal([0, 0, 1, 2, 3]) == "Parts that are tied together: frames 0 to 199."
 
 
-def test_a_long_list_of_parts_is_cut() -> None:
+def test_refusal_lists_six_parts_at_most() -> None:
     shown = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
     assert parts_refusal([part for part in range(6) for _ in range(2)]) == f"Parts that are tied together: {shown}."
     assert parts_refusal([part for part in range(7) for _ in range(2)]) == f"Parts that are tied together: {shown}; and others."
 
 
-def test_a_long_list_of_pairs_is_cut() -> None:
+def test_refusal_lists_six_pairs_at_most() -> None:
     lines = refusal((2, 3, 4, 5, 6, 7, 8, 9)).splitlines()
     assert [line for line in lines if line.startswith("  ")][6:] == ["  ... and 2 more"]
 
 
-def test_blank_exposures_need_no_advice() -> None:
+def test_refusal_gives_no_advice_for_blank_exposures() -> None:
     assert refusal((4, 5, 6), BLANK, reason="frames 400 to 499: no pixel detected a photon").splitlines()[-2:] == [
         "  frames 700 to 799 onto frames 600 to 699: frames 400 to 499: no pixel detected a photon",
         "To go on with the largest part alone, set graph.disconnected to largest.",
     ]
 
 
-def test_when_nothing_is_tied_there_is_no_largest_part() -> None:
-    """Of ten exposures without a pair, the largest component is one."""
+def test_refusal_offers_no_largest_part_if_no_pair_is_located() -> None:
+    """Without located pairs, the largest component is a single exposure."""
     for disconnected in ("error", "largest"):
         lines = refusal(tuple(range(1, N)), disconnected=disconnected).splitlines()
         assert lines[0] == "level 2: none of the 9 pairs of exposures could be located"

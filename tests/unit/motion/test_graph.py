@@ -38,7 +38,7 @@ def true_motion(n_nodes: int, seed: int = 0) -> np.ndarray:
 
 
 def edge(true: np.ndarray, moving: int, fixed: int, rng: np.random.Generator | None = None, std_px: float = NOISE_PX) -> Edge:
-    """Measure a pair; with a generator, every corner errs by `std_px` along each axis, and the information says so."""
+    """Measure a pair; with a generator, corners have errors of `std_px` along each axis, as the information predicts."""
     homography = normalised(inverse(true[fixed]) @ true[moving])
     to_corners = jacobian(homography, corners(SHAPE)).reshape(8, 8)
     information = to_corners.T @ to_corners / std_px**2
@@ -58,12 +58,12 @@ def error_px(homographies: np.ndarray, true: np.ndarray, anchor: int) -> float:
 
 
 def moved(wrong: Edge, x_px: float, y_px: float) -> Edge:
-    """Return the edge as if its locator had been off by so many pixels."""
+    """Return the edge with an error of (x_px, y_px)."""
     return replace(wrong, motion=replace(wrong.motion, homography=translation(x_px, y_px) @ wrong.motion.homography))
 
 
 def confident(edges: list[Edge], times: float) -> list[Edge]:
-    """Let edges say that they err by so many times less than they do."""
+    """Scale the information of edges as if their errors were `times` smaller."""
     return [replace(each, motion=replace(each.motion, information=each.motion.information * times**2)) for each in edges]
 
 
@@ -73,7 +73,7 @@ def without_information(edges: list[Edge]) -> list[Edge]:
 
 @pytest.mark.parametrize("skips", [(1,), (1, 2, 4), (1, 29)], ids=["chain", "loops", "closed once"])
 @pytest.mark.parametrize("anchor", [0, 15, 29])
-def test_without_noise_it_is_exact(skips: tuple[int, ...], anchor: int) -> None:
+def test_solve_is_exact_without_noise(skips: tuple[int, ...], anchor: int) -> None:
     true = true_motion(30)
     solution = solve(30, measured(true, skips), anchor, SHAPE)
     assert error_px(solution.homographies, true, anchor) < 1e-9
@@ -82,60 +82,60 @@ def test_without_noise_it_is_exact(skips: tuple[int, ...], anchor: int) -> None:
     assert solution.residual_px < 1e-9
 
 
-def test_the_anchor_is_the_identity() -> None:
+def test_solve_keeps_anchor_at_identity() -> None:
     solution = solve(30, measured(true_motion(30), (1, 2, 4), np.random.default_rng(0)), 7, SHAPE)
     np.testing.assert_array_equal(solution.homographies[7], np.eye(3))
     np.testing.assert_array_equal(solution.homographies[:, 2, 2], 1)
 
 
-def test_a_pair_may_be_measured_in_either_direction_and_twice() -> None:
+def test_solve_accepts_pairs_in_either_direction_and_twice() -> None:
     true = true_motion(4)
     edges = [edge(true, 1, 0), edge(true, 1, 2), edge(true, 2, 1), edge(true, 2, 3), edge(true, 0, 3), edge(true, 1, 0)]
     assert error_px(solve(4, edges, 0, SHAPE).homographies, true, 0) < 1e-9
 
 
-def test_more_edges_beat_the_chain() -> None:
+def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
     """Errors of 0.1 px a pair: over 120 exposures a chain drifts by 0.7 px; second and fourth neighbours leave 0.14 px."""
     errors: dict[tuple[int, ...], list[float]] = {(1,): [], (1, 2, 4): [], (1, 2, 4, 40): []}
     for seed in range(2):
         true, rng = true_motion(120, seed), np.random.default_rng(seed)
         for skips, found in errors.items():
             found.append(error_px(solve(120, measured(true, skips, rng), 60, SHAPE).homographies, true, 60))
-    chain, neighbours, revisits = (float(np.mean(found)) for found in errors.values())
+    chain, neighbours, closures = (float(np.mean(found)) for found in errors.values())
     assert chain > 0.5
     assert neighbours < 0.35 * chain
-    assert revisits < 0.15 * chain
+    assert closures < 0.15 * chain
 
 
-def test_the_residual_is_that_of_the_measurements() -> None:
-    """Every corner errs by 0.1 px along two axes; half of the residuals are taken up by the unknowns."""
+def test_residual_is_that_of_the_measurements() -> None:
+    """Every corner has an error of 0.1 px along two axes; the unknowns absorb half of the residuals."""
     true = true_motion(200)
     edges = measured(true, (1, 2), np.random.default_rng(0))
     solution = solve(200, edges, 100, SHAPE)
     assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - 199 / len(edges)), rel=0.05)
 
 
-@pytest.mark.parametrize("told_by", ["information", "residual_px"])
-def test_edges_count_by_what_they_say_of_themselves(told_by: str) -> None:
+@pytest.mark.parametrize("weighted_by", ["information", "residual_px"])
+def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> None:
     """Every second measurement of a pair is twenty times as noisy."""
     true, rng = true_motion(40), np.random.default_rng(0)
     good = measured(true, (1, 2), rng)
     noisy = [edge(true, each.moving, each.fixed, rng, 20 * NOISE_PX) for each in good]
     best = error_px(solve(40, good, 20, SHAPE).homographies, true, 20)
-    told = good + noisy
-    if told_by == "residual_px":
+    edges = good + noisy
+    if weighted_by == "residual_px":
         stds = np.repeat([NOISE_PX, 20 * NOISE_PX], len(good))
-        told = [
+        edges = [
             Edge(each.moving, each.fixed, replace(each.motion, residual_px=std_px))
-            for each, std_px in zip(without_information(told), stds, strict=True)
+            for each, std_px in zip(without_information(edges), stds, strict=True)
         ]
-    weighted = error_px(solve(40, told, 20, SHAPE).homographies, true, 20)
-    alike = error_px(solve(40, without_information(good + noisy), 20, SHAPE).homographies, true, 20)
+    weighted = error_px(solve(40, edges, 20, SHAPE).homographies, true, 20)
+    unweighted = error_px(solve(40, without_information(good + noisy), 20, SHAPE).homographies, true, 20)
     assert weighted < 1.2 * best
-    assert alike > 1.5 * weighted
+    assert unweighted > 1.5 * weighted
 
 
-def test_one_gross_outlier_is_outvoted_and_reported_wherever_it_is() -> None:
+def test_solve_drops_one_gross_outlier_at_any_edge() -> None:
     true = true_motion(9)
     edges = measured(true, (1, 2, 4), np.random.default_rng(0))
     clean = error_px(solve(9, edges, 4, SHAPE).homographies, true, 4)
@@ -145,7 +145,7 @@ def test_one_gross_outlier_is_outvoted_and_reported_wherever_it_is() -> None:
         assert error_px(solution.homographies, true, 4) < 1.5 * clean
 
 
-def test_what_contradicts_is_dropped_as_if_it_were_not_there() -> None:
+def test_solve_with_outliers_equals_solve_without_them() -> None:
     true = true_motion(20)
     edges = measured(true, (1, 2, 4), np.random.default_rng(0))
     wrong = {7: moved(edges[7], 3, 0), 30: moved(edges[30], 40, -30), 31: moved(edges[31], 0, 500)}
@@ -161,20 +161,20 @@ def test_what_contradicts_is_dropped_as_if_it_were_not_there() -> None:
     np.testing.assert_allclose(std_px, std_without_px, rtol=0.25)
 
 
-def test_what_would_fall_apart_without_them_keeps_its_contradictions() -> None:
-    """The last exposure hangs by two pairs that are 40 px apart: nothing tells which is right, and that is what it says."""
+def test_solve_keeps_outliers_if_graph_disconnects_without_them() -> None:
+    """The last exposure has two pairs that are 40 px apart: either may be right, and the expected error includes both."""
     still = np.broadcast_to(np.eye(3), (21, 3, 3))
-    told = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
-    solution = solve(21, without_information(told), 10, SHAPE)
+    edges = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
+    solution = solve(21, without_information(edges), 10, SHAPE)
     assert solution.located.all()
     assert solution.outliers == ()
     assert error_px(solution.homographies, still, 10) < 1e-6
-    assert solution.residual_px == pytest.approx(20 * np.sqrt(2 / len(told)))
+    assert solution.residual_px == pytest.approx(20 * np.sqrt(2 / len(edges)))
     _, std_px = solution.assess()
     assert std_px[:20].max() < 2 < 5 < std_px[20] < 40
 
 
-def test_failures_are_skipped_and_positions_are_those_of_the_whole_list() -> None:
+def test_outlier_positions_count_failed_edges() -> None:
     true = true_motion(20)
     edges = measured(true, (1, 2, 4), np.random.default_rng(0))
     failure = Edge(5, 3, NotLocated("nothing to see"))
@@ -182,8 +182,8 @@ def test_failures_are_skipped_and_positions_are_those_of_the_whole_list() -> Non
     assert solve(20, given, 10, SHAPE).outliers == (32,)
 
 
-def test_half_of_the_pairs_agree_perfectly_where_the_search_starts_and_do_not_outvote_the_rest() -> None:
-    """The tree that it starts from holds one pair in two; their errors are three times what they say."""
+def test_solve_keeps_edges_outside_the_spanning_tree_it_starts_from() -> None:
+    """The spanning tree contains one pair in two; errors are three times what the information predicts."""
     true = true_motion(60)
     edges = confident(measured(true, (1, 2), np.random.default_rng(0)), 3)
     solution = solve(60, edges, 30, SHAPE)
@@ -191,7 +191,7 @@ def test_half_of_the_pairs_agree_perfectly_where_the_search_starts_and_do_not_ou
     assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - 59 / len(edges)), rel=0.1)
 
 
-def test_what_is_not_tied_to_the_anchor_is_unknown() -> None:
+def test_solve_leaves_nodes_not_tied_to_the_anchor_unknown() -> None:
     true = true_motion(7)
     edges = [edge(true, 1, 0), edge(true, 2, 1), edge(true, 2, 0), Edge(3, 2, NotLocated("lost")), edge(true, 5, 4)]
     solution = solve(7, edges, 1, SHAPE)
@@ -204,7 +204,7 @@ def test_what_is_not_tied_to_the_anchor_is_unknown() -> None:
     assert np.isfinite(std_px).all()
 
 
-def test_a_graph_without_edges_is_its_anchor() -> None:
+def test_solve_without_edges_locates_anchor_alone() -> None:
     solution = solve(3, [], 2, SHAPE)
     np.testing.assert_array_equal(solution.located, [False, False, True])
     np.testing.assert_array_equal(solution.homographies[2], np.eye(3))
@@ -214,7 +214,7 @@ def test_a_graph_without_edges_is_its_anchor() -> None:
     np.testing.assert_array_equal(std_px, [np.nan])
 
 
-def test_the_solution_does_not_depend_on_the_unit_of_length() -> None:
+def test_solve_does_not_depend_on_the_unit_of_length() -> None:
     true = true_motion(20)
     edges = without_information(measured(true, (1, 2, 4), np.random.default_rng(0)))
     halved = [
@@ -243,7 +243,7 @@ def squared_errors(homographies: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def unequal(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator) -> list[Edge]:
-    """Measure pairs that err by 0.03 to 0.3 px, and say so."""
+    """Measure pairs with errors of 0.03 to 0.3 px, and matching information."""
     stds = np.random.default_rng(1).choice([0.03, 0.1, 0.3], size=len(true) * len(skips))
     pairs = [(moving, moving - skip) for moving in range(len(true)) for skip in skips if skip <= moving]
     return [edge(true, *pair, rng, std_px) for pair, std_px in zip(pairs, stds, strict=False)]
@@ -260,7 +260,7 @@ GRAPHS: dict[str, Callable[..., list[Edge]]] = {
 
 
 @pytest.mark.parametrize("graph", GRAPHS)
-def test_the_error_is_what_it_says_for_every_exposure(graph: str) -> None:
+def test_expected_error_matches_actual_error_of_every_exposure(graph: str) -> None:
     """Sixteen measurements of one motion: the error of every exposure is as large as expected."""
     true = true_motion(10)
     found = [solve(10, GRAPHS[graph](true, np.random.default_rng(seed)), 5, SHAPE) for seed in range(16)]
@@ -268,13 +268,13 @@ def test_the_error_is_what_it_says_for_every_exposure(graph: str) -> None:
     expected = np.array([solution.assess()[1] for solution in found])
     ratios = np.sqrt(squares.mean(axis=0) / (expected**2).mean(axis=0))
     assert 0.7 < ratios.min() < ratios.max() < 1.2
-    # A single loop tells little of the size of errors, and in doubt they are taken to be larger.
+    # A single loop hardly determines the scale of errors; the larger one is taken.
     assert 0.8 < np.sqrt(squares.mean() / (expected**2).mean()) < 1.1
     assert np.mean(np.sqrt(squares) < 3 * expected) > 0.99
 
 
 @pytest.mark.parametrize("n_nodes", [9, 36])
-def test_a_chain_drifts_as_a_random_walk_about_its_middle(n_nodes: int) -> None:
+def test_expected_error_of_a_chain_is_that_of_a_random_walk(n_nodes: int) -> None:
     """Step j of a walk over N exposures weighs j / N in the distance of those after it from the mean, (N - j) / N before.
 
     The camera stands still, so that the best alignment of planes takes out the mean.
@@ -287,7 +287,7 @@ def test_a_chain_drifts_as_a_random_walk_about_its_middle(n_nodes: int) -> None:
     np.testing.assert_allclose(solution.assess()[1], walk, rtol=0.12)
 
 
-def test_what_is_expected_does_not_depend_on_the_anchor() -> None:
+def test_expected_error_does_not_depend_on_the_anchor() -> None:
     true = true_motion(20)
     edges = measured(true, (1, 2), np.random.default_rng(0))
     first, last = (solve(20, edges, anchor, SHAPE).assess()[1] for anchor in (0, 19))
@@ -295,15 +295,15 @@ def test_what_is_expected_does_not_depend_on_the_anchor() -> None:
 
 
 @pytest.mark.parametrize("skips", [(1, 2), (1,)], ids=["loops", "chain"])
-def test_only_loops_tell_that_pairs_are_too_sure_of_themselves(skips: tuple[int, ...]) -> None:
+def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tuple[int, ...]) -> None:
     true = true_motion(40)
     edges = measured(true, skips, np.random.default_rng(0))
-    honest, sure, modest = (solve(40, confident(edges, times), 20, SHAPE).assess()[1].mean() for times in (1, 5, 0.2))
-    assert sure == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.1)
+    honest, overconfident, modest = (solve(40, confident(edges, times), 20, SHAPE).assess()[1].mean() for times in (1, 5, 0.2))
+    assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.1)
     assert modest == pytest.approx(5 * honest, rel=0.15)
 
 
-def test_the_information_is_the_curvature_of_the_disagreement_while_the_others_are_held() -> None:
+def test_information_of_a_node_is_the_curvature_of_the_cost_with_others_held() -> None:
     true = true_motion(5)
     edges = [
         edge(true, 1, 0),
@@ -316,7 +316,7 @@ def test_the_information_is_the_curvature_of_the_disagreement_while_the_others_a
     solution = solve(5, edges, 1, SHAPE)
     found, _ = solution.assess()
 
-    def disagreement(node: int, change: np.ndarray) -> float:
+    def cost(node: int, change: np.ndarray) -> float:
         homographies = solution.homographies.copy()
         homographies[node] = from_parameters(parameters(homographies[node]) + change)
         total = 0.0
@@ -333,16 +333,16 @@ def test_the_information_is_the_curvature_of_the_disagreement_while_the_others_a
         for first, second in np.ndindex(8, 8):
             for one, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 change = one * steps * (np.arange(8) == first) + other * steps * (np.arange(8) == second)
-                curvature[first, second] += one * other * disagreement(node, change) / 4
+                curvature[first, second] += one * other * cost(node, change) / 4
         information = found[node] * np.outer(steps, steps)
         np.testing.assert_allclose(information, curvature, rtol=0.01, atol=1e-3 * np.abs(information).max())
 
 
 @pytest.mark.parametrize(("closures", "most"), [(0, 20), (100, 50)])
-def test_a_large_graph_takes_few_steps_that_grow_with_its_size_only(
+def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
     monkeypatch: pytest.MonkeyPatch, closures: int, most: int
 ) -> None:
-    """The normal equations stay sparse: the factors hold so many blocks for each exposure."""
+    """The factors of the normal equations stay sparse: at most `most` blocks for each exposure."""
     filled: list[int] = []
     factorise = adjustment.splu
 

@@ -8,8 +8,8 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, PluginError
 from photonpano.context import Context, Quiet
-from photonpano.geometry import translation
-from photonpano.motion.loop import estimate_motion
+from photonpano.geometry import from_parameters, inverse, normalised, translation
+from photonpano.motion.loop import ReferencedTrajectory, estimate_motion
 from photonpano.pipeline.components import Level
 from photonpano.specs.settings import GraphSettings
 
@@ -30,7 +30,7 @@ def run(source: Any) -> Callable[..., list]:
 
 
 @pytest.mark.parametrize("reference", [0, 60, 119])
-def test_the_reference_frame_is_the_identity_at_every_level(
+def test_reference_frame_is_the_identity_at_every_level(
     run: Callable, make_level: Callable, pan: Callable, reference: int
 ) -> None:
     results = run(make_level(pan(0.3)), make_level(pan(0.3), number=2), reference=reference)
@@ -41,7 +41,7 @@ def test_the_reference_frame_is_the_identity_at_every_level(
             np.testing.assert_allclose(result.trajectory.at(inside)[:, 0, 2], 0.3 * (inside - reference), atol=1e-9)
 
 
-def test_a_level_is_merged_along_the_motion_of_the_one_before(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_level_is_merged_along_the_motion_of_the_previous_one(run: Callable, make_level: Callable, pan: Callable) -> None:
     merged_along: list[Any] = []
     level = make_level(pan(0.3))
     merge = level.merger.merge
@@ -57,8 +57,10 @@ def test_a_level_is_merged_along_the_motion_of_the_one_before(run: Callable, mak
     assert merged_along == [None] * 12 + [results[0].trajectory] * 23
 
 
-def test_it_tells_how_far_a_level_moved_the_frames(run: Callable, make_level: Callable, known_motion: type) -> None:
-    """From a pan to one that also sways by 2 px, four times; another plane of reference would explain next to nothing."""
+def test_change_is_the_mean_displacement_of_corners_between_levels(
+    run: Callable, make_level: Callable, known_motion: type
+) -> None:
+    """The second level adds a sway of 2 px with four periods, which no change of the reference plane explains."""
 
     def swaying(by_px: float) -> Any:
         return known_motion(lambda frame: translation(0.3 * frame, by_px * np.sin(2 * np.pi * frame / 30)))
@@ -69,23 +71,23 @@ def test_it_tells_how_far_a_level_moved_the_frames(run: Callable, make_level: Ca
     assert set(second.seconds) == {"resample", "merge", "locate", "interpolate"}
 
 
-def test_a_level_that_finds_the_same_changes_nothing(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_change_is_0_if_a_level_finds_the_same_motion(run: Callable, make_level: Callable, pan: Callable) -> None:
     _, second = run(make_level(pan(0.3)), make_level(pan(0.3), number=2), reference=100)
     assert second.change_px == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("wanted", "levels"), [(True, 2), (False, 4)])
-def test_it_stops_when_a_level_changes_less_than_is_known(
+def test_estimate_motion_stops_on_convergence_only_if_asked(
     source: Any, make_level: Callable, pan: Callable, wanted: bool, levels: int
 ) -> None:
-    """Measured without information, a corner is known to a pixel; the second level changes nothing."""
+    """Without information, the expected error is about a pixel; the second level changes nothing."""
     chosen = [make_level(pan(0.3), number=number) for number in (1, 2, 3, 4)]
     results = estimate_motion(source, chosen, GraphSettings(), 60, Context(2), until_converged=wanted)
     assert len(results) == levels
     assert [result.converged for result in results] == [False, *[True] * (levels - 1)]
 
 
-def test_it_notes_a_line_for_each_level(source: Any, make_level: Callable, pan: Callable) -> None:
+def test_estimate_motion_notes_a_line_for_each_level(source: Any, make_level: Callable, pan: Callable) -> None:
     class Notes(Quiet):
         def __init__(self) -> None:
             self.lines: list[str] = []
@@ -123,7 +125,7 @@ CALLS = [
 
 
 @pytest.mark.parametrize(("kind", "method"), CALLS)
-def test_a_component_that_fails_is_named(run: Callable, make_level: Callable, pan: Callable, kind: str, method: str) -> None:
+def test_component_that_raises_is_named(run: Callable, make_level: Callable, pan: Callable, kind: str, method: str) -> None:
     second = make_level(pan(0.3), number=2)
     setattr(component(second, kind), method, raising(ZeroDivisionError("by nothing")))
     with pytest.raises(PluginError) as caught:
@@ -134,7 +136,7 @@ def test_a_component_that_fails_is_named(run: Callable, make_level: Callable, pa
 
 @pytest.mark.parametrize(("kind", "method"), CALLS)
 @pytest.mark.parametrize("error", [InputError("said for users"), KeyboardInterrupt()], ids=repr)
-def test_what_is_meant_for_users_passes(
+def test_errors_written_for_users_pass_unchanged(
     run: Callable, make_level: Callable, pan: Callable, kind: str, method: str, error: BaseException
 ) -> None:
     level = make_level(pan(0.3))
@@ -152,7 +154,7 @@ def spans(*starts: int) -> Iterator[Group]:
 @pytest.mark.parametrize(
     ("groups", "instants"), [((), "[]"), (tuple(spans(0, 50, 20)), "[0, 50, 20]"), (tuple(spans(0, 0)), "[0, 0]")]
 )
-def test_groups_without_order_are_refused(
+def test_resample_refuses_groups_out_of_order(
     run: Callable, make_level: Callable, pan: Callable, groups: tuple[Group, ...], instants: str
 ) -> None:
     class Chaos:
@@ -167,7 +169,7 @@ def test_groups_without_order_are_refused(
     )
 
 
-def test_groups_beyond_the_capture_are_refused(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_resample_refuses_groups_beyond_the_capture(run: Callable, make_level: Callable, pan: Callable) -> None:
     class Greedy:
         def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
             return tuple(spans(0, n_frames - 5))
@@ -180,7 +182,7 @@ def test_groups_beyond_the_capture_are_refused(run: Callable, make_level: Callab
     )
 
 
-def test_one_group_is_one_located_instant(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_single_group_is_one_located_instant(run: Callable, make_level: Callable, pan: Callable) -> None:
     class Whole:
         def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
             return (Group(FrameSpan(0, n_frames), 59.5),)
@@ -188,3 +190,20 @@ def test_one_group_is_one_located_instant(run: Callable, make_level: Callable, p
     (result,) = run(make_level(pan(0.3), resampler=Whole()))
     assert (result.located.n_located, result.located.edges) == (1, ())
     np.testing.assert_array_equal(result.trajectory.at([0, 119]), [np.eye(3)] * 2)
+
+
+def test_referenced_trajectory_is_the_identity_at_the_reference(pan: Callable) -> None:
+    trajectory = ReferencedTrajectory(pan(0.5), 40)
+    np.testing.assert_allclose(trajectory.at([40, 50, 20.5]), [np.eye(3), translation(5, 0), translation(-9.75, 0)])
+
+
+def test_referenced_trajectory_keeps_pairwise_motions(known_motion: type) -> None:
+    """A camera that zooms while it pans: these maps do not commute."""
+    zoom, speed = np.array([1e-3, -2e-4, 3e-4, 1e-3, 0, 0, 1e-6, 2e-6]), np.array([0.3, -0.1])
+    free = known_motion(lambda frame: translation(*speed * frame) @ from_parameters(zoom * frame))
+    pairs = []
+    for reference in (0, 25, 100):
+        first, second = ReferencedTrajectory(free, reference).at([20, 70])
+        pairs.append(normalised(inverse(first) @ second))
+        np.testing.assert_allclose(ReferencedTrajectory(free, reference).at([reference]), [np.eye(3)], atol=1e-12)
+    np.testing.assert_allclose(pairs[1:], [pairs[0]] * 2, atol=1e-9)

@@ -1,4 +1,4 @@
-"""A level of twelve exposures, in each of which a known motion is located, or lost."""
+"""A level of twelve exposures with a known motion, of which some pairs may fail."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(source: Any) -> Callable[..., LocatedLevel]:
 
 @pytest.fixture
 def failing() -> Callable[..., Any]:
-    """Make an answer that loses every pair of these exposures."""
+    """Make an answer that fails for every pair of these exposures."""
 
     def failing(*lost: int) -> Callable[..., Any]:
         def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
@@ -55,7 +55,7 @@ def _truth(moving: Group, fixed: Group, found: Located) -> Located:
 
 
 class Second:
-    """A fallback that knows the motion, remembers what it was shown, and answers as it is told."""
+    """A fallback that knows the motion, records what it describes, and returns what `answer` makes of the motion."""
 
     def __init__(self, motion: Trajectory, answer: Callable[..., Any] = _truth) -> None:
         self._motion, self._answer = motion, answer

@@ -44,7 +44,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("answer", "problem"), BROKEN)
-def test_what_is_no_motion_is_refused_with_the_name_of_the_locator(
+def test_invalid_motion_is_refused_with_the_name_of_the_locator(
     run: Callable, make_level: Callable, pan: Callable, answer: Any, problem: str
 ) -> None:
     with pytest.raises(PluginError) as caught:
@@ -52,7 +52,7 @@ def test_what_is_no_motion_is_refused_with_the_name_of_the_locator(
     assert str(caught.value) == f"locator 'toy' of toys 1.0 broke its contract at level 1: {problem}"
 
 
-def test_a_motion_that_keeps_its_promise() -> None:
+def test_valid_motion_is_accepted() -> None:
     for motion in (
         Located(np.eye(3), np.eye(8)),
         Located(rescaled(translation(3, 1), 2)),
@@ -73,7 +73,7 @@ STILL = (
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.3])
-def test_a_level_in_which_nothing_moves_to_the_last_digit_is_refused(
+def test_level_is_refused_if_every_pair_is_exactly_the_identity(
     run: Callable, make_level: Callable, pan: Callable, scale: float
 ) -> None:
     with pytest.raises(PluginError) as caught:
@@ -81,7 +81,7 @@ def test_a_level_in_which_nothing_moves_to_the_last_digit_is_refused(
     assert str(caught.value) == f"locator 'toy' of toys 1.0 {STILL}"
 
 
-def test_both_locators_that_see_nothing_move_are_named(
+def test_all_locators_that_return_the_identity_are_named(
     run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
 ) -> None:
     with pytest.raises(PluginError) as caught:
@@ -90,17 +90,15 @@ def test_both_locators_that_see_nothing_move_are_named(
     assert str(caught.value) == f"{both} {STILL.replace('its', 'their')}"
 
 
-def test_a_camera_that_stands_still_is_believed(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_nearly_the_identity_is_accepted_for_a_still_camera(run: Callable, make_level: Callable, pan: Callable) -> None:
     def nearly(moving: Group, fixed: Group, found: Located) -> Located:
         return replace(found, homography=found.homography @ translation(1e-4, 0))
 
     assert run(make_level(pan(0.0), nearly)).n_located == 12
 
 
-def test_pairs_that_move_less_than_a_locator_tells_are_believed(
-    run: Callable, make_level: Callable, known_motion: type
-) -> None:
-    """Slow at first: pairs are the identity in whole pixels, and the motion known so far errs by 2 px."""
+def test_identity_is_accepted_for_small_motion_in_whole_pixels(run: Callable, make_level: Callable, known_motion: type) -> None:
+    """Slow at first: pairs are the identity in whole pixels, and the motion known so far is off by 2 px."""
     motion = known_motion(lambda frame: translation(0.001 * frame**2, 0))
     found = run(make_level(motion, in_whole_pixels), known_motion(lambda frame: translation(0.2 * frame, 0)))
     identities = [bool((edge.motion.homography == np.eye(3)).all()) for edge in found.edges]
@@ -108,7 +106,7 @@ def test_pairs_that_move_less_than_a_locator_tells_are_believed(
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_the_identity_is_refused_where_the_motion_is_known_to_be_far_from_it(
+def test_identity_is_refused_if_the_motion_known_so_far_is_large(
     run: Callable, make_level: Callable, pan: Callable, scale: float
 ) -> None:
     with pytest.raises(PluginError) as caught:

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_a_pair_that_is_lost_is_offered_to_the_fallback_and_no_other(
+def test_fallback_gets_pairs_that_the_locator_does_not_locate_and_no_others(
     run: Callable, make_level: Callable, pan: Callable, threads: int, failing: Callable, make_second: type
 ) -> None:
     motion = pan(0.3)
@@ -34,7 +34,7 @@ def test_a_pair_that_is_lost_is_offered_to_the_fallback_and_no_other(
     assert third.shown == []
 
 
-def test_a_motion_that_no_camera_makes_is_lost_as_well(
+def test_fallback_gets_pairs_with_an_implausible_motion(
     run: Callable, make_level: Callable, pan: Callable, make_second: type
 ) -> None:
     def mirror(moving: Group, fixed: Group, found: Located) -> Located:
@@ -46,7 +46,7 @@ def test_a_motion_that_no_camera_makes_is_lost_as_well(
     assert found.failures == ()
 
 
-def test_a_pair_that_all_lose_says_what_each_of_them_said(
+def test_failure_of_all_locators_joins_their_reasons(
     run: Callable, make_level: Callable, pan: Callable, make_second: type
 ) -> None:
     def lost(reason: str, **evidence: float) -> Callable[..., Any]:
@@ -64,7 +64,7 @@ def test_a_pair_that_all_lose_says_what_each_of_them_said(
     assert [(edge.moving, edge.fixed) for edge in found.failures] == [(4, 3), (4, 2), (4, 1), (5, 4)]
 
 
-def test_a_blank_exposure_is_not_shown_to_a_fallback_either(
+def test_fallback_does_not_describe_blank_exposures(
     run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
 ) -> None:
     second = make_second(pan(0.3))
@@ -81,7 +81,7 @@ def test_a_blank_exposure_is_not_shown_to_a_fallback_either(
     assert {edge.locator for edge in found.failures} == {""}
 
 
-def test_a_fallback_keeps_features_no_longer_than_the_locator(
+def test_fallback_features_are_released_as_early_as_the_locators(
     run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
 ) -> None:
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
@@ -106,7 +106,7 @@ def test_a_fallback_keeps_features_no_longer_than_the_locator(
 
 
 @pytest.mark.parametrize("method", ["describe", "register"])
-def test_a_fallback_that_fails_is_named(
+def test_fallback_that_raises_is_named(
     run: Callable, make_level: Callable, pan: Callable, method: str, failing: Callable, make_second: type
 ) -> None:
     def fail(*_: Any) -> Any:
@@ -119,7 +119,7 @@ def test_a_fallback_that_fails_is_named(
     assert str(caught.value) == "locator 'second' of toys 1.0 failed at level 1: ZeroDivisionError: oops"
 
 
-def test_a_fallback_that_breaks_its_contract_is_named(
+def test_fallback_that_breaks_its_contract_is_named(
     run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
 ) -> None:
     second = make_second(pan(0.3), lambda *_: None)

@@ -20,7 +20,7 @@ SHAPE = (40, 60)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 2.0])
-def test_homographies_are_in_pixels_of_frames_whatever_the_scale(
+def test_homographies_are_in_pixels_of_frames_at_any_scale(
     run: Callable, make_level: Callable, known_motion: type, scale: float
 ) -> None:
     motion = known_motion(lambda frame: from_parameters(np.array([1e-4, 2e-4, -2e-4, 0, 0.3, 0.1, 1e-6, 0]) * frame))
@@ -32,7 +32,7 @@ def test_homographies_are_in_pixels_of_frames_whatever_the_scale(
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_the_locator_starts_from_the_motion_known_in_pixels_of_exposures(
+def test_locator_starts_from_the_motion_known_so_far_in_pixels_of_exposures(
     run: Callable, make_level: Callable, pan: Callable, scale: float
 ) -> None:
     level = make_level(pan(0.3), scale=scale)
@@ -43,7 +43,7 @@ def test_the_locator_starts_from_the_motion_known_in_pixels_of_exposures(
     np.testing.assert_allclose(level.locators[0].component.initials, [translation(2.5 * scale, 0)] * 11, atol=1e-12)
 
 
-def test_pairs_come_in_order_with_any_number_of_threads(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_pairs_are_in_order_with_any_number_of_threads(run: Callable, make_level: Callable, pan: Callable) -> None:
     results = [run(make_level(pan(0.3)), graph=GraphSettings(), threads=threads) for threads in (1, 2, 3)]
     pairs = [[(edge.moving, edge.fixed) for edge in found.edges] for found in results]
     assert pairs[0] == sorted(pairs[0])
@@ -52,7 +52,9 @@ def test_pairs_come_in_order_with_any_number_of_threads(run: Callable, make_leve
         np.testing.assert_array_equal(found.homographies, results[0].homographies)
 
 
-def test_every_exposure_is_described_once_and_soon_forgotten(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_exposures_are_described_once_and_released_after_their_last_pair(
+    run: Callable, make_level: Callable, pan: Callable
+) -> None:
     class Features:
         def __init__(self, group: Group) -> None:
             self.group = group
@@ -81,7 +83,7 @@ def test_every_exposure_is_described_once_and_soon_forgotten(run: Callable, make
     assert most < len(found.groups)
 
 
-def test_a_lost_exposure_is_bridged(run: Callable, make_level: Callable, pan: Callable, failing: Callable) -> None:
+def test_lost_exposure_is_bridged(run: Callable, make_level: Callable, pan: Callable, failing: Callable) -> None:
     found = run(make_level(pan(0.3), failing(4)))
     tried = [(edge.moving, edge.fixed) for edge in found.edges if edge.moving in (4, 5)]
     assert tried == [(4, 3), (4, 2), (4, 1), (5, 4), (5, 3)]
@@ -100,14 +102,14 @@ def test_two_lost_exposures_are_bridged_and_three_are_not(
     np.testing.assert_array_equal(np.flatnonzero(found.solution.located), [7, 8, 9, 10, 11])
 
 
-def test_what_is_covered_reaches_from_the_first_to_the_last_frame_of_located_exposures(
+def test_covered_frames_reach_from_the_first_to_the_last_located_exposure(
     run: Callable, make_level: Callable, pan: Callable, failing: Callable
 ) -> None:
     assert run(make_level(pan(0.3), failing(5))).covered == FrameSpan(0, 120)
     assert run(make_level(pan(0.3), failing(0, 1, 11))).covered == FrameSpan(20, 110)
 
 
-def test_nothing_is_known_of_a_single_exposure(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_single_exposure_has_no_information(run: Callable, make_level: Callable, pan: Callable) -> None:
     class Whole:
         def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
             return (Group(FrameSpan(0, n_frames), 60.0),)
@@ -117,17 +119,17 @@ def test_nothing_is_known_of_a_single_exposure(run: Callable, make_level: Callab
     np.testing.assert_array_equal(found.homographies, [np.eye(3)])
 
 
-def test_what_is_known_of_each_exposure_is_passed_on(run: Callable, make_level: Callable, pan: Callable) -> None:
-    """Each is held by the one before and the one after; the camera hardly moves, so that both say the same of it."""
+def test_information_of_each_exposure_sums_that_of_its_pairs(run: Callable, make_level: Callable, pan: Callable) -> None:
+    """Each has pairs with the one before and the one after; the camera hardly moves, so that their information adds up."""
 
-    def told(moving: Group, fixed: Group, found: Located) -> Located:
+    def informed(moving: Group, fixed: Group, found: Located) -> Located:
         return replace(found, information=np.diag([1e3, 1e3, 1e3, 1e3, 4, 4, 1e7, 1e7]))
 
-    found = run(make_level(pan(1e-9), told))
+    found = run(make_level(pan(1e-9), informed))
     np.testing.assert_allclose(found.information[[0, 5, 11], 4, 4], [4, 8, 4], rtol=1e-6)
 
 
-def test_a_pair_that_no_camera_makes_is_refused(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_implausible_motion_is_refused(run: Callable, make_level: Callable, pan: Callable) -> None:
     def mirror(moving: Group, fixed: Group, found: Located) -> Located:
         mirrored = translation(59, 0) @ np.diag([-1.0, 1.0, 1.0])
         return Located(mirrored, evidence={"inliers": 30}) if 40 in (moving.span.start, fixed.span.start) else found
@@ -138,7 +140,7 @@ def test_a_pair_that_no_camera_makes_is_refused(run: Callable, make_level: Calla
     }
 
 
-def test_a_blank_exposure_is_not_shown_to_the_locator(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_locator_does_not_describe_blank_exposures(run: Callable, make_level: Callable, pan: Callable) -> None:
     level = make_level(pan(0.3))
     merge = level.merger.merge
     shown: list[int] = []
@@ -162,14 +164,14 @@ def test_a_blank_exposure_is_not_shown_to_the_locator(run: Callable, make_level:
 def test_information_and_residual_are_converted_to_pixels_of_frames(
     run: Callable, make_level: Callable, pan: Callable, scale: float
 ) -> None:
-    """A locator whose corners err by 0.2 px of an exposure has corners that err by 0.2 / scale px of a frame."""
+    """An error of 0.2 px of an exposure is an error of 0.2 / scale px of a frame."""
 
-    def told(moving: Group, fixed: Group, found: Located) -> Located:
+    def informed(moving: Group, fixed: Group, found: Located) -> Located:
         shape = tuple(round(side * scale) for side in SHAPE)
         to_corners = jacobian(found.homography, corners(shape)).reshape(8, 8)
         return replace(found, information=to_corners.T @ to_corners / 0.2**2, residual_px=0.2)
 
-    (first, *_) = run(make_level(pan(0.3), told, scale=scale)).edges
+    (first, *_) = run(make_level(pan(0.3), informed, scale=scale)).edges
     to_corners = jacobian(first.motion.homography, corners(SHAPE)).reshape(8, 8)
     covariance = to_corners @ np.linalg.inv(first.motion.information) @ to_corners.T
     # The corner pixels of a rescaled image are not quite those of the image.
@@ -177,11 +179,11 @@ def test_information_and_residual_are_converted_to_pixels_of_frames(
     assert first.motion.residual_px == pytest.approx(0.2 / scale)
 
 
-def test_photons_that_two_exposures_share_do_not_count_twice(run: Callable, make_level: Callable, pan: Callable) -> None:
-    def told(moving: Group, fixed: Group, found: Located) -> Located:
+def test_information_discounts_shared_photons(run: Callable, make_level: Callable, pan: Callable) -> None:
+    def informed(moving: Group, fixed: Group, found: Located) -> Located:
         return replace(found, information=np.eye(8))
 
-    found = run(make_level(pan(0.3), told, number=2), pan(0.3), GraphSettings(skips=(0.5, 1.0)))
+    found = run(make_level(pan(0.3), informed, number=2), pan(0.3), GraphSettings(skips=(0.5, 1.0)))
     share = {edge.moving - edge.fixed: edge.motion.information[0, 0] for edge in found.edges}
-    # Half of the photons of each group are in the one before, too: half of all that pairs say is said twice.
+    # Half of the photons of each group are in the one before, too, so that pairs repeat half of their information.
     assert share == {1: 0.25, 2: 0.5}

@@ -1,4 +1,4 @@
-"""Places seen again: which pairs close loops, and what becomes of those that show another place."""
+"""Loop closures of a level: which pairs are registered, accepted, refused or dropped."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DRIFT_PX = 0.05
 
 
 class Scenery:
-    """Merges what a camera on a known path sees of a plane that repeats itself every 20 px; remembers what it merged."""
+    """Merges the view of a camera on a known path over a plane of period 20 px; records what it merged."""
 
     def __init__(self, motion: Trajectory) -> None:
         self._motion = motion
@@ -93,7 +93,7 @@ def is_closure(moving: Group, fixed: Group) -> bool:
 
 
 def drifting(moving: Group, fixed: Group, found: Located) -> Located:
-    """Neighbours err by 0.05 px of an exposure for each group length, all in one direction; views of one place do not."""
+    """Motions of neighbours are off by 0.05 px of an exposure for each group length, in one direction; closures are exact."""
     off_px = 0.0 if is_closure(moving, fixed) else DRIFT_PX * (moving.reference - fixed.reference) / 10
     return replace(found, homography=translation(0, off_px) @ found.homography, evidence={"inliers": 30})
 
@@ -106,7 +106,7 @@ def at_closures(change: Callable[[Located], Located | NotLocated]) -> Callable[.
 
 
 def drift_px(found: LocatedLevel) -> float:
-    """How far the first and the last exposure lie apart, which saw the same place."""
+    """Distance between the first and the last exposure, which show the same place."""
     return abs(float(found.homographies[-1, 1, 2] - found.homographies[0, 1, 2]))
 
 
@@ -114,7 +114,7 @@ def closures_of(found: LocatedLevel) -> list[tuple[int, int]]:
     return [(edge.moving, edge.fixed) for edge in found.closures]
 
 
-def test_places_seen_again_stop_the_drift(run: Callable, level: Callable) -> None:
+def test_loop_closures_stop_the_drift(run: Callable, level: Callable) -> None:
     with_them, without = run(level()), run(level(), closure_overlap=None)
     assert closures_of(with_them) == PAIRS
     assert closures_of(without) == []
@@ -123,7 +123,7 @@ def test_places_seen_again_stop_the_drift(run: Callable, level: Callable) -> Non
     assert drift_px(with_them) < 0.1 * drift_px(without)
 
 
-def test_what_was_accepted_tells_how_alike_the_two_are(run: Callable, level: Callable) -> None:
+def test_accepted_closure_records_its_similarity(run: Callable, level: Callable) -> None:
     for edge in run(level()).closures:
         assert edge.locator == "toy"
         assert edge.motion.evidence["inliers"] == 30
@@ -131,18 +131,18 @@ def test_what_was_accepted_tells_how_alike_the_two_are(run: Callable, level: Cal
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_the_search_starts_where_the_other_pairs_put_them(run: Callable, level: Callable, scale: float) -> None:
+def test_closure_starts_from_the_solution_of_the_other_pairs(run: Callable, level: Callable, scale: float) -> None:
     toy = level(scale=scale)
     run(toy)
     initials = toy.locators[0].component.initials
     assert all(initial is None for initial in initials[: -len(PAIRS)])
-    # Both of a pair lie at one place, but since then neighbours have drifted, by 0.05 px of an exposure each.
+    # Both exposures of a pair show one place; the drift of neighbours between them is 0.05 px of an exposure each.
     expected = [translation(0, DRIFT_PX * (moving - fixed)) for moving, fixed in PAIRS]
     np.testing.assert_allclose(initials[-len(PAIRS) :], expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_pairs_that_show_another_place_are_refused(run: Callable, level: Callable, scale: float) -> None:
+def test_closure_of_different_places_is_refused(run: Callable, level: Callable, scale: float) -> None:
     wrong = at_closures(lambda found: replace(found, homography=translation(7, 9) @ found.homography, evidence={"inliers": 12}))
     found = run(level(wrong, scale=scale))
     assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS == closures_of(found)
@@ -155,7 +155,7 @@ def test_pairs_that_show_another_place_are_refused(run: Callable, level: Callabl
     np.testing.assert_array_equal(found.homographies, run(level(wrong, scale=scale), closure_overlap=None).homographies)
 
 
-def test_some_that_are_right_stop_the_drift_though_others_are_refused(run: Callable, level: Callable) -> None:
+def test_right_closures_stop_the_drift_although_others_are_refused(run: Callable, level: Callable) -> None:
     def answer(moving: Group, fixed: Group, found: Located) -> Located:
         wrong = is_closure(moving, fixed) and moving.span.start // 10 % 2
         return (
@@ -168,14 +168,14 @@ def test_some_that_are_right_stop_the_drift_though_others_are_refused(run: Calla
     assert drift_px(found) < 0.15
 
 
-def test_what_no_locator_finds_keeps_its_reason(run: Callable, level: Callable) -> None:
+def test_closure_that_no_locator_locates_keeps_its_reason(run: Callable, level: Callable) -> None:
     found = run(level(at_closures(lambda _: NotLocated("3 matches", {"matches": 3}))))
     assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS
     assert {edge.motion.reason for edge in found.failures} == {"3 matches"}
     assert found.n_located == N
 
 
-def test_a_fallback_is_asked_and_checked_as_well(
+def test_closure_located_by_a_fallback_is_checked(
     run: Callable, level: Callable, make_level: Callable, known_motion: type
 ) -> None:
     def lost(_: Located) -> NotLocated:
@@ -190,8 +190,8 @@ def test_a_fallback_is_asked_and_checked_as_well(
     assert (len(PAIRS) - 2) <= len(found.failures) <= len(PAIRS)
 
 
-def test_a_contradiction_that_looks_right_is_outvoted_and_found_among_all_pairs(run: Callable, level: Callable) -> None:
-    """The plane repeats itself: off by its period, two exposures look as much alike."""
+def test_similar_but_wrong_closure_is_dropped_as_outlier(run: Callable, level: Callable) -> None:
+    """A shift by the period of the plane leaves the similarity as it is."""
 
     def answer(moving: Group, fixed: Group, found: Located) -> Located:
         motion = drifting(moving, fixed, found)
@@ -208,7 +208,7 @@ def test_a_contradiction_that_looks_right_is_outvoted_and_found_among_all_pairs(
 
 
 @pytest.mark.parametrize("threads", [2, 4])
-def test_any_number_of_threads_finds_the_same(run: Callable, level: Callable, threads: int) -> None:
+def test_closures_do_not_depend_on_the_number_of_threads(run: Callable, level: Callable, threads: int) -> None:
     alone, several = run(level(), threads=1), run(level(), threads=threads)
     np.testing.assert_array_equal(several.homographies, alone.homographies)
     np.testing.assert_array_equal(several.std_px, alone.std_px)
@@ -218,15 +218,15 @@ def test_any_number_of_threads_finds_the_same(run: Callable, level: Callable, th
     assert [each.motion.evidence for each in several.edges] == [each.motion.evidence for each in alone.edges]
 
 
-def test_only_exposures_of_places_seen_again_are_merged_again(run: Callable, level: Callable) -> None:
+def test_only_exposures_of_closures_are_merged_again(run: Callable, level: Callable) -> None:
     toy = level()
     run(toy, threads=1)
     assert toy.merger.merged[:N] == list(range(N))
     assert toy.merger.merged[N:] == [index for pair in PAIRS for index in pair]
 
 
-def test_an_exposure_that_several_pairs_need_is_merged_again_once(run: Callable, level: Callable, known_motion: type) -> None:
-    """Three sweeps over six places: the last one meets both others."""
+def test_exposure_of_several_closures_is_merged_again_once(run: Callable, level: Callable, known_motion: type) -> None:
+    """Three sweeps over six places: the last has closures with both others."""
     sweeps = known_motion(lambda frame: translation(20 + 0.9 * abs((frame + 80) % 160 - 80), 20))
     toy = level(merger=Scenery(sweeps), locator=level().locators[0].component.__class__(sweeps, drifting))
     found = run(toy, threads=1)
@@ -235,7 +235,7 @@ def test_an_exposure_that_several_pairs_need_is_merged_again_once(run: Callable,
     assert sorted(toy.merger.merged[N:]) == sorted(needed)
 
 
-def test_all_are_forgotten_when_their_last_pair_is_done(run: Callable, level: Callable) -> None:
+def test_exposures_of_closures_are_released_after_their_last_pair(run: Callable, level: Callable) -> None:
     toy = level()
     locator, most = toy.locators[0].component, 0
     register = locator.register
