@@ -32,19 +32,17 @@ _SAMPLE_BYTES = 64 * 1024
 class PackedNpyConfig(Config):
     """A capture in one .npy file: uint8 (frames, height, ceil(width / 8)), as `numpy.packbits(cube, axis=-1)` makes it."""
 
-    path: SpecPath = Field(
-        description="the .npy file, or that file compressed with gzip: it is unpacked once, to a file beside it"
-    )
+    path: SpecPath = Field(description="the .npy file; a file compressed with gzip is unpacked once, to a file beside it")
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
     width: int | None = Field(
-        None, ge=1, description="columns of a frame, in px; needed only where it is not eight times the bytes of a row"
+        None, ge=1, description="columns of a frame, in px; needed only if the width is not a multiple of eight"
     )
     channel: int | None = Field(
         None,
         ge=0,
         le=2,
-        description="which of the three channels of a colour capture (frames, height, ceil(width / 8), 3) is used: 0, 1 or 2; "
-        "leave it out for others",
+        description="channel of a colour capture (frames, height, ceil(width / 8), 3): 0, 1 or 2; leave it out for "
+        "other captures",
     )
 
 
@@ -129,7 +127,7 @@ def _recognise(path: Path) -> Recognised | None:
 
 PACKED_NPY = SourceContribution(
     name="packed-npy",
-    summary="Binary frames in a .npy file, eight pixels to a byte as numpy.packbits makes them",
+    summary="Binary frames in a .npy file, eight pixels to a byte, as from numpy.packbits",
     config=PackedNpyConfig,
     build=lambda config, _: _open(config),
     check=_check,

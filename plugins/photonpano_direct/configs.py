@@ -10,12 +10,14 @@ from photonpano.locating import ImageLimits, PyramidConfig
 class DirectConfig(PyramidConfig, ImageLimits):
     """Inverse-compositional alignment, coarse to fine."""
 
-    blur_px: float = Field(0.8, gt=0, le=16, description="standard deviation of the Gaussian that quiets photon noise, in px")
-    max_iterations: int = Field(30, ge=1, le=1000, description="steps at each level of the pyramid")
-    converged_px: float = Field(0.01, gt=0, le=1, description="the alignment is done when a step moves no corner further")
+    blur_px: float = Field(0.8, gt=0, le=16, description="standard deviation of the Gaussian blur against photon noise, in px")
+    max_iterations: int = Field(30, ge=1, le=1000, description="largest number of steps at each level of the pyramid")
+    converged_px: float = Field(
+        0.01, gt=0, le=1, description="the alignment has converged when a step moves all corners by less, in px"
+    )
     max_noise_ratio: float = Field(
         100.0,
         gt=1,
-        description="a pair that differs by more than this many times its photon noise is not located, "
-        "unless there is so much light that blur explains it",
+        description="largest difference of the aligned images, in multiples of photon noise; a pair above it is not "
+        "located, unless blur in bright light explains it",
     )

@@ -14,7 +14,7 @@ from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_i
 class BinConfig(Config):
     """A capture in .bin files."""
 
-    path: SpecPath = Field(description="a .bin file, or a folder of them: nested ones too, in natural order (0, 2, 10)")
+    path: SpecPath = Field(description="a .bin file, or a folder of them, nested or not, in natural order (0, 2, 10)")
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
 
 

@@ -28,7 +28,7 @@ class MatPartsConfig(Config):
 
     path: SpecPath = Field(
         description=f"the folder of part_1.mat, part_2.mat and so on, each with frames of zeros and ones as OUTPUT (height, "
-        f"width, frames); an {_INFO} in it, with no_parts and no_frames, must agree with them"
+        f"width, frames); an optional {_INFO} with no_parts and no_frames must agree with them"
     )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
 

@@ -27,7 +27,7 @@ class Spad512SparseConfig(Config):
     """A sparse capture of the SPAD512, 512 x 512 px. It is read once when it is opened, to find its frames."""
 
     path: SpecPath = Field(
-        description="a file of addresses of lit pixels, or a folder of .bin files with them: nested ones too, in natural order"
+        description="a file with addresses of lit pixels, or a folder of such .bin files, nested or not, in natural order"
     )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
 

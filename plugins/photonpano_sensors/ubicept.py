@@ -25,10 +25,10 @@ class UbiceptConfig(Config):
 
     path: SpecPath = Field(description="the .ubi.h5 file")
     binary_frames: int | None = Field(
-        None, ge=1, le=65535, description="binary frames that each frame is the sum of; by default what the file says"
+        None, ge=1, le=65535, description="number of binary frames in each sum; by default from the file"
     )
     frame_rate_hz: float | None = Field(
-        None, gt=0, description="frames (sums) a second, in Hz; by default what the file says, if it does"
+        None, gt=0, description="frames (sums) a second, in Hz; by default from the file, if known"
     )
 
 

@@ -23,11 +23,9 @@ class VisionsimConfig(Config):
     """A capture that visionsim has simulated."""
 
     path: SpecPath = Field(description=f"the {_TRANSFORMS} beside the .npy file, or their folder")
-    channel: int | None = Field(
-        None, ge=0, le=2, description="which of the three channels of a capture in colour is used: 0, 1 or 2"
-    )
+    channel: int | None = Field(None, ge=0, le=2, description="channel of a colour capture: 0, 1 or 2")
     frame_rate_hz: float | None = Field(
-        None, gt=0, description=f"frames a second, in Hz; by default what {_TRANSFORMS} says as fps, if it does"
+        None, gt=0, description=f"frames a second, in Hz; by default `fps` of {_TRANSFORMS}, if it is there"
     )
 
 
@@ -183,7 +181,7 @@ def _recognise(path: Path) -> Recognised | None:
 
 VISIONSIM = SourceContribution(
     name="visionsim",
-    summary="Binary frames that visionsim has simulated: a .npy file and its transforms.json",
+    summary="Binary frames simulated by visionsim: a .npy file and its transforms.json",
     config=VisionsimConfig,
     build=lambda config, _: _open(config),
     check=_check,

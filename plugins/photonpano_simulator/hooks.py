@@ -50,14 +50,14 @@ def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer the simulators."""
     yield SourceContribution(
         name="simulator",
-        summary="A simulated single-photon camera that turns before a photograph or a street that is built in",
+        summary="A simulated single-photon camera that rotates in front of a photograph or the built-in street",
         config=SimulatorConfig,
         build=_build,
         check=_check,
     )
     yield SourceContribution(
         name="camera-simulator",
-        summary="A simulated conventional camera, with photon noise and read noise, before the same scenes",
+        summary="A simulated conventional camera with photon noise and read noise, in front of the same scenes",
         config=CameraSimulatorConfig,
         build=_build,
         check=_check,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from photonpano.protocols import Source
     from photonpano.values import FluxImage
 
-DARK_FILE = "what `photonpano dark` wrote, or a .npy file of rates, of the size that frames have at this place of the list"
+DARK_FILE = "a file from `photonpano dark`, or a .npy file of rates, of the size of the frames at this place of the list"
 _AT_ONCE = 1024
 """Frames that are summed between two reports of progress."""
 
@@ -41,7 +41,7 @@ class DarkFrames:
 
 
 class DarkCounts(Correction):
-    """Takes dark counts out of the flux, pixel by pixel."""
+    """Subtracts dark counts from the flux, pixel by pixel."""
 
     name: ClassVar[str] = "dark-counts"
     dark: SpecPath = Field(description=f"dark counts per frame: {DARK_FILE}")
@@ -49,8 +49,8 @@ class DarkCounts(Correction):
         0.1,
         gt=0,
         le=3,
-        description="pixels of binary frames with more dark counts per frame than this are masked: where they exceed the "
-        "photons of the scene, a pixel adds more noise than light",
+        description="dark counts per frame above which a pixel of binary frames is masked, because it adds more noise "
+        "than light",
     )
 
     @property

@@ -38,7 +38,8 @@ class Crop(Rearrangement):
 
     name: ClassVar[str] = "crop"
     rows: tuple[int | None, int | None] = Field(
-        (None, None), description="the first row, and the one after the last; negative ones count from the end, null is the end"
+        (None, None),
+        description="the first row, and the one after the last; negative numbers count from the end, null is the end",
     )
     columns: tuple[int | None, int | None] = Field((None, None), description="the same for columns")
 
@@ -48,11 +49,11 @@ class Crop(Rearrangement):
 
 
 class SwapColumns(Rearrangement):
-    """Puts some columns where others are, and those in their place."""
+    """Swaps two blocks of columns."""
 
     name: ClassVar[str] = "swap-columns"
     first: tuple[int, int] = Field(description="the first column, and the one after the last, from 0")
-    second: tuple[int, int] = Field(description="the same of those that they are swapped with: as many, and others")
+    second: tuple[int, int] = Field(description="the columns to swap them with: the same number, without overlap")
 
     @field_validator("first", "second")
     @classmethod
@@ -90,7 +91,7 @@ class MissingRow(Rearrangement):
     before: int | None = Field(
         None,
         ge=0,
-        description="the row before which it is inserted, from 0; by default it lies between the halves of the frame",
+        description="the row before which it is inserted, from 0; by default between the halves of the frame",
     )
 
     def moved(self, pixels: Index) -> Index:
@@ -193,7 +194,7 @@ class GreySwissSpad2Half(Preset):
 
 
 class GreySwissSpad2Full(Preset):
-    """The full array of the grey SwissSPAD2: from 512x512 to 509x496 px, with the row that its halves lack between them."""
+    """The full array of the grey SwissSPAD2: from 512x512 to 509x496 px, with a row for the gap between its halves."""
 
     name: ClassVar[str] = "grey-swissspad2-full"
     shape: ClassVar[tuple[int, int]] = (512, 512)

@@ -32,16 +32,19 @@ _TO_STD = 1.4826
 
 
 class HotPixels(Correction):
-    """Finds the pixels that are lit too often, and masks them; the motion fills them."""
+    """Finds hot pixels and masks them; the motion fills them."""
 
     name: ClassVar[str] = "hot-pixels"
     dark: SpecPath | None = Field(
         None,
-        description=f"dark counts per frame: {DARK_FILE}; by default the capture itself tells which pixels stand out from "
-        "their neighbours, dark ones as well; the camera has to move for that",
+        description=f"dark counts per frame: {DARK_FILE}; by default, pixels of the capture that are much brighter or darker "
+        "than their neighbours are masked, for which the camera has to move",
     )
     threshold: float = Field(
-        THRESHOLD, gt=0, le=1000, description="how far a pixel stands out, in standard deviations of the others, told robustly"
+        THRESHOLD,
+        gt=0,
+        le=1000,
+        description="smallest deviation of a hot pixel, in robust standard deviations of the other pixels",
     )
 
     def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:

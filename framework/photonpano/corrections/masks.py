@@ -38,8 +38,8 @@ class Mask(Correction):
 
     name: ClassVar[str] = "mask"
     file: SpecPath = Field(
-        description="a bool .npy file, true for pixels that must not be used, or a .png picture in which they are not black; "
-        "of the size that frames have at this place of the list"
+        description="a bool .npy file, true for bad pixels, or a .png picture in which bad pixels are not black; of "
+        "the size of the frames at this place of the list"
     )
 
     def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
@@ -51,18 +51,19 @@ class Mask(Correction):
 
 
 class ColourFilter(Correction):
-    """Keeps the pixels behind some colours of a colour filter array, so that no chequerboard shows."""
+    """Keeps the pixels of some colours of a colour filter array, so that the pattern does not show."""
 
     name: ClassVar[str] = "colour-filter"
     pattern: SpecPath = Field(
-        description="the filter array: a .png picture, or a .npy file (height, width, 3) of uint8 in the order red, green, "
-        "blue, of the size that frames have at this place of the list; white is clear, others are pure red, green and blue"
+        description="the filter array, of the size of the frames at this place of the list: a .png picture, or a .npy "
+        "file (height, width, 3) of uint8 in the order red, green, blue; clear pixels are white, the "
+        "others pure red, green or blue"
     )
     keep: tuple[Colour, ...] = Field(("clear",), description="the colours whose pixels are used")
     others: Literal["mask", "interpolate"] = Field(
         "mask",
-        description="what becomes of the other pixels: mask leaves them to the motion to fill, interpolate takes the mean of "
-        "the kept ones that touch them",
+        description="the other pixels: mask masks them, and the motion fills them; interpolate takes the mean of the "
+        "kept pixels that touch them",
     )
 
     @property

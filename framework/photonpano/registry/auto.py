@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 class AutoConfig(Config):
     """A capture of any kind."""
 
-    path: SpecPath = Field(
-        description="the file or folder; what else is written here is handed to the source that recognises it"
-    )
+    path: SpecPath = Field(description="the file or folder; other keys are passed to the source that recognises it")
 
 
 def _build(config: AutoConfig, context: SourceContext) -> Source:

@@ -20,7 +20,7 @@ class ChainConfig(Config):
     backends: tuple[str | dict[str, Any], ...] = Field(
         ("direct", "opencv-sift"),
         min_length=1,
-        description="the locators, in the order in which they are tried: each a name, or a mapping of use and with",
+        description="the locators, in the order in which they are tried: each is a name, or a mapping of use and with",
     )
 
 
@@ -31,7 +31,7 @@ def _build(config: ChainConfig, context: StageContext) -> Locator:
 
 CHAIN = LocatorContribution(
     name="chain-of-backends",
-    summary="Several locators in order, each for the pairs that those before it have lost",
+    summary="Several locators in order, each for the pairs that those before it lost",
     config=ChainConfig,
     build=_build,
 )

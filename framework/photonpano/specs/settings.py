@@ -14,8 +14,8 @@ class LevelSettings(Config):
 
     scale: Literal["auto"] | Annotated[float, Field(ge=0.05, le=4)] = Field(
         "auto",
-        description="pixels of the level's exposures per pixel of a frame; auto takes 0.5 at the first two levels, which later "
-        "ones refine, and 1 at the last, at any further one, and where frames are small",
+        description="pixels of the level's exposures per pixel of a frame; auto takes 0.5 at the first two levels if "
+        "a later one refines them and frames are not small, otherwise 1",
     )
 
 
@@ -24,18 +24,18 @@ class GraphSettings(Config):
 
     skips: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         (1.0, 2.0, 4.0),
-        description="each exposure is registered with those so many group lengths away; an empty list leaves a chain of "
-        "neighbours",
+        description="distances, in group lengths, of the exposures that are registered with each other; an empty list "
+        "registers neighbours only",
     )
     closure_overlap: Annotated[float, Field(gt=0, lt=1)] | None = Field(
         0.5,
-        description="exposures that see one place at different times are registered too if they share so much of the field "
-        "of view; null registers none",
+        description="loop closures: exposures of different times are registered if they share at least this fraction "
+        "of the field of view; null disables them",
     )
     disconnected: Literal["error", "largest"] = Field(
         "error",
-        description="when some exposures cannot be tied to the others: stop with an error that names them, "
-        "or go on with the largest part",
+        description="if some exposures are not connected to the others: stop with an error that names them, or "
+        "continue with the largest connected part",
     )
 
 
@@ -44,16 +44,16 @@ class RenderSettings(Config):
 
     scale: float = Field(1.0, ge=0.05, le=16, description="pixels of the panorama per pixel of the reference frame")
     reference: Literal["first", "middle", "last"] | Annotated[int, Field(ge=0)] = Field(
-        "middle", description="the frame whose plane the panorama lies in: first, middle, last, or a frame index"
+        "middle", description="the frame in whose plane the panorama lies: first, middle, last, or a frame index"
     )
     tolerance_px: float = Field(
         0.125,
         gt=0,
         le=8,
-        description="frames are summed before they are warped while they move less than this, in px; 0.25 costs 0.07 dB of a "
-        "sharp scene in good light, and half the time",
+        description="motion, in px of a frame, within which frames are summed before they are warped; 0.25 takes half "
+        "the time of 0.125, and costs 0.07 dB for a sharp scene in good light",
     )
-    white_quantile: float = Field(0.995, gt=0, le=1, description="the quantile of flux that becomes white in panorama.png")
+    white_quantile: float = Field(0.995, gt=0, le=1, description="quantile of the flux that is white in panorama.png")
 
 
 class OutputSettings(Config):
@@ -65,13 +65,13 @@ class OutputSettings(Config):
 class RunSettings(Config):
     """How the run uses the machine."""
 
-    seed: int = Field(0, ge=0, description="all randomness of the run derives from it")
+    seed: int = Field(0, ge=0, description="seed of all randomness in the run")
     threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = Field(
-        "auto", description="threads to use; auto takes one for each core"
+        "auto", description="number of threads; auto takes one per core"
     )
     memory: ByteSize = Field(
         ByteSize(2 * 1024**3),
         ge=64 * 1024**2,
-        description="a panorama that would take more memory than this is rendered in parts; one that is more than 16 times as "
-        "large is refused",
+        description="memory for rendering the panorama; a larger panorama is rendered in parts, and one of more than "
+        "16 times this size is an error",
     )

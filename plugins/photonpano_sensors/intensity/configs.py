@@ -16,34 +16,33 @@ class ResponseConfig(Config):
 
     curve: Literal["linear", "srgb"] | Gamma = Field(
         "linear",
-        description="the curve that the levels were encoded with, which is undone before frames are summed: linear for raw "
-        "levels, srgb, or the exponent that makes them linear, such as 2.2",
+        description="encoding of the grey levels, which is undone before frames are summed: linear for raw levels, "
+        "srgb, or the exponent that makes them linear, such as 2.2",
     )
     curve_file: SpecPath | None = Field(
         None,
-        description="a measured curve in place of it: a text file with a number for each level from 0 on, proportional to the "
-        "light",
+        description="measured curve, instead of `curve`: a text file with a number for each level from 0 on, "
+        "proportional to the light",
     )
     black_level: float | None = Field(
-        None, ge=0, description="the level of no light; by default 0, and 16 (of 8 bits) in a video of limited range"
+        None, ge=0, description="level without light; by default 0, and 16 (of 8 bits) in a video of limited range"
     )
     white_level: float | None = Field(
         None,
         gt=0,
-        description="the level above which nothing is told; by default the highest there is, and 235 (of 8 bits) in a video of "
-        "limited range",
+        description="level at which a pixel saturates; by default the highest, and 235 (of 8 bits) in a video of limited range",
     )
     saturation_photons: float = Field(
         10_000.0,
         gt=0,
         le=1e9,
-        description="detected photons per pixel per frame at white_level: the unit of the flux, and how strong photon noise is",
+        description="detected photons per pixel per frame at white_level; scales the flux, and determines the photon noise",
     )
     read_noise: float = Field(
         20.0,
         ge=0,
         le=1e6,
-        description="standard deviation of what reading a pixel adds, in photons; quantisation is added to it",
+        description="standard deviation of the read noise, in photons, without quantisation noise",
     )
 
     @model_validator(mode="after")
@@ -58,9 +57,9 @@ class IntensityConfig(Config):
 
     path: SpecPath = Field(description="the capture")
     frame_rate_hz: float | None = Field(
-        None, gt=0, description="frames a second while recording, in Hz; by default what the file says, if it does"
+        None, gt=0, description="frames a second while recording, in Hz; by default from the file, if known"
     )
-    response: ResponseConfig = Field(ResponseConfig(), description="how photons become grey levels")
+    response: ResponseConfig = Field(ResponseConfig(), description="conversion of photons to grey levels")
 
 
 class VideoConfig(IntensityConfig):
@@ -72,13 +71,13 @@ class VideoConfig(IntensityConfig):
 class FastcamMrawConfig(IntensityConfig):
     """Raw frames of a Photron FASTCAM."""
 
-    path: SpecPath = Field(description="the .cih or .cihx file, or the .mraw file; they lie side by side under one name")
+    path: SpecPath = Field(description="the .cih or .cihx file, or the .mraw file of the same name beside it")
 
 
 class ImageFolderConfig(IntensityConfig):
     """A picture for each frame."""
 
     path: SpecPath = Field(
-        description="a folder of .png or .tif files, one a frame in natural order (2 before 10), or one .tif file with a page "
-        "for each frame"
+        description="a folder of .png or .tif files, one per frame, in natural order (2 before 10), or one .tif file "
+        "with a page per frame"
     )
