@@ -11,10 +11,8 @@ class DirectConfig(PyramidConfig, ImageLimits):
     """Inverse-compositional alignment, coarse to fine."""
 
     blur_px: float = Field(0.8, gt=0, le=16, description="standard deviation of the Gaussian blur against photon noise, in px")
-    max_iterations: int = Field(30, ge=1, le=1000, description="largest number of steps at each level of the pyramid")
-    converged_px: float = Field(
-        0.01, gt=0, le=1, description="the alignment has converged when a step moves all corners by less, in px"
-    )
+    max_iterations: int = Field(30, ge=1, le=1000, description="largest number of steps on a level of the pyramid")
+    converged_px: float = Field(0.01, gt=0, le=1, description="converged when a step moves no corner further than this")
     max_noise_ratio: float = Field(
         100.0,
         gt=1,
