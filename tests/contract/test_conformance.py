@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from photonpano import discover
-from photonpano.registry.auto import AUTO
-from photonpano.registry.chain import CHAIN
+from photonpano.specs import builtin
 from photonpano.testing.conformance import Conformance
 
+(AUTO,) = builtin.photonpano_sources()
+(CHAIN,) = builtin.photonpano_locators()
 PLUGINS = Path(__file__).parents[1] / "plugins"
 OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.origin.plugin == "photonpano"]
 

@@ -141,8 +141,7 @@ class _Writer:
 
     def _origin(self, path: str) -> str:
         """Return "default" or "--set" for a value that does not stand in the file."""
-        places = self._plan.places
-        place = places.get(path)
+        place = self._plan.places.get(path)
         if place is None and path.startswith("levels."):
             _, index, stage, *rest = path.split(".")
             # A level that keeps the component of its stage inherits the keys and the fallback of that stage.

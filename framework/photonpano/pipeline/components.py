@@ -17,7 +17,6 @@ from photonpano.motion.level import Level, NamedLocator
 from photonpano.protocols import Resampler, Source
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
-from photonpano.specs.tree import Place
 from photonpano.threads import thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
 
@@ -63,7 +62,7 @@ def build_source(plan: Plan) -> Source:
 
     def located(index: int, message: str) -> SpecError:
         where = f"corrections.{index}"
-        return SpecError([plan.places.get(where, Place(where)).problem(message)])
+        return SpecError([plan.place(where).problem(message)])
 
     try:
         return corrected_source(source, plan.corrections, located)

@@ -23,7 +23,6 @@ from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
 from photonpano.specs.plan import Plan
-from photonpano.specs.tree import Place
 from photonpano.threads import one_thread_inside, thread_count
 
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
@@ -89,7 +88,7 @@ def _require_photons(plan: Plan, source: Source) -> None:
     try:
         require_photons(source)
     except InputError as error:
-        raise InputError(str(plan.places.get("source", Place("source")).problem(str(error)))) from error
+        raise InputError(str(plan.place("source").problem(str(error)))) from error
 
 
 def _reference_frame(plan: Plan, source: Source) -> int:

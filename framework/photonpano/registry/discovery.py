@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import logging
 from importlib.metadata import EntryPoint, entry_points
-from importlib.metadata import version as version_of
 
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
-from photonpano.registry.auto import AUTO
 from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer, Origin, make_entry, ordered
-from photonpano.registry.chain import CHAIN
 from photonpano.registry.disabling import DisabledNames
 from photonpano.registry.plugins import contributions_of, observation_of
 
@@ -24,7 +21,7 @@ def discover() -> Catalog:
     environment variable `PHOTONPANO_DISABLE_PLUGINS` names, by its distribution or its entry point, is not imported: see
     `Catalog.disabled`. Names in the variable that are no plugin's are logged as a warning.
     """
-    rows: list[Entry] = [make_entry(own, Origin(PROJECT, version_of(PROJECT), "built in")) for own in (AUTO, CHAIN)]
+    rows: list[Entry] = []
     broken: list[BrokenPlugin] = []
     disabled: list[DisabledPlugin] = []
     observers: list[Observer] = []

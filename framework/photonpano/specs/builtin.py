@@ -1,1 +1,196 @@
 """The framework's own contributions; they enter through the entry point `framework`, as those of plugins do."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from heapq import nsmallest
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ConfigDict, Field
+
+from photonpano.contributions import Config, Recognised, SourceContribution, SpecPath
+from photonpano.hookspecs import hookimpl
+from photonpano.reading import missing_file
+from photonpano.specs.aliases import LocatorAlias, SourceAlias, Use
+from photonpano.specs.checks import complaints
+from photonpano.specs.plan import Choice
+from photonpano.specs.validation import validate
+from photonpano.specs.written import Place, WrittenSpec, from_python
+from photonpano.text import listed
+from photonpano.values import Decision
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from photonpano.registry import Catalog, Entry
+
+logger = logging.getLogger(__name__)
+
+_SHOWN = 3
+"""The largest number of names of a folder in a message."""
+_SEARCHED = 1000
+"""The largest number of files of a folder whose endings are compared with those of sources."""
+
+
+class AutoConfig(Config):
+    """A capture of any kind."""
+
+    # For editors: the other keys are those of the source that recognises the path.
+    model_config = ConfigDict(json_schema_extra={"additionalProperties": True})
+
+    path: SpecPath = Field(description="the file or folder; other keys are passed to the source that recognises it")
+
+
+class ChainConfig(Config):
+    """Several locators, in the order in which they are tried."""
+
+    backends: tuple[str | dict[str, Any], ...] = Field(
+        ("direct", "opencv-sift"),
+        min_length=1,
+        description="the locators, in the order in which they are tried: each is a name, or a mapping of use and with",
+    )
+
+
+@hookimpl
+def photonpano_sources() -> Iterator[SourceAlias]:
+    """Offer the name for the source that recognises a capture."""
+    yield SourceAlias(
+        name="auto", summary="The source that recognises the file or folder", config=AutoConfig, expand=recognised_source
+    )
+
+
+@hookimpl
+def photonpano_locators() -> Iterator[LocatorAlias]:
+    """Offer the name for a locator with fallbacks."""
+    yield LocatorAlias(
+        name="chain-of-backends",
+        summary="Several locators in order, each for the pairs that those before it lost",
+        config=ChainConfig,
+        expand=first_with_fallbacks,
+    )
+
+
+def recognised_source(use: Use) -> dict[str, Any] | None:
+    """Rewrite a section that uses `auto` into one that uses the source that recognises the capture.
+
+    The keys that the source recognised are laid under those that are written beside the path.
+    """
+    written, where, spec = use.section.get("with"), f"{use.where}.with", use.spec
+    own = {key: written[key] for key in AutoConfig.model_fields if key in written} if isinstance(written, dict) else written
+    config = validate(AutoConfig, own, where, spec, use.directory)
+    if config is None:
+        return None
+    assert isinstance(written, dict)
+    path = config.path
+    if not path.exists():
+        spec.wrong(f"{where}.path", missing_file(path, "file or folder"))
+        return None
+    recognised, failures = _ask_sources(use.catalog, path)
+    if len(recognised) != 1:
+        several = [f"{entry.name} ({answer.because})" for entry, answer in recognised]
+        if several:
+            message = f"{path} is recognised by {listed(several)}; name the right one"
+        else:
+            # The path is named once; each line has its last part.
+            near = [line.replace(str(path), path.name) for line in _near_misses(use, written, path)]
+            lines = [*(near or _known_endings(use.catalog)), *failures]
+            message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
+        spec.wrong(f"{where}.path", message)
+        return None
+    for failure in failures:
+        logger.warning(failure)
+    ((entry, answer),) = recognised
+    found = from_python(answer.keys, spec.place(f"{where}.path"))
+    spec.problems += found.problems
+    here = {f"{where}.{key}": replace(spec.place(f"{where}.path"), where=f"{where}.{key}") for key in found.data}
+    spec.places = here | spec.places
+    spec.remark = f" ({path.name} is taken for {entry.name}: {answer.because})"
+    use.decisions.append(Decision(use.where, entry.name, f"{path.name} is taken for it: {answer.because}"))
+    others = {key: value for key, value in written.items() if key not in AutoConfig.model_fields}
+    return use.section | {"use": entry.name, "with": found.data | others}
+
+
+def _ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
+    """Show a path to all sources: return those that recognise it, and a clause for each that raised or broke its contract."""
+    recognised: list[tuple[Entry, Recognised]] = []
+    failures: list[str] = []
+    for entry in catalog.rows:
+        if not isinstance(entry.contribution, SourceContribution):
+            continue
+        try:
+            answer = entry.contribution.recognise(path)
+        except Exception as error:
+            failures.append(f"recognise of the {entry.label} raised {type(error).__name__}: {error}")
+            continue
+        if isinstance(answer, Recognised):
+            recognised.append((entry, answer))
+        elif answer is not None:
+            returned = type(answer).__name__
+            failures.append(f"recognise of the {entry.label} returned a {returned}, expected a Recognised or None")
+    return recognised, failures
+
+
+def _near_misses(use: Use, written: dict[str, Any], path: Path) -> Iterator[str]:
+    """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept."""
+    endings = {each.suffix.lower() for each in ([path] if path.is_file() else islice(path.rglob("*"), _SEARCHED))}
+    for entry in use.catalog.rows:
+        contribution = entry.contribution
+        if not isinstance(contribution, SourceContribution) or isinstance(contribution, SourceAlias):
+            continue
+        if contribution.suffixes and not endings & {*contribution.suffixes}:
+            continue
+        try:
+            config = validate(contribution.config, written, "", WrittenSpec(None, {"": Place()}, []), use.directory)
+        except Exception:  # what is wrong with the config is reported once the source is named
+            config = None
+        if config is not None:
+            yield from (f"{entry.name}: {each}" for each in complaints(Choice(contribution, config, entry.origin)))
+
+
+def _known_endings(catalog: Catalog) -> list[str]:
+    """Return a clause with the endings of the files of all sources."""
+    sources = [each.contribution for each in catalog.rows if isinstance(each.contribution, SourceContribution)]
+    endings = sorted({suffix for source in sources for suffix in source.suffixes})
+    return [f"the names of files of captures end in {listed(endings)}"] if endings else []
+
+
+def _contents(path: Path) -> str:
+    """Describe a file or folder that no source recognises."""
+    if path.is_file():
+        return f"a file of {path.stat().st_size:,} bytes"
+    try:
+        names = nsmallest(_SHOWN + 1, (each.name for each in path.iterdir()))
+    except OSError as error:
+        return f"which cannot be read ({error.strerror})"
+    if len(names) > _SHOWN:
+        return f"a folder of {', '.join(names[:_SHOWN])} and more"
+    return f"a folder of {listed(names)}" if names else "an empty folder"
+
+
+def first_with_fallbacks(use: Use) -> dict[str, Any] | None:
+    """Rewrite a section that uses `chain-of-backends` into one that uses the first, and has the others as its fallbacks."""
+    keys, where, spec = use.section.get("with"), use.where, use.spec
+    if use.section.get("fallback"):
+        spec.wrong_key(f"{where}.fallback", "a chain has its fallbacks among its backends")
+    validate(ChainConfig, keys, f"{where}.with", spec, use.directory)
+    backends = keys.get("backends") if isinstance(keys, dict) else None
+    items = f"{where}.with.backends"
+    if backends is None:
+        backends = list(ChainConfig.model_fields["backends"].default)
+        spec.places |= {f"{items}.{index}": spec.place(f"{where}.use") for index in range(len(backends))}
+    if not isinstance(backends, list) or not backends or not all(isinstance(item, str | dict) for item in backends):
+        return None
+    first, *others = backends
+    chosen = {"use": first} if isinstance(first, str) else {"use": None} | first
+    if "fallback" in chosen:
+        message = "a locator of a chain has no fallback; list all of them, in the order in which they are tried"
+        spec.wrong_key(f"{items}.0.fallback", message)
+    moved = {f"{where}.use": spec.place(f"{items}.0")} if isinstance(first, str) else {}
+    moved |= spec.places_under(f"{items}.0", where)
+    for index in range(len(others)):
+        moved |= spec.places_under(f"{items}.{index + 1}", f"{where}.fallback.{index}")
+    spec.replace_places(where, moved)
+    return chosen | {"fallback": others}

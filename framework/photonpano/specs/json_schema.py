@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from pydantic.json_schema import models_json_schema
 
 from photonpano.corrections import CORRECTIONS
-from photonpano.registry.auto import AutoConfig
-from photonpano.registry.chain import CHAIN, ChainConfig
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.schema_text import TolerantJsonSchema
-from photonpano.specs.corrections import corrections_schema
+from photonpano.specs.aliases import LocatorAlias
 from photonpano.specs.resolution import DEFAULT_FALLBACK, DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
 from photonpano.specs.settings import LevelSettings, OutputSettings
 
@@ -45,14 +43,13 @@ def json_schema(catalog: Catalog) -> Schema:
         own = [entry for entry in entries if entry.kind == kind.name]
         sections[kind.section] = _component(kind, own, schemas, DEFAULTS.get(kind.section))
         overrides[kind.section] = _component(kind, own, schemas, None)
-    single = [entry for entry in entries if entry.kind == "locator" and entry.contribution is not CHAIN]
+    single = [entry for entry in entries if entry.kind == "locator" and not isinstance(entry.contribution, LocatorAlias)]
     locator = _component(KINDS["locator"], single, schemas, None) | {"type": "object", "required": ["use"]}
     one = {"anyOf": [locator["properties"]["use"], locator]}
     definitions["fallback"] = {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}
-    if ChainConfig in schemas:
-        definitions[_definition(schemas[ChainConfig])]["properties"]["backends"]["items"] = one
-    if AutoConfig in schemas:  # what it hands on is known once a source has recognised the path
-        definitions[_definition(schemas[AutoConfig])]["additionalProperties"] = True
+    for entry in entries:
+        if isinstance(entry.contribution, LocatorAlias):
+            definitions[_definition(schemas[entry.contribution.config])]["properties"]["backends"]["items"] = one
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
@@ -67,7 +64,7 @@ def json_schema(catalog: Catalog) -> Schema:
         "properties": {
             "version": {"const": VERSION, "description": "the version of the format"},
             "source": sections.pop("source"),
-            "corrections": corrections_schema(schemas),
+            "corrections": _corrections(schemas),
             **sections,
             "levels": {
                 "description": "how many levels, as many as it takes, or an entry for each level that overrides stages for it",
@@ -119,3 +116,20 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
+
+
+def _corrections(schemas: dict[type[BaseModel], Schema]) -> Schema:
+    """Return the schema of the list of corrections."""
+    alone = [name for name, model in CORRECTIONS.items() if not any(key.is_required() for key in model.model_fields.values())]
+    one = {
+        "type": "object",
+        "minProperties": 1,
+        "maxProperties": 1,
+        "additionalProperties": False,
+        "properties": {name: schemas[model] for name, model in CORRECTIONS.items()},
+    }
+    return {
+        "description": "what is done to frames first of all, in this order: names, or mappings of one name to its settings",
+        "type": ["array", "null"],
+        "items": {"anyOf": [{"enum": alone}, one]},
+    }

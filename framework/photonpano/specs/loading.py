@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem, SpecError
 from photonpano.registry import Catalog, discover
-from photonpano.specs.overrides import apply_override
 from photonpano.specs.resolution import resolve
-from photonpano.specs.tree import Place, Value, from_data
+from photonpano.specs.written import Place, WrittenSpec, from_python, given, joined
 from photonpano.specs.yaml_reader import read_yaml
 
 if TYPE_CHECKING:
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
     from photonpano.specs.plan import Plan
 
 MAX_BYTES = 2**20
-"""No spec is as long as this; a capture that is given by mistake is."""
+"""The largest size of a spec file: no spec is as long, but a capture that is given by mistake is."""
 
 
 def load_spec(
@@ -102,23 +100,65 @@ def _load(
     catalog: Catalog | None,
 ) -> Plan:
     problems: list[Problem] = []
-    root = read_yaml(spec, problems, place) if isinstance(spec, str) else from_data(spec, problems, place)
-    if root is None or root.content is None:
-        start = place if root is None else root.place
-        raise SpecError(problems or [start.problem("the spec is empty; it needs at least `version` and `source`")])
+    written = read_yaml(spec, place, problems) if isinstance(spec, str) else from_python(spec, place)
+    if written is None or written.data is None:
+        place = place if written is None else written.place("")
+        problems += written.problems if written and written.problems is not problems else []
+        raise SpecError(problems or [place.problem("the spec is empty; it needs at least `version` and `source`")])
     for override in overrides:
-        apply_override(root, override, problems)
-    _set_output(root, None if output is None else Path(output).absolute(), Path("runs", name))
-    return resolve(root, directory, discover() if catalog is None else catalog, problems)
+        _apply_override(written, override)
+    _set_output(written, None if output is None else Path(output).absolute(), Path("runs", name))
+    return resolve(written, directory, discover() if catalog is None else catalog)
 
 
-def _set_output(root: Value, chosen: Path | None, default: Path) -> None:
-    """Set the run folder: the chosen one, or the default where the spec names none."""
-    if not isinstance(root.content, dict):
+def _apply_override(spec: WrittenSpec, text: str) -> None:
+    """Set one value of a spec; mappings on the way to it are made where they are missing.
+
+    Args:
+        spec: the spec, which is changed.
+        text: such as `run.seed=1` or `levels.0.scale=0.5`: keys and list indices (from 0), then a value in YAML.
+    """
+    path, sign, yaml = text.partition("=")
+    keys = path.strip().split(".")
+    if not sign or not all(keys):
+        spec.problems.append(Place(override=text).problem("expected KEY=VALUE, such as run.seed=1"))
         return
-    place = Place("output", root.place.file)
-    section = root.content.setdefault("output", Value(None, place, place))
-    if section.content is None:
-        section.content = {}
-    if isinstance(section.content, dict) and (chosen is not None or "directory" not in section.content):
-        section.content["directory"] = Value(str(chosen or default), replace(place, where="output.directory"))
+    place = Place(path.strip(), override=text)
+    n_problems = len(spec.problems)
+    value = read_yaml(yaml, place, spec.problems) or WrittenSpec(None, {place.where: place}, [])
+    if len(spec.problems) == n_problems:
+        _set(spec, spec.data, "", keys, value, place)
+
+
+def _set(spec: WrittenSpec, node: Any, where: str, keys: list[str], value: WrittenSpec, place: Place) -> None:
+    """Set a value in a mapping or list of a spec."""
+    key: str | int
+    key, *rest = keys
+    if isinstance(node, list) and key.isdecimal() and int(key) < len(node):
+        key = int(key)
+    elif not isinstance(node, dict):
+        spec.problems.append(place.problem(f"{where or 'the spec'} is {given(node)}, which has no {key!r}"))
+        return
+    path = joined(where, key)
+    if not rest:
+        node[key] = value.data
+        spec.replace_places(path, value.places)
+        return
+    if isinstance(key, int) or node.get(key) is not None:
+        inside = node[key]
+    else:
+        inside = node[key] = {}
+        spec.places.setdefault(path, Place(path, override=place.override))
+    _set(spec, inside, path, rest, value, place)
+
+
+def _set_output(spec: WrittenSpec, chosen: Path | None, default: Path) -> None:
+    """Set the run folder: the chosen one, or the default where the spec names none."""
+    if not isinstance(spec.data, dict):
+        return
+    if spec.data.get("output") is None:
+        spec.data["output"] = {}
+    section = spec.data["output"]
+    if isinstance(section, dict) and (chosen is not None or "directory" not in section):
+        section["directory"] = str(chosen or default)
+        spec.replace_places("output.directory", {"output.directory": Place("output.directory", spec.place("").file)})

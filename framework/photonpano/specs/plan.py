@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from photonpano.specs.written import place_of
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
@@ -13,7 +15,7 @@ if TYPE_CHECKING:
     from photonpano.corrections import Correction
     from photonpano.registry import Observer, Origin
     from photonpano.specs.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
-    from photonpano.specs.tree import Place
+    from photonpano.specs.written import Place
     from photonpano.values import Decision
 
 
@@ -85,3 +87,7 @@ class Plan:
     file: Path | None = None
     observers: tuple[Observer, ...] = ()
     decisions: tuple[Decision, ...] = ()
+
+    def place(self, where: str) -> Place:
+        """Return where a value was written, by its path in `document`; for a default, where it would stand."""
+        return place_of(self.places, where)

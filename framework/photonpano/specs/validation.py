@@ -1,103 +1,97 @@
-"""Validate a section against its model, and say in plain words what is wrong."""
+"""Validate plain data against a model, and put what is wrong into plain words."""
 
 from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from photonpano.registry.schema_text import alternative, config_schema, discriminator, expectation, keys_of, subschema
-from photonpano.specs.tree import Value, given
-from photonpano.text import listed, suggestion
+from photonpano.specs.written import WrittenSpec, given, joined
+from photonpano.text import listed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
     from pydantic_core import ErrorDetails
 
-    from photonpano.errors import Problem
     from photonpano.registry.schema_text import Schema
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
-OWN_WORDS = {"value_error", "assertion_error"}
+RAISED = {"value_error", "assertion_error"}
 """Errors that a validator of the model raised itself: its sentence is the message."""
-SAID_BY_SCHEMA = {
+EXPECTED = {
     *("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number", "multiple_of"),
     *("too_short", "too_long", "string_too_short", "string_too_long", "string_pattern_mismatch"),
     *("literal_error", "enum", "byte_size", "byte_size_unit", "missing"),
 }
-"""Errors, beside those of type, that the words of the schema explain better than pydantic does."""
+"""Errors, beside those of type, whose message is what the schema expects and what was given."""
 NUMBER = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*")
 
 
-def validate(model: type[ModelT], section: Value, directory: Path, problems: list[Problem]) -> ModelT | None:
-    """Validate a section; values are taken as YAML gives them, so text is no number and a number no switch.
+def validate(model: type[ModelT], data: Any, where: str, spec: WrittenSpec, directory: Path) -> ModelT | None:
+    """Validate a section; types are those of YAML, so text is no number and a number no switch.
 
     Args:
-        model: what the section is to become.
-        section: a mapping; null counts as an empty one.
+        model: the model of the section.
+        data: a mapping; None counts as an empty one.
+        where: the path of the section.
+        spec: problems are added here.
         directory: what relative paths count from.
-        problems: what is wrong is added here, each at its place.
 
     Returns:
         None if something is wrong.
     """
-    content = {} if section.content is None else section.content
-    if not isinstance(content, dict):
-        problems.append(section.place.problem(f"expected a mapping, got {given(content)}"))
+    section = spec.mapping(data, where)
+    if section is None:
         return None
-    section = Value(content, section.place, section.key)
     try:
-        return model.model_validate_json(json.dumps(section.plain()), strict=True, context={"directory": directory})
+        return model.model_validate_json(json.dumps(section), strict=True, context={"directory": directory})
     except ValidationError as error:
-        root = config_schema(model)
-        found = [_problem(each, section, root) for each in error.errors(include_url=False)]
-        problems += dict.fromkeys(found)  # the alternatives of a union fail one by one, with one sentence
+        schema, n_problems = config_schema(model), len(spec.problems)
+        for each in error.errors(include_url=False):
+            _report(each, section, where, schema, spec)
+        # The alternatives of a union fail one by one, with one sentence.
+        spec.problems[n_problems:] = dict.fromkeys(spec.problems[n_problems:])
     return None
 
 
-def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Say that a mapping has no such key, and which it has."""
-    return f"unknown key; {suggestion(key, known) or 'no keys are allowed here'}"
-
-
-def _problem(error: ErrorDetails, section: Value, root: Schema) -> Problem:
-    value, schema, parent = section, root, root
-    for step in error["loc"]:  # steps that lead nowhere name an alternative of a union, or a key that is missing
+def _report(error: ErrorDetails, value: Any, where: str, root: Schema, spec: WrittenSpec) -> None:
+    kind, steps, schema = error["type"], list(error["loc"]), root
+    # The last step is a key that is missing or unknown, or an item that is missing.
+    last = steps.pop() if kind in ("missing", "extra_forbidden") else ""
+    for step in steps:
         child = _child(value, step)
-        if child is None:
+        if child is None:  # the step names an alternative of a union
             schema = alternative(schema, step, root)
         else:
-            parent, value, schema = schema, child, subschema(schema, step, root)
-    kind = error["type"]
+            schema, (value,), where = subschema(schema, step, root), child, joined(where, step)
     tag_key, tags = discriminator(schema, root)
-    if kind == "union_tag_not_found" and tag_key:
-        return value.head.problem(f"required: {listed(tags, 'or')}", tag_key)
-    if kind == "union_tag_invalid" and tag_key and (tag := _child(value, tag_key)):
-        return tag.place.problem(f"expected {listed(tags, 'or')}, got {given(tag.content)}")
-    if kind == "missing" and isinstance(key := error["loc"][-1], str):
-        return value.head.problem(f"required: {expectation(subschema(schema, key, root), root)}", key)
-    if kind == "extra_forbidden":
-        return value.head.problem(unknown_key(str(error["loc"][-1]), keys_of(parent, root)))
-    if kind in OWN_WORDS:
-        return value.place.problem(str(error["ctx"]["error"]))
-    if schema and (kind in SAID_BY_SCHEMA or kind.endswith("_type")):
-        return value.place.problem(f"expected {expectation(schema, root)}, got {_given(value, kind)}")
-    return value.place.problem(f"{error['msg'][:1].lower()}{error['msg'][1:]}, got {given(value.content)}")
+    if kind == "missing" and isinstance(last, str):
+        spec.wrong_key(joined(where, last), f"required: {expectation(subschema(schema, last, root), root)}")
+    elif kind == "extra_forbidden":
+        spec.wrong_key(joined(where, last), spec.unknown_key(str(last), where, keys_of(schema, root)))
+    elif kind == "union_tag_not_found" and tag_key:
+        spec.wrong_key(joined(where, tag_key), f"required: {listed(tags, 'or')}")
+    elif kind == "union_tag_invalid" and tag_key:
+        spec.wrong(joined(where, tag_key), f"expected {listed(tags, 'or')}, got {given(value[tag_key])}")
+    elif kind in RAISED:
+        spec.wrong(where, str(error["ctx"]["error"]))
+    elif schema and (kind in EXPECTED or kind.endswith("_type")):
+        number = kind in ("int_type", "float_type") and isinstance(value, str) and NUMBER.fullmatch(value)
+        got = f"the text {value!r}; leave the quotes out" if number else given(value)
+        spec.wrong(where, f"expected {expectation(schema, root)}, got {got}")
+    else:
+        spec.wrong(where, f"{error['msg'][:1].lower()}{error['msg'][1:]}, got {given(value)}")
 
 
-def _child(value: Value, step: str | int) -> Value | None:
-    if isinstance(value.content, dict):
-        return value.content.get(str(step))
-    if isinstance(value.content, list) and isinstance(step, int) and step < len(value.content):
-        return value.content[step]
+def _child(value: Any, step: str | int) -> tuple[Any] | None:
+    """Return the value of a key or an item, in a tuple of one; None if there is none."""
+    if isinstance(value, dict) and str(step) in value:
+        return (value[str(step)],)
+    if isinstance(value, list) and isinstance(step, int) and step < len(value):
+        return (value[step],)
     return None
-
-
-def _given(value: Value, kind: str) -> str:
-    quoted = kind in ("int_type", "float_type") and isinstance(value.content, str) and NUMBER.fullmatch(value.content)
-    return f"the text {value.content!r}; leave the quotes out" if quoted else given(value.content)

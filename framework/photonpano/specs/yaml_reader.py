@@ -1,57 +1,60 @@
-"""Read YAML into values with their places. Nothing is constructed from tags, so nothing in a file is executed."""
+"""Read YAML into plain data with a table of places. Nothing is constructed from tags, so nothing in a file is executed."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.reader import ReaderError
 
-from photonpano.specs.tree import Place, Value, joined
+from photonpano.specs.written import Place, WrittenSpec, joined
 
 if TYPE_CHECKING:
     from ruamel.yaml.error import StringMark
     from ruamel.yaml.nodes import Node
 
     from photonpano.errors import Problem
-    from photonpano.specs.tree import Scalar
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
 MAX_VALUES = 20_000
-"""Aliases of aliases multiply; no spec is as long as this."""
+"""The largest number of values in a spec; aliases of aliases multiply."""
 
 
 class _TooLongError(Exception):
     """More than `MAX_VALUES` values."""
 
 
-def read_yaml(text: str, problems: list[Problem], place: Place) -> Value | None:
+def read_yaml(text: str, place: Place, problems: list[Problem]) -> WrittenSpec | None:
     """Read one YAML 1.2 document; aliases and merge keys are followed.
 
     Args:
         text: the document.
-        problems: what is wrong with it is added here.
         place: where the document stands; lines and columns are filled in unless it is an override.
+        problems: what is wrong with it is added here.
 
     Returns:
         None if the text is not YAML, or holds no document.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.composer.warn_double_anchors = False
-    reader = _Reader(problems, place)
+    reader = _Reader(place, problems)
     try:
         node = yaml.compose(text)
-        return None if node is None else reader.value(node, place.where)
+        if node is not None:
+            reader.spec.data = reader.value(node, place.where)
+            return reader.spec
     except MarkedYAMLError as error:
         problems.append(_syntax_problem(error, reader))
     except ReaderError as error:
-        at = place if place.override else _at(text, error.position, place)
-        problems.append(at.problem(f"not valid YAML: {error.reason}, got the character {error.character:#04x}"))
+        if not place.override:
+            line_start = text.rfind("\n", 0, error.position)
+            place = replace(place, line=text.count("\n", 0, error.position) + 1, column=error.position - line_start)
+        problems.append(place.problem(f"not valid YAML: {error.reason}, got the character {error.character:#04x}"))
     except YAMLError as error:
         problems.append(place.problem(f"not valid YAML: {error}"))
     except _TooLongError:
@@ -69,21 +72,15 @@ def _syntax_problem(error: MarkedYAMLError, reader: _Reader) -> Problem:
         message = f"not valid YAML: {context} {error.problem}"
     elif error.context_mark and not reader.root.override:
         message += f" ({context} that starts in line {error.context_mark.line + 1})"
-    at = reader.place(error.problem_mark, reader.root.where) if error.problem_mark else reader.root
-    return at.problem(message)
-
-
-def _at(text: str, position: int, place: Place) -> Place:
-    line, column = text.count("\n", 0, position) + 1, position - text.rfind("\n", 0, position)
-    return replace(place, line=line, column=column)
+    return (reader.place(error.problem_mark, reader.root.where) if error.problem_mark else reader.root).problem(message)
 
 
 class _Reader:
-    """Turns the nodes of one document into values."""
+    """Reads the nodes of one document."""
 
-    def __init__(self, problems: list[Problem], root: Place) -> None:
-        self.problems = problems
+    def __init__(self, root: Place, problems: list[Problem]) -> None:
         self.root = root
+        self.spec = WrittenSpec(None, {}, problems)
         self.count = 0
         self.open: set[int] = set()
 
@@ -93,74 +90,89 @@ class _Reader:
             return replace(self.root, where=where)
         return replace(self.root, where=where, line=mark.line + 1, column=mark.column + 1)
 
-    def value(self, node: Node, where: str, key: Place | None = None) -> Value:
-        """Read a node; what cannot be read becomes a problem and null."""
+    def value(self, node: Node, where: str, key: Place | None = None) -> Any:
+        """Read a node; what cannot be read becomes a problem and None."""
         self.count += 1
         if self.count > MAX_VALUES:
             raise _TooLongError
         place = self.place(node.start_mark, where)
-        if node.tag == f"{TAG}null" and node.value == "" and key is not None:
-            return Value(None, key, key)  # nothing was written, so there is no place but the key's
+        if key is not None and node.tag == f"{TAG}null" and node.value == "":
+            self.spec.places[where] = key  # nothing was written, so there is no place but the key's
+            return None
+        start = (place.line, place.column) if place.line and place.column else None
+        self.spec.places[where] = place if key is None else replace(key, start=start)
         if isinstance(node, ScalarNode):
-            before = len(self.problems)
-            return Value(self.scalar(node, place), place, key, readable=len(self.problems) == before)
-        if not self.is_known(node, place, "map", "seq"):
-            return Value(None, place, key, readable=False)
+            return self.scalar(node, where)
+        if not self.is_known(node, where, "map", "seq"):
+            return None
         if id(node) in self.open:
-            self.problems.append(place.problem("an alias stands inside what it repeats"))
-            return Value(None, place, key, readable=False)
+            self.unreadable(where, "an alias stands inside what it repeats")
+            return None
         self.open.add(id(node))
-        content = self.mapping(node, where) if isinstance(node, MappingNode) else self.items(node.value, where)
-        self.open.discard(id(node))
-        return Value(content, place, key)
+        try:
+            if isinstance(node, MappingNode):
+                return self.mapping(node, where)
+            return [self.value(item, joined(where, index)) for index, item in enumerate(node.value)]
+        finally:
+            self.open.discard(id(node))
 
-    def items(self, nodes: list[Node], where: str) -> list[Value]:
-        """Read a list."""
-        return [self.value(item, joined(where, index)) for index, item in enumerate(nodes)]
-
-    def mapping(self, node: MappingNode, where: str) -> dict[str, Value]:
-        """Read a mapping; of duplicate keys the first stays, and what is merged in stands behind its own keys."""
-        content: dict[str, Value] = {}
-        merged: dict[str, Value] = {}
+    def mapping(self, node: MappingNode, where: str) -> dict[str, Any]:
+        """Read a mapping; the first of duplicate keys stays, and the mapping's own keys win over those that are merged in."""
+        merged: dict[str, Any] = {}
         for key_node, item in node.value:
             if key_node.tag == f"{TAG}merge":
                 merged = self.merged(item, where) | merged
-                continue
+        content: dict[str, Any] = {}
+        for key_node, item in node.value:
             key = key_node.value
+            if key_node.tag == f"{TAG}merge":
+                continue
             if key_node.tag != f"{TAG}str":
                 got = (f"{key}; quote it" if key else "nothing") if isinstance(key, str) else "a list or a mapping"
-                self.problems.append(self.place(key_node.start_mark, where).problem(f"a key is text, got {got}"))
-                continue
-            place = self.place(key_node.start_mark, joined(where, key))
-            if key in content:
-                first = content[key].head
-                line = f" in line {first.line}" if first.line else ""
-                self.problems.append(place.problem(f"the key is given twice, first{line}"))
-                continue
-            content[key] = self.value(item, place.where, place)
+                self.report(key_node, where, f"a key is text, got {got}")
+            elif key in content:
+                first = self.spec.places[joined(where, key)].line
+                self.report(
+                    key_node, joined(where, key), f"the key is given twice, first{f' in line {first}' if first else ''}"
+                )
+            else:
+                path = joined(where, key)
+                if path in self.spec.places:  # that of a value which was merged in
+                    self.spec.replace_places(path, {})
+                content[key] = self.value(item, path, self.place(key_node.start_mark, path))
         return merged | content
 
-    def merged(self, node: Node, where: str) -> dict[str, Value]:
+    def merged(self, node: Node, where: str) -> dict[str, Any]:
         """Read what stands under a merge key: a mapping, or a list of mappings of which the first wins."""
-        content: dict[str, Value] = {}
+        content: dict[str, Any] = {}
+        place = self.spec.places[where]
         for source in reversed([node] if isinstance(node, MappingNode) else node.value):
             if not isinstance(source, MappingNode):
-                self.problems.append(self.place(node.start_mark, where).problem("<< merges mappings, got something else"))
+                self.report(node, where, "<< merges mappings, got something else")
                 return {}
-            value = self.value(source, where)
-            content |= value.content if isinstance(value.content, dict) else {}
+            content |= self.value(source, where) or {}
+        self.spec.places[where] = place
         return content
 
-    def is_known(self, node: Node, place: Place, *names: str) -> bool:
-        """Tell whether a tag is one of these; any other is a problem."""
+    def report(self, node: Node, where: str, message: str) -> None:
+        """Report a problem at a node."""
+        self.spec.problems.append(self.place(node.start_mark, where).problem(message))
+
+    def unreadable(self, where: str, message: str) -> None:
+        """Report a value that cannot be read, and return None in its place."""
+        self.spec.wrong(where, message)
+        self.spec.unreadable.add(where)
+
+    def is_known(self, node: Node, where: str, *names: str) -> bool:
+        """Return whether the tag of a node is one of these; any other is a problem."""
         if node.tag in {f"{TAG}{name}" for name in names}:
             return True
-        self.problems.append(place.problem(f"tags such as {str(node.tag).replace(TAG, '!!')} are not allowed"))
+        self.unreadable(where, f"tags such as {str(node.tag).replace(TAG, '!!')} are not allowed")
         return False
 
-    def scalar(self, node: ScalarNode, place: Place) -> Scalar:
+    def scalar(self, node: ScalarNode, where: str) -> str | int | float | bool | None:
         """Read a scalar; dates are text."""
-        if not self.is_known(node, place, "null", "bool", "int", "float", "str", "timestamp", "value"):
+        if not self.is_known(node, where, "null", "bool", "int", "float", "str", "timestamp", "value"):
             return None
         text = str(node.value)
         tag = str(node.tag).removeprefix(TAG)
@@ -180,6 +192,6 @@ class _Reader:
             text.encode()  # refuses half of a surrogate pair, which JSON and file systems cannot hold
         except ValueError:
             expected = {"int": "an integer", "float": "a number"}.get(tag, "text")
-            self.problems.append(place.problem(f"expected {expected}, got {text!a}"))
+            self.unreadable(where, f"expected {expected}, got {text!a}")
             return None
         return text

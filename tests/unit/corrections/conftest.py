@@ -11,7 +11,7 @@ from photonpano import FrameSpan
 from photonpano.corrections import Correction
 from photonpano.photometry import packed_counts
 from photonpano.specs.corrections import resolved_corrections
-from photonpano.specs.tree import Place, from_data
+from photonpano.specs.written import Place, from_python
 from photonpano.testing import MemorySource
 
 
@@ -35,9 +35,9 @@ def corrections(tmp_path: Path) -> Callable[..., tuple[Correction, ...]]:
     """Make corrections of what a spec would say: `corrections("rot90", {"crop": {"rows": [2, None]}})`."""
 
     def corrections(*written: Any) -> tuple[Correction, ...]:
-        problems: list[Any] = []
-        found = resolved_corrections(from_data(list(written), problems, Place("corrections")), tmp_path, problems)
-        assert problems == []
+        spec = from_python({"corrections": list(written)}, Place())
+        found = resolved_corrections(spec.data["corrections"], spec, tmp_path)
+        assert spec.problems == []
         return found
 
     return corrections

@@ -39,11 +39,11 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
 
 
 @pytest.mark.parametrize(("kind", "name"), [("source", "auto"), ("locator", "chain-of-backends")])
-def test_the_framework_offers_some_names_itself(kind, name):
+def test_the_framework_offers_names_through_its_own_entry_point(kind, name):
     entry = discover().find(kind, name)
     assert (entry.origin.plugin, entry.origin.entry_point, entry.origin.version) == (
         "photonpano",
-        "built in",
+        "framework = photonpano.specs.builtin",
         photonpano.__version__,
     )
 
@@ -184,7 +184,7 @@ def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "photonpano")
     catalog = discover()
-    assert {row.origin.plugin for row in catalog.rows if row.origin.entry_point != "built in"} == {"alpha"}
+    assert {row.origin.plugin for row in catalog.rows} == {"alpha"}
     disabled = [row.origin.entry_point.partition(" = ")[0] for row in catalog.disabled]
     assert disabled == ["colmap", "core", "direct", "framework", "kornia", "opencv", "sensors", "simulator"]
 

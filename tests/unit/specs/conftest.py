@@ -17,9 +17,9 @@ from photonpano import (
     SpecPath,
 )
 from photonpano.registry import Catalog, Origin
-from photonpano.registry.auto import AUTO
 from photonpano.registry.catalog import make_entry
-from photonpano.registry.chain import CHAIN
+from photonpano.registry.plugins import contributions_of
+from photonpano.specs import builtin
 
 
 class PackedNpyConfig(Config):
@@ -109,7 +109,7 @@ def too_few_frames(config, info):
 
 
 CONTRIBUTIONS = [
-    AUTO,
+    *contributions_of(builtin),
     SourceContribution(
         name="packed-npy", summary="Toy", config=PackedNpyConfig, build=unbuilt, check=missing_file, recognise=npy
     ),
@@ -126,7 +126,6 @@ CONTRIBUTIONS = [
         requires=(Requirement("no_such_library", "photonpano[kornia]"),),
     ),
     LocatorContribution(name="moody", summary="Toy", config=MoodyConfig, build=unbuilt),
-    CHAIN,
     InterpolatorContribution(name="smoothing-spline", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
     InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
 ]

@@ -138,6 +138,13 @@ def test_one_that_raises_is_named_and_does_not_stop_the_others(folder, catalog, 
     assert complaint in told(folder, catalog.including(sulky), "source: {use: auto, with: {path: cube.dat}}")
 
 
+def test_one_that_returns_something_else_is_named(folder, catalog):
+    odd = SourceContribution(name="odd", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=lambda _: {})
+    said = told(folder, catalog.including(odd), "source: {use: auto, with: {path: cube.dat}}")
+    complaint = f"recognise of the source 'odd' of {__name__} unreleased returned a dict, expected a Recognised or None"
+    assert said.splitlines()[1:] == [f"  {complaint}"]
+
+
 def test_a_wrong_key_is_told_at_its_place_with_whom_it_was_given_to(folder, catalog):
     said = told(folder, catalog, "source:\n  use: auto\n  with:\n    path: cube.npy\n    frame_rate: 5\n    width: 3\n")
     because = "(cube.npy is taken for packed-npy: its name ends in .npy)"

@@ -3,8 +3,7 @@
 import pytest
 
 from photonpano import PluginError, SpecError
-from photonpano.registry.chain import CHAIN, ChainConfig
-from photonpano.specs import parse_spec
+from photonpano.specs import builtin, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
 SHORT = {"use": "direct", "with": {"max_steps": 5}}
@@ -67,6 +66,7 @@ def test_a_default_that_is_not_on_offer_is_an_error_where_the_chain_is_named(cat
     assert str(caught.value).startswith("3:15: locate.use: there is no locator 'opencv-sift'; known: ")
 
 
-def test_nothing_is_built_of_a_chain():
-    with pytest.raises(PluginError, match=r"^chain-of-backends stands for other locators: "):
-        CHAIN.build(ChainConfig(), None)
+def test_building_an_alias_is_an_error():
+    for alias in (*builtin.photonpano_sources(), *builtin.photonpano_locators()):
+        with pytest.raises(PluginError, match=r"^this name stands for other components, "):
+            alias.build(None, None)

@@ -90,7 +90,7 @@ def test_default_fallback_is_left_out_where_it_is_not_installed_and_an_error_whe
     assert parse_spec(MINIMAL, catalog=without).levels[0].fallbacks == ()
     twice = Catalog((*catalog.rows, catalog.find("locator", "opencv-sift")))
     (message,) = messages(MINIMAL, catalog=twice)
-    assert message.startswith("locate.fallback: the locator 'opencv-sift' is offered by ")
+    assert message.startswith("locate.fallback.0.use: the locator 'opencv-sift' is offered by ")
     parse_spec(MINIMAL | {"locate": {"fallback": []}}, catalog=twice)
 
 

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from photonpano.specs.tree import Place
+from photonpano.specs.written import Place
 from photonpano.specs.yaml_reader import read_yaml
 
 
 def read(text):
     problems = []
-    value = read_yaml(text, problems, Place())
+    spec = read_yaml(text, Place(), problems)
     assert problems == []
-    return value
+    return spec
 
 
 @pytest.mark.parametrize(
@@ -58,27 +58,36 @@ def read(text):
     ],
 )
 def test_value(text, value):
-    plain = read(text).plain()
+    plain = read(text).data
     assert plain == value
     assert type(plain) is type(value)
 
 
 def test_whole_numbers_beyond_a_float_keep_their_size():
-    assert read("123456789012345678901234567890").plain() == 123456789012345678901234567890
+    assert read("123456789012345678901234567890").data == 123456789012345678901234567890
 
 
 def test_places_of_values_and_keys():
-    root = read("a: 1\nb:\n  - x: {y: 2}\n  -\nc:\n")
-    seen = {value.place.where: (value.place.line, value.place.column, value.key and value.key.column) for value in root.walk()}
-    assert seen == {
+    places = read("a: 1\nb:\n  - x: {y: 2}\n  -\nc:\n").places
+    assert {where: (place.line, place.column, place.start) for where, place in places.items()} == {
         "": (1, 1, None),
-        "a": (1, 4, 1),
-        "b": (3, 3, 1),
+        "a": (1, 1, (1, 4)),
+        "b": (2, 1, (3, 3)),
         "b.0": (3, 5, None),
-        "b.0.x": (3, 8, 5),
-        "b.0.x.y": (3, 12, 9),
+        "b.0.x": (3, 5, (3, 8)),
+        "b.0.x.y": (3, 9, (3, 12)),
         "b.1": (4, 4, None),
-        "c": (5, 1, 1),
+        "c": (5, 1, None),
+    }
+
+
+def test_keys_that_are_merged_in_have_the_places_where_they_are_written():
+    places = read("a: &x {p: {r: 1}, q: {r: 2}}\nb: {<<: *x, q: {s: 3}}").places
+    assert {where: place.line for where, place in places.items() if where.startswith("b.")} == {
+        "b.p": 1,
+        "b.p.r": 1,
+        "b.q": 2,
+        "b.q.s": 2,
     }
 
 
@@ -94,15 +103,15 @@ documents = st.recursive(
 @given(documents)
 def test_reads_what_json_writes(document):
     """JSON is YAML, up to whole floats such as 1e16, which are read as integers."""
-    assert read(json.dumps(document, ensure_ascii=False)).plain() == document
+    assert read(json.dumps(document, ensure_ascii=False)).data == document
 
 
 @settings(deadline=None)  # the machine may be busy
 @given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))
 def test_any_text_is_a_value_or_a_problem(text):
     problems = []
-    value = read_yaml(text, problems, Place())
-    if value is None and not problems:
+    spec = read_yaml(text, Place(), problems)
+    if (spec is None or spec.data is None) and not problems:
         assert YAML(typ="safe", pure=True).load(text) is None
     for problem in problems:
         assert problem.line is None or problem.line <= text.count("\n") + 2
