@@ -16,7 +16,7 @@ from photonpano.registry import KINDS, Catalog, discover
 from photonpano.registry.description import flow
 from photonpano.report.numbers import counted, duration
 from photonpano.specs import Plan
-from photonpano.specs.tree import joined
+from photonpano.specs.written import joined
 from photonpano.text import byte_size
 
 _DESCRIBED_LEVELS = 3
@@ -142,13 +142,6 @@ class _Writer:
     def _origin(self, path: str) -> str:
         """Return "default" or "--set" for a value that does not stand in the file."""
         place = self._plan.places.get(path)
-        if place is None and path.startswith("levels."):
-            _, index, stage, *rest = path.split(".")
-            # A level that keeps the component of its stage inherits the keys and the fallback of that stage.
-            own = f"levels.{index}.{stage}"
-            replaced = f"{own}.use" in places or (rest[:1] == ["fallback"] and f"{own}.fallback.0" in places)
-            if rest and not replaced:
-                place = places.get(".".join([stage, *rest]))
         if place is not None and place.override is not None:
             return "--set"
         return "default" if place is None or place.line is None else ""
