@@ -149,7 +149,7 @@ def test_a_correction_that_does_not_suit_the_capture_is_told_with_its_place(smal
     done = CliRunner().invoke(app, ["check", str(tmp_path / "scan.yaml")])
     assert done.exit_code == 2
     assert done.stderr == (
-        f"{tmp_path}/scan.yaml:5:5: corrections.1: {tmp_path}/bad.npy is of 132x168 px, and frames are of 124x160 px at this "
+        f"{tmp_path}/scan.yaml:5:5: corrections.1: {tmp_path}/bad.npy has 132x168 px, and frames have 124x160 px at this "
         "place of the list\n"
         "error: the spec has 1 problem\n"
     )

@@ -1,17 +1,13 @@
-"""Corrections of sensors: what is done to frames, in the order of a list, before anything else sees them."""
+"""Corrections of sensors: applied to frames in the order of a list, before any other stage."""
 
 from photonpano.corrections.dark import DarkCounts, DarkFrames, measure_dark, read_dark, write_dark
 from photonpano.corrections.geometry import (
+    TURNS,
     ColourSwissSpad2,
     Crop,
-    FlipLr,
-    FlipUd,
     GreySwissSpad2Full,
     GreySwissSpad2Half,
     MissingRow,
-    Rot90,
-    Rot180,
-    Rot270,
     SwapColumns,
 )
 from photonpano.corrections.hot_pixels import HotPixels, hot_in_the_dark
@@ -19,16 +15,14 @@ from photonpano.corrections.masks import ColourFilter, Mask
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import CorrectedSource, corrected_source
 
-CORRECTIONS: dict[str, type[Correction]] = {
-    correction.name: correction
-    for correction in (
-        *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
-        *(Crop, SwapColumns, MissingRow),
-        *(Rot90, Rot180, Rot270, FlipUd, FlipLr),
-        *(Mask, HotPixels, DarkCounts, ColourFilter),
-    )
-}
-"""All corrections by the names that specs call them."""
+_ALL: tuple[type[Correction], ...] = (
+    *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
+    *(Crop, SwapColumns, MissingRow),
+    *TURNS,
+    *(Mask, HotPixels, DarkCounts, ColourFilter),
+)
+CORRECTIONS = {correction.name: correction for correction in _ALL}
+"""All corrections by their names in specs."""
 
 __all__ = [
     "CORRECTIONS",

@@ -1,4 +1,4 @@
-"""Dark counts: measured in dark frames, stored, read again, and taken out of sums."""
+"""Dark counts: measure them in dark frames, store and read them, and subtract them from sums."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 DARK_FILE = "a file from `photonpano dark`, or a .npy file of rates, of the size of the frames at this place of the list"
 _AT_ONCE = 1024
-"""Frames that are summed between two reports of progress."""
+"""Frames summed between two reports of progress."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarkFrames:
-    """What frames show that were taken with the lens covered.
+    """Dark counts of each pixel, from frames taken with the lens covered.
 
     Attributes:
         rates: (H, W) float32, dark counts per frame: photons of binary frames, grey values of others.
-        n_frames: how many frames tell it; None if unknown.
+        n_frames: frames that they were measured in; None if unknown.
     """
 
     rates: FluxImage
@@ -59,7 +59,7 @@ class DarkCounts(Correction):
         return True
 
     def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
-        """Note what is to be taken out, and mask where that is too much; see `Correction`."""
+        """Add the rates to subtract, and mask pixels where they exceed the limit; see `Correction`."""
         rates = read_dark(self.dark).rates
         pixels.require(rates.shape, self.dark)
         noted = replace(pixels, dark_rates=pixels.dark_rates + rates)
@@ -70,19 +70,19 @@ class DarkCounts(Correction):
             n_masked = int((pixels.valid & high).sum())
             reason = f"pixels with more than limit = {self.limit:g} dark counts a frame are masked"
             decide("dark_counts_masked", n_masked, reason)
-        # What is masked needs no correction, which would be a large factor.
+        # Masked pixels need no correction, whose factor would be large.
         return replace(noted, valid=pixels.valid & ~high, dark_rates=np.where(high, np.float32(0), noted.dark_rates))
 
 
 def measure_dark(source: Source, advance: Callable[[int], object] | None = None) -> DarkFrames:
     """Measure the dark counts of a capture that was recorded with the lens covered.
 
-    The rate of a binary pixel is `-ln(1 - k / n)` for k counts in n frames, as flux is; that of another is the mean of its grey
-    values.
+    The rate of a binary pixel is `-ln(1 - k / n)` for k counts in n frames, as its flux is. The rate of other pixels is the
+    mean of their grey values.
 
     Args:
         source: the capture.
-        advance: is told how many frames have been read since the last call.
+        advance: called with the number of frames read since the last call.
     """
     info = source.info
     counts = np.zeros(info.frame_shape, np.uint64)
@@ -104,7 +104,7 @@ def read_dark(path: Path) -> DarkFrames:
     """Read dark counts: an .npz archive that `write_dark` wrote, or a .npy file of rates.
 
     Raises:
-        InputError: the file is missing, is something else, or holds rates that are negative or not finite.
+        InputError: the file is missing, holds something else, or rates that are negative or not finite.
     """
     arrays = read_arrays(path, "a file of dark counts", ("rates", "n_frames"))
     rates, n_frames = arrays.get("rates", arrays.get("")), arrays.get("n_frames")
@@ -119,5 +119,5 @@ def read_dark(path: Path) -> DarkFrames:
             f"column {column}"
         )
     if n_frames is not None and (n_frames.shape != () or n_frames.dtype.kind not in "iu" or n_frames < 1):
-        raise InputError(f"{path} is damaged: n_frames is no number of frames; write it again with `photonpano dark`")
+        raise InputError(f"{path} is damaged: n_frames is not a positive integer; write it again with `photonpano dark`")
     return DarkFrames(rates.astype(np.float32), None if n_frames is None else int(n_frames))

@@ -1,23 +1,22 @@
-"""Corrections that move pixels. Each is one numpy function, which is applied to the numbers of the pixels."""
+"""Corrections that move pixels: each applies one numpy function to an array of the pixels' numbers."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from photonpano.corrections.pixels import MISSING, Correction, numbered
+from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pixels, numbered
 from photonpano.errors import InputError
-
-if TYPE_CHECKING:
-    from photonpano.corrections.pixels import Decide, Index, Pixels
-    from photonpano.protocols import Source
+from photonpano.protocols import Source
 
 
 class Rearrangement(Correction):
-    """Moves pixels, and leaves out or adds some."""
+    """Moves, removes or inserts pixels."""
 
     def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
         """Move the pixels; see `Correction`."""
@@ -26,7 +25,7 @@ class Rearrangement(Correction):
 
     @abstractmethod
     def moved(self, pixels: Index) -> Index:
-        """Return the (H, W) numbers of pixels where they are to lie, -1 for pixels that the sensor does not have.
+        """Move the numbers of pixels, (H, W): -1 stands for a pixel that the sensor does not have.
 
         Raises:
             InputError: the frame is too small.
@@ -68,7 +67,7 @@ class SwapColumns(Rearrangement):
         if stop - start != other_stop - other_start:
             counts = f"{self.first[1] - self.first[0]} columns {list(self.first)} with the "
             counts += f"{self.second[1] - self.second[0]} columns {list(self.second)}"
-            raise ValueError(f"cannot swap the {counts}: there have to be as many")
+            raise ValueError(f"cannot swap the {counts}: the blocks differ in width")
         if other_start < stop:
             raise ValueError(f"cannot swap the columns {list(self.first)} with {list(self.second)}: they overlap")
         return self
@@ -85,7 +84,7 @@ class SwapColumns(Rearrangement):
 
 
 class MissingRow(Rearrangement):
-    """Inserts a row that the sensor does not have; it is masked, and the motion fills it."""
+    """Inserts a row that the sensor does not have. It is masked, and the motion fills it."""
 
     name: ClassVar[str] = "missing-row"
     before: int | None = Field(
@@ -103,58 +102,37 @@ class MissingRow(Rearrangement):
         return np.insert(pixels, before, MISSING, axis=0)
 
 
-class Rot90(Rearrangement):
-    """Turns the frame by 90 degrees clockwise."""
+class Turn(Rearrangement):
+    """Rotates or mirrors the frame.
 
-    name: ClassVar[str] = "rot90"
+    Attributes:
+        turn: the numpy function that does it.
+    """
 
-    def moved(self, pixels: Index) -> Index:
-        """See `Rearrangement`."""
-        return np.rot90(pixels, -1)
-
-
-class Rot180(Rearrangement):
-    """Turns the frame upside down, by 180 degrees."""
-
-    name: ClassVar[str] = "rot180"
+    turn: ClassVar[Callable[[Index], Index]]
 
     def moved(self, pixels: Index) -> Index:
         """See `Rearrangement`."""
-        return np.rot90(pixels, 2)
+        return type(self).turn(pixels)
 
 
-class Rot270(Rearrangement):
-    """Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."""
-
-    name: ClassVar[str] = "rot270"
-
-    def moved(self, pixels: Index) -> Index:
-        """See `Rearrangement`."""
-        return np.rot90(pixels, 1)
-
-
-class FlipUd(Rearrangement):
-    """Mirrors the frame: what was above is below."""
-
-    name: ClassVar[str] = "flip-ud"
-
-    def moved(self, pixels: Index) -> Index:
-        """See `Rearrangement`."""
-        return np.flipud(pixels)
+def _turns() -> tuple[type[Turn], ...]:
+    table: tuple[tuple[str, Callable[[Index], Index], str], ...] = (
+        ("rot90", partial(np.rot90, k=-1), "Turns the frame by 90 degrees clockwise."),
+        ("rot180", partial(np.rot90, k=2), "Turns the frame upside down, by 180 degrees."),
+        ("rot270", partial(np.rot90, k=1), "Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."),
+        ("flip-ud", np.flipud, "Mirrors the frame top to bottom."),
+        ("flip-lr", np.fliplr, "Mirrors the frame left to right."),
+    )
+    return tuple(type(name, (Turn,), {"name": name, "turn": staticmethod(turn), "__doc__": doc}) for name, turn, doc in table)
 
 
-class FlipLr(Rearrangement):
-    """Mirrors the frame: what was on the left is on the right."""
-
-    name: ClassVar[str] = "flip-lr"
-
-    def moved(self, pixels: Index) -> Index:
-        """See `Rearrangement`."""
-        return np.fliplr(pixels)
+TURNS = _turns()
+"""A class for each way to turn a frame."""
 
 
 class Preset(Rearrangement):
-    """What a known sensor needs: other corrections, one after the other.
+    """Other corrections, one after the other, that a known sensor needs.
 
     Attributes:
         shape: (height, width) of the frames that it is made for.
@@ -168,7 +146,7 @@ class Preset(Rearrangement):
         """See `Rearrangement`."""
         if pixels.shape != self.shape:
             wanted, here = ("x".join(map(str, shape)) for shape in (self.shape, pixels.shape))
-            raise InputError(f"{self.name} is for frames of {wanted} px, and they are of {here} px at this place of the list")
+            raise InputError(f"{self.name} is for frames of {wanted} px, and frames have {here} px at this place of the list")
         for step in self.steps:
             pixels = step.moved(pixels)
         return pixels
@@ -202,9 +180,9 @@ class GreySwissSpad2Full(Preset):
 
 
 def _part(ends: tuple[int | None, int | None], length: int, what: str) -> slice:
-    """Return the slice between two ends, which numpy would cut off where it reaches beyond the frame."""
+    """Return the slice between two ends; numpy would silently cut off what lies outside the frame."""
     start, stop = (default if end is None else end + length * (end < 0) for end, default in zip(ends, (0, length), strict=True))
     if not 0 <= start < stop <= length:
         given = ", ".join("null" if end is None else str(end) for end in ends)
-        raise InputError(f"the {what} [{given}] are no part of a frame, which has {length} {what} at this place of the list")
+        raise InputError(f"there are no {what} [{given}]: frames have {length} {what} at this place of the list")
     return slice(start, stop)

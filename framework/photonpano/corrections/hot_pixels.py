@@ -1,4 +1,4 @@
-"""Hot and dead pixels: found in dark frames, or in the capture itself."""
+"""Find hot and dead pixels, in dark frames or in the capture itself, and mask them."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from photonpano.values import BoolArray, FluxImage
 
 THRESHOLD = 10.0
-"""Standard deviations, told robustly: of real sensors this finds a few pixels in a hundred."""
+"""Default threshold, in robust standard deviations: it finds a few percent of the pixels of real sensors."""
 _SPANS, _SPAN_FRAMES = 16, 256
-"""So many spans, of so many frames each, are looked at of a capture: enough to blur the scene."""
+"""16 spans of 256 frames are summed all over the capture, which blurs the scene."""
 _REACH = 2
-"""A pixel is compared with those up to so many rows and columns away,"""
+"""Neighbourhood radius, px."""
 _ONE_IN = 6
-"""and is like them if one in so many is as bright: a straight edge or a line of the scene passes through as many, at the border
-of the frame as well."""
+"""A pixel is hot if it is brighter than the top 1/6 of its neighbours by the threshold. A straight edge or a line of the scene
+makes at least 1/6 of them bright, at the border of the frame as well."""
 _TO_STD = 1.4826
-"""Standard deviations of a normal distribution in its median absolute deviation."""
+"""Standard deviation of a normal distribution divided by its median absolute deviation."""
 
 
 class HotPixels(Correction):
@@ -67,16 +67,16 @@ class HotPixels(Correction):
 
 
 def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tuple[BoolArray, float]:
-    """Tell which pixels have far more dark counts than most.
+    """Return the pixels that have far more dark counts than most.
 
     Args:
-        dark: what dark frames show.
-        threshold: how many standard deviations above the median a pixel may be. They are told by the median absolute deviation,
-            and are those of the photons if that is more.
-        valid: (H, W) the pixels to look at.
+        dark: the dark counts.
+        threshold: standard deviations above the median from which a pixel is hot. The standard deviation comes from the median
+            absolute deviation, and is at least that of photon noise.
+        valid: (H, W) the pixels that count for the median.
 
     Returns:
-        (H, W), and the rate above which pixels are hot.
+        (H, W) mask of hot pixels, and the rate above which pixels are hot.
     """
     rates = dark.rates[valid]
     if not rates.size:
@@ -84,14 +84,14 @@ def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tup
     median = float(np.median(rates))
     std = _TO_STD * float(np.median(np.abs(rates - median)))
     if dark.n_frames is not None:
-        # A single count by chance makes no pixel hot.
+        # One count by chance must not make a pixel hot.
         std = max(std, float(np.sqrt(max(median, 1 / dark.n_frames) / dark.n_frames)))
     limit = median + threshold * std
     return dark.rates > limit, limit
 
 
 def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[BoolArray, int]:
-    """Return which pixels of a capture are brighter or darker than their neighbours, and how many frames tell it."""
+    """Return the pixels of a capture that are brighter or darker than their neighbours, and the number of frames compared."""
     spans = source.info.spread(_SPANS, _SPAN_FRAMES)
     seen = sum(map(len, spans))
     counts = np.sum([source.counts(span) for span in spans], axis=0)
@@ -107,7 +107,7 @@ def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[Boo
 
 
 def _ranked(image: FluxImage, one_in: int) -> FluxImage:
-    """Return what one in so many of the neighbours of each pixel reach, itself not among them; NaN where few are known."""
+    """Return, for each pixel, the value that `1 / one_in` of its neighbours reach; NaN where fewer than 6 are known."""
     side = 2 * _REACH + 1
     padded = np.pad(image, _REACH, constant_values=np.nan)
     windows = sliding_window_view(padded, (side, side)).reshape(*image.shape, side * side)

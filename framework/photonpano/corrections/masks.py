@@ -1,4 +1,4 @@
-"""Corrections that mask pixels which somebody knows: bad ones, and those under a colour filter."""
+"""Corrections that mask pixels listed in a file: bad ones, and those behind a colour filter."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COLOURS: dict[Colour, tuple[int, int, int]] = {
     "green": (0, 255, 0),
     "blue": (0, 0, 255),
 }
-"""How a pattern shows them: red, green, blue."""
+"""Red, green and blue of each colour in a pattern."""
 
 
 class Mask(Correction):
@@ -89,7 +89,7 @@ class ColourFilter(Correction):
 
 
 def _of_colours(pattern: NDArray[np.uint8], colours: Iterable[Colour]) -> BoolArray:
-    """Return where a pattern has one of some colours: (H, W)."""
+    """Return a mask of the pixels that have one of the colours: (H, W)."""
     found: BoolArray = np.logical_or.reduce([np.all(pattern == COLOURS[colour], axis=-1) for colour in colours])
     return found
 

@@ -1,4 +1,4 @@
-"""What a list of corrections makes of the pixels of a frame."""
+"""The pixels of a frame after some corrections, and the interface of a correction."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from photonpano.values import BoolArray, FluxImage
 
 Index: TypeAlias = NDArray[np.intp]
 Decide: TypeAlias = Callable[[str, int, str], None]
-"""Is told what was chosen, its value, and the reason."""
+"""Records a decision: what was chosen, its value, and the reason."""
 MISSING = -1
-"""Stands in an index for a pixel that the sensor does not have."""
+"""The index of a pixel that the sensor does not have."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,10 +27,10 @@ class Pixels:
     """The pixels of a frame after some corrections; every array is (H, W).
 
     Attributes:
-        index: intp, where each lies in the frame as it is read, counted along its rows; -1 where there is none.
-        valid: whether it may be used.
-        interpolated: whether its neighbours stand in for it.
-        dark_rates: float32, dark counts per frame that are to be taken out: photons of binary frames, else grey values.
+        index: intp, the number of each pixel in the frame as it is read, counted along its rows; -1 where there is none.
+        valid: False for pixels that must not be used.
+        interpolated: True for pixels that are replaced by their neighbours.
+        dark_rates: float32, dark counts per frame to subtract: photons of binary frames, grey values of others.
     """
 
     index: Index
@@ -40,7 +40,7 @@ class Pixels:
 
     @classmethod
     def as_read(cls, valid: BoolArray) -> Pixels:
-        """Return the pixels of a source without corrections, of which `valid` may be used."""
+        """Return the pixels of a source without corrections."""
         nothing = np.zeros(valid.shape, np.bool_)
         return cls(numbered(valid.shape), valid, nothing, np.zeros(valid.shape, np.float32))
 
@@ -51,7 +51,7 @@ class Pixels:
         return height, width
 
     def rearranged(self, order: Index) -> Pixels:
-        """Return them in another order: the numbers of pixels, see `numbered`, where they are to lie, or -1."""
+        """Return the pixels in another order, given as their numbers (see `numbered`), or -1."""
         missing = order == MISSING
         return Pixels(
             np.where(missing, MISSING, self.index.ravel()[order]),
@@ -61,46 +61,46 @@ class Pixels:
         )
 
     def without(self, bad: BoolArray) -> Pixels:
-        """Return them with some more that must not be used."""
+        """Return the pixels with more of them masked."""
         return replace(self, valid=self.valid & ~bad)
 
     def require(self, shape: tuple[int, ...], what: object) -> None:
-        """Refuse what is not of the size that frames have after the corrections so far.
+        """Refuse a file whose size differs from that of frames after the corrections so far.
 
         Raises:
-            InputError: says both sizes.
+            InputError: the sizes differ.
         """
         if shape != self.shape:
             given, here = ("x".join(map(str, size)) for size in (shape, self.shape))
-            raise InputError(f"{what} is of {given} px, and frames are of {here} px at this place of the list")
+            raise InputError(f"{what} has {given} px, and frames have {here} px at this place of the list")
 
 
 class Correction(Config, ABC):
     """One correction of a list: its settings, and what it does.
 
     Attributes:
-        name: what specs call it.
+        name: its name in specs.
     """
 
     name: ClassVar[str]
 
     @property
     def changes_sums(self) -> bool:
-        """Whether it takes something out of sums of frames, rather than moving or masking pixels."""
+        """Whether it subtracts something from sums of frames, rather than moving or masking pixels."""
         return False
 
     @abstractmethod
     def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
-        """Apply it to what the corrections before it have left.
+        """Apply the correction to the pixels that the corrections before it have left.
 
         Args:
             pixels: the pixels so far.
             source: the capture as it is read.
-            decide: is told what was chosen because of what the capture or a file shows; None as long as no frame may be read,
-                where what depends on frames is left out.
+            decide: records what was chosen because of the capture or a file. None means that no frame may be read yet: the
+                correction leaves out what depends on frames.
 
         Raises:
-            InputError: it does not suit the pixels, or a file is not what it should be.
+            InputError: the correction does not suit the pixels, or a file holds something else.
         """
 
 

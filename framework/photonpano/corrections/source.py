@@ -1,4 +1,4 @@
-"""A capture as its sensor should have recorded it."""
+"""Apply corrections to a source."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from photonpano.values import BoolArray, Counts, Decision, FluxImage, FrameSpan,
 
 _TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
 _CORNER_WEIGHT = 0.5
-"""A pixel that touches another with a corner only counts so much."""
+"""Weight of a neighbour that touches a pixel with a corner only, relative to one that shares an edge."""
 
 
 def apply_corrections(
@@ -27,22 +27,22 @@ def apply_corrections(
     decide: Decide | None = None,
     blame: Callable[[int, str], Exception] | None = None,
 ) -> Pixels:
-    """Return what corrections make of the pixels of a capture, one after the other.
+    """Apply corrections to the pixels of a capture, one after the other.
 
     Args:
         source: the capture as it is read.
         corrections: in the order in which they are applied.
         decide: see `Correction.applied`.
-        blame: makes the error of what is wrong with a correction, given as its place in the list, from a sentence.
+        blame: makes the error to raise, from the place of the correction in the list and a sentence.
 
     Raises:
-        InputError: a correction does not suit the capture, a file is not what it should be, or no pixel is left.
+        InputError: a correction does not suit the capture, a file holds something else, or no pixel is left.
     """
     pixels = Pixels.as_read(source.valid)
     for place, correction in enumerate(corrections):
         try:
             if isinstance(source, LinearlyCorrectedSource):
-                raise InputError("this source takes things out of its sums itself, and cannot be corrected further")
+                raise InputError("this source corrects its sums itself, and cannot be corrected further")
             pixels = correction.applied(pixels, source, decide)
             if not pixels.valid.any():
                 raise InputError(f"{correction.name} leaves no pixel that may be used")
@@ -142,7 +142,7 @@ class _CorrectedSums(CorrectedSource):
 
 
 class _Gather:
-    """Takes the pixels of an index from frames, as a plain slice where they are one."""
+    """Gathers the pixels of an index from frames; as a slice if the index is a contiguous part of the frame."""
 
     def __init__(self, index: Index, frame_shape: tuple[int, int]) -> None:
         self._missing = index == MISSING
@@ -161,7 +161,7 @@ class _Gather:
 
 
 def _slices(index: Index, frame_shape: tuple[int, int]) -> tuple[slice, slice] | None:
-    """Return the rows and columns that an index takes, if it takes a part of the frame as it lies."""
+    """Return the rows and columns of an index that is a contiguous part of the frame; None for others."""
     top, left = divmod(int(index[0, 0]), frame_shape[1])
     part = slice(top, top + index.shape[0]), slice(left, left + index.shape[1])
     return part if np.array_equal(numbered(frame_shape)[part], index) else None
@@ -169,18 +169,18 @@ def _slices(index: Index, frame_shape: tuple[int, int]) -> tuple[slice, slice] |
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Estimate:
-    """How sums of frames become those of a sensor without faults.
+    """Corrects sums of frames for dark counts and missing pixels.
 
-    With the dark counts d a frame, a pixel of n binary frames stays dark in `n exp(-f - d)` of them on average; so
-    `n - (n - k) exp(d)` of k counts is what it would have counted without them, on average.
+    With flux f and dark counts d per frame, a pixel stays dark in `n exp(-f - d)` of n binary frames on average. So k counts
+    become `n - (n - k) exp(d)`, which is on average the count without dark counts.
 
     Attributes:
         valid: (H, W) bool, pixels that may be used.
-        gain: (H, W) float32, what counts are multiplied by; 1 where nothing is to be done.
-        offset: (H, W) float32, what is taken off for each frame.
-        filled: (P,) numbers of the pixels for which their neighbours stand in,
-        neighbours: (P, 8) numbers of those,
-        weights: (P, 8) float32, and how much they count; 1 together.
+        gain: (H, W) float32, factor of the counts; 1 where there is nothing to correct.
+        offset: (H, W) float32, subtracted for each frame.
+        filled: (P,) numbers of the pixels that are replaced by their neighbours.
+        neighbours: (P, 8) numbers of the neighbours of each.
+        weights: (P, 8) float32, weights of the neighbours; each row sums to 1.
     """
 
     valid: BoolArray
@@ -192,11 +192,11 @@ class _Estimate:
 
     @classmethod
     def of(cls, pixels: Pixels, binary: bool) -> _Estimate:
-        """Prepare what is done to each sum."""
+        """Compute the correction once for all sums."""
         rates = pixels.dark_rates
         gain, offset = (np.exp(rates), np.expm1(rates)) if binary else (np.ones_like(rates), rates)
         filled, neighbours, weights = _filling(pixels)
-        # Where no neighbour may be used, the motion fills the pixel.
+        # A pixel without a usable neighbour is masked: the motion fills it.
         lonely = weights.sum(axis=1) == 0
         valid = pixels.valid.copy()
         valid.ravel()[filled[lonely]] = False
@@ -205,7 +205,7 @@ class _Estimate:
         return cls(valid, gain, offset, filled, neighbours, weights / weights.sum(axis=1, keepdims=True))
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """Return the sum of frames of a sensor without faults: see `LinearlyCorrectedSource`."""
+        """Correct a sum of frames: see `LinearlyCorrectedSource`."""
         summed = counts * self.gain - np.float32(n_frames) * self.offset
         summed = summed.astype(np.float32, copy=False)
         flat = summed.reshape(-1)
@@ -214,7 +214,7 @@ class _Estimate:
 
 
 def _filling(pixels: Pixels) -> tuple[Index, Index, FluxImage]:
-    """Return the pixels to be interpolated, those that touch them, and how much these count; 0 for one that may not be used."""
+    """Return the pixels to interpolate, their neighbours, and the weights of these: 0 for one that must not be used."""
     height, width = pixels.shape
     usable = np.pad(pixels.valid & ~pixels.interpolated, 1)
     rows, columns = np.nonzero(pixels.interpolated & pixels.valid)

@@ -95,9 +95,7 @@ def test_problem_of_opened_capture_is_attributed_to_its_option(
     name, *others = command
     result = invoke(name, "cube.npy", *others, "--correct", "{crop: {rows: [9, null]}}")
     assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr == (
-        "error: --correct: the rows [9, null] are no part of a frame, which has 8 rows at this place of the list\n"
-    )
+    assert result.stderr == ("error: --correct: there are no rows [9, null]: frames have 8 rows at this place of the list\n")
 
 
 def test_unreadable_capture_names_recognised_source(folder: Path, invoke: Callable[..., Any]) -> None:

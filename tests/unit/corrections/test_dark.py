@@ -114,5 +114,5 @@ def test_archives_of_something_else_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is an archive without `rates`; name what `photonpano dark` wrote, or a"):
         read_dark(path)
     np.savez(path, rates=np.zeros((2, 2)), n_frames=np.array(-3))
-    with pytest.raises(InputError, match="is damaged: n_frames is no number of frames"):
+    with pytest.raises(InputError, match="is damaged: n_frames is not a positive integer"):
         read_dark(path)

@@ -107,15 +107,15 @@ def test_a_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, co
     [
         (
             {"crop": {"rows": [2, 300]}},
-            "the rows [2, 300] are no part of a frame, which has 6 rows at this place of the list",
+            "there are no rows [2, 300]: frames have 6 rows at this place of the list",
         ),
         (
             {"crop": {"columns": [-12, None]}},
-            "the columns [-12, null] are no part of a frame, which has 10 columns at this place of the list",
+            "there are no columns [-12, null]: frames have 10 columns at this place of the list",
         ),
         (
             {"crop": {"rows": [4, 4]}},
-            "the rows [4, 4] are no part of a frame, which has 6 rows at this place of the list",
+            "there are no rows [4, 4]: frames have 6 rows at this place of the list",
         ),
         (
             {"swap-columns": {"first": [0, 2], "second": [9, 11]}},
@@ -124,7 +124,7 @@ def test_a_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, co
         ({"missing-row": {"before": 7}}, "there is no row 7: frames have 6 rows at this place of the list"),
         (
             "colour-swissspad2",
-            "colour-swissspad2 is for frames of 256x512 px, and they are of 6x10 px at this place of the list",
+            "colour-swissspad2 is for frames of 256x512 px, and frames have 6x10 px at this place of the list",
         ),
     ],
 )

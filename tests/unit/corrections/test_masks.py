@@ -46,9 +46,9 @@ def test_a_mask_is_of_the_size_at_its_place_of_the_list(refused: Callable, tmp_p
     np.save(tmp_path / "bad.npy", np.zeros((10, 6), bool))
     mask = {"mask": {"file": "bad.npy"}}
     file = tmp_path / "bad.npy"
-    assert refused(mask) == f"{file} is of 10x6 px, and frames are of 6x10 px at this place of the list"
+    assert refused(mask) == f"{file} has 10x6 px, and frames have 6x10 px at this place of the list"
     assert refused({"crop": {"rows": [2, None]}}, "rot90", mask) == (
-        f"{file} is of 10x6 px, and frames are of 10x4 px at this place of the list"
+        f"{file} has 10x6 px, and frames have 10x4 px at this place of the list"
     )
 
 

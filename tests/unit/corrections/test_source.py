@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from photonpano import Config, FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, SourceContribution
-from photonpano.corrections import corrected_source
-from photonpano.corrections.geometry import Crop, MissingRow, Rot90
+from photonpano.corrections import CORRECTIONS, corrected_source
+from photonpano.corrections.geometry import Crop, MissingRow
 from photonpano.testing import MemorySource, SourceConformance
 
 N, SHAPE = 40, (12, 16)
@@ -31,7 +31,7 @@ class TestCorrectedSource(SourceConformance):
     """Turned, cropped and with a row that is missing: what the kit asks of any source."""
 
     def opened(self) -> Any:
-        return corrected_source(MemorySource(self.known_frames()), (Rot90(), Crop(rows=(1, -2)), MissingRow()))
+        return corrected_source(MemorySource(self.known_frames()), (CORRECTIONS["rot90"](), Crop(rows=(1, -2)), MissingRow()))
 
     contribution = SourceContribution(name="moved", summary="Toy", config=MovedConfig, build=lambda *_: None)
 
@@ -86,7 +86,7 @@ def test_a_source_that_corrects_its_sums_is_refused(frames: np.ndarray, correcti
     """What it takes out would be lost, as it is of the size of its own frames."""
     np.save(tmp_path / "dark.npy", np.zeros(SHAPE))
     once = corrected_source(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
-    with pytest.raises(InputError, match="takes things out of its sums itself, and cannot be corrected further"):
+    with pytest.raises(InputError, match="corrects its sums itself, and cannot be corrected further"):
         corrected_source(once, corrections("rot90"))
 
 

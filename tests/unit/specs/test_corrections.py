@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from photonpano import SpecError
-from photonpano.corrections.geometry import Crop, Rot90
+from photonpano.corrections import CORRECTIONS
+from photonpano.corrections.geometry import Crop
 from photonpano.registry import Catalog
 from photonpano.specs import load_spec, parse_spec
 
@@ -47,9 +48,9 @@ def test_files_that_are_missing_are_told_with_their_place(catalog: Catalog, tmp_
 def test_settings_can_be_overridden(catalog: Catalog) -> None:
     written = spec("rot90", {"crop": {"rows": [0, 4]}})
     changed = parse_spec(written, overrides=["corrections.1.crop.rows=[2, null]"], catalog=catalog)
-    assert changed.corrections == (Rot90(), Crop(rows=(2, None)))
+    assert changed.corrections == (CORRECTIONS["rot90"](), Crop(rows=(2, None)))
     replaced = parse_spec(written, overrides=["corrections=[rot90]"], catalog=catalog)
-    assert replaced.corrections == (Rot90(),)
+    assert replaced.corrections == (CORRECTIONS["rot90"](),)
     assert replaced.document["corrections"] == ["rot90"]
 
 
