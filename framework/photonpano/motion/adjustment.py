@@ -24,6 +24,7 @@ from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3
+"""A step that moves no corner by more than about this has converged."""
 CAUCHY = 2.385
 """Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise)."""
 OUTLIER = 8.0

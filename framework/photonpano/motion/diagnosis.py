@@ -83,24 +83,24 @@ def require_tied(
     longest = max(map(len, runs), default=0)
     if tied.sum() >= 2 and (longest <= TOLERATED_RUN or disconnected == "largest"):
         return
-    failures = [edge for edge in edges if isinstance(edge.motion, NotLocated)]
-    lost = [_frames(run) for run in runs[:_SHOWN]]
-    if len(runs) > _SHOWN:
-        lost.append(f"{len(runs) - _SHOWN} more spans")
-    lines = [
-        f"level {level}: {len(failures)} of {len(edges)} pairs of exposures could not be located, "
-        f"so that {listed(lost)} cannot be tied to the rest"
-        if tied.sum() >= 2
-        else f"level {level}: none of the {len(edges)} pairs of exposures could be located"
+    reasons = [
+        f"  {groups[edge.moving]} onto {groups[edge.fixed]}: {edge.motion.reason}"
+        for edge in edges
+        if isinstance(edge.motion, NotLocated)
     ]
-    if tied.sum() >= 2:
-        lines.append(f"Parts that are tied together: {_tied_together(groups, parts)}.")
-    lines += [_pair(edge, groups) for edge in failures[:_SHOWN]]
-    if len(failures) > _SHOWN:
-        lines.append(f"  ... and {len(failures) - _SHOWN} more")
-    lines += _advice(groups, tied, contrasts)
-    if tied.sum() >= 2:
-        lines.append("To go on with the largest part alone, set graph.disconnected to largest.")
+    more = [f"  ... and {len(reasons) - _SHOWN} more"] if len(reasons) > _SHOWN else []
+    lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts)]
+    if tied.sum() < 2:
+        lines.insert(0, f"level {level}: none of the {len(edges)} pairs of exposures could be located")
+    else:
+        lost = [_frames(run) for run in runs[:_SHOWN]] + ([f"{len(runs) - _SHOWN} more spans"] if len(runs) > _SHOWN else [])
+        lines = [
+            f"level {level}: {len(reasons)} of {len(edges)} pairs of exposures could not be located, "
+            f"so that {listed(lost)} cannot be tied to the rest",
+            f"Parts that are tied together: {_tied_together(groups, parts)}.",
+            *lines,
+            "To go on with the largest part alone, set graph.disconnected to largest.",
+        ]
     raise LocationError("\n".join(lines))
 
 
@@ -134,11 +134,6 @@ def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Co
         f"{seen}, so darkness is not the cause: either motion blurs them (try smaller groups, such as "
         f"resample.with.group_size={max(1, size // 2)}), or the scene has no texture there."
     ]
-
-
-def _pair(edge: Edge, groups: Sequence[Group]) -> str:
-    assert isinstance(edge.motion, NotLocated)
-    return f"  {groups[edge.moving]} onto {groups[edge.fixed]}: {edge.motion.reason}"
 
 
 def _runs(groups: Sequence[Group], flags: BoolArray) -> list[Sequence[Group]]:

@@ -9,11 +9,11 @@ from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order
 
 from photonpano.geometry import inverse, normalised
 from photonpano.motion.adjustment import Adjustment
+from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 
@@ -62,7 +62,7 @@ class GraphSolution:
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
     """Number the connected components of the located edges, the largest first: (N,)."""
-    _, labels = connected_components(_adjacency(n_nodes, _pairs(edges)), directed=False)
+    labels = component_labels(n_nodes, _pairs(edges))
     by_size = np.argsort(-np.bincount(labels), kind="stable")
     return np.asarray(np.argsort(by_size)[labels])
 
@@ -82,7 +82,7 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
     """
     located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
     pairs = _pairs(edges)
-    order, parents = breadth_first_order(_adjacency(n_nodes, pairs), anchor, directed=False)
+    order, parents = breadth_first_order(adjacency(n_nodes, pairs), anchor, directed=False)
     located = np.zeros(n_nodes, dtype=bool)
     located[order] = True
     tied = [index for index, (moving, _) in enumerate(pairs) if located[moving]]
@@ -101,7 +101,7 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
     kept = np.ones(len(tied), dtype=bool)
     found, norms = adjustment.minimise(homographies[located], kept)
     inliers = adjustment.inliers(norms)
-    if not inliers.all() and _connected(len(order), compact[pairs][inliers]):
+    if not inliers.all() and not component_labels(len(order), compact[pairs][inliers]).any():
         kept = inliers
         found, norms = adjustment.minimise(found, kept)
     homographies[located] = found
@@ -114,15 +114,6 @@ def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
     """Return the (moving, fixed) of the located edges: (E, 2)."""
     located = [(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]
     return np.array(located, dtype=int).reshape(-1, 2)
-
-
-def _connected(n_nodes: int, pairs: NDArray[np.integer]) -> bool:
-    return bool(connected_components(_adjacency(n_nodes, pairs), directed=False)[0] == 1)
-
-
-def _adjacency(n_nodes: int, pairs: NDArray[np.integer]) -> sparse.csr_array:
-    ones = np.ones(len(pairs))
-    return sparse.csr_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(n_nodes, n_nodes))
 
 
 def _compose_tree(

@@ -39,11 +39,11 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
                     (max(index, each), min(index, each)) for each in partners if each != index and 0 <= each < len(groups)
                 }
     # Neighbours connect the graph, for instance of a capture that is hardly longer than a group.
-    components = _components(len(groups), pairs)
+    labels = component_labels(len(groups), np.array(sorted(pairs), dtype=int).reshape(-1, 2))
     pairs |= {
         (later, later - 1)
         for later in range(1, len(groups))
-        if components[later] != components[later - 1] or not shared_share(groups[later].span, groups[later - 1].span)
+        if labels[later] != labels[later - 1] or not shared_share(groups[later].span, groups[later - 1].span)
     }
     return sorted(pairs)
 
@@ -64,11 +64,14 @@ def independent_share(groups: Sequence[Group]) -> float:
     return min(1.0, float(np.median(np.diff(instants_of(groups))) / np.median(lengths_of(groups))))
 
 
-def _components(n_groups: int, pairs: set[tuple[int, int]]) -> NDArray[np.integer]:
-    """Number the connected components of the groups: (N,)."""
-    moving, fixed = np.array(sorted(pairs), dtype=int).reshape(-1, 2).T
-    adjacency = sparse.csr_array((np.ones(len(moving)), (moving, fixed)), shape=(n_groups, n_groups))
-    return np.asarray(connected_components(adjacency, directed=False)[1])
+def adjacency(n_nodes: int, pairs: NDArray[np.integer]) -> sparse.csr_array:
+    """Return the adjacency matrix of a graph: 1 where a pair of (P, 2) has its row and column, 0 elsewhere."""
+    return sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_nodes, n_nodes))
+
+
+def component_labels(n_nodes: int, pairs: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Number the connected components of a graph, given its (P, 2) pairs: (N,) the component of each node."""
+    return np.asarray(connected_components(adjacency(n_nodes, pairs), directed=False)[1])
 
 
 def instants_of(groups: Sequence[Group]) -> FloatArray:
