@@ -1,4 +1,4 @@
-"""Every component that comes with photonpano is held to what the conformance kit asks of others."""
+"""Every component that comes with photonpano is tested with the conformance kit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OURS = [(entry.kind, entry.name) for entry in discover().rows if entry.origin.pl
 
 @pytest.fixture(scope="module")
 def tested() -> set[tuple[str, str]]:
-    """Return kind and name of what has a subclass of the kit that pytest collects."""
+    """Return kind and name of all contributions under test in a class of the kit."""
     found = {(own.kind, own.name) for own in (AUTO, CHAIN)}
     for path in PLUGINS.glob("*/test_conformance.py"):
         spec = importlib.util.spec_from_file_location(f"conformance_of_{path.parent.name}", path)
@@ -32,7 +32,7 @@ def tested() -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("kind", "name"), OURS)
-def test_our_own_components_are_held_to_the_kit(kind: str, name: str, tested: set[tuple[str, str]]) -> None:
+def test_own_components_have_conformance_tests(kind: str, name: str, tested: set[tuple[str, str]]) -> None:
     assert (kind, name) in tested, f"add a subclass of {kind.capitalize()}Conformance to tests/plugins/*/test_conformance.py"
 
 

@@ -1,6 +1,4 @@
-"""The conformance kit: what a plugin promises, as tests that its author subclasses.
-
-A class for each kind of component, for pytest:
+"""The conformance kit: the contract of each kind of component, as test classes for authors of plugins to subclass.
 
     from photonpano.testing import LocatorConformance
 
@@ -9,9 +7,8 @@ A class for each kind of component, for pytest:
         config = {"min_inliers": 20}
         tolerance_px = 0.5
 
-Beside them stand the scenes, motions and captures that the checks use, for tests of one's own. Tests import this package, and
-nothing else does: it needs pytest (`pip install "photonpano[testing]"`). Each name is imported when it is first used, so that
-pytest starts as fast as without it.
+The scenes, motions and captures of the checks are public, too. The package needs pytest (`pip install "photonpano[testing]"`);
+only tests import it. Names are imported on first use, so that pytest starts as fast as without the kit.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Captures, motions and exposures in memory, with photon noise: what components are given to work on."""
+"""Simulated captures, motions and exposures in memory, with photon noise: inputs of the components under test."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class MemorySource(Closing):
     """Binary frames held in memory: a `photonpano.Source`."""
 
     def __init__(self, frames: ArrayLike, valid: BoolArray | None = None) -> None:
-        """Take frames of zeros and ones, (n, H, W), and the (H, W) mask of pixels that may be used; by default all."""
+        """Take (n, H, W) frames of zeros and ones, and the (H, W) mask of usable pixels, by default all."""
         self._frames = np.asarray(frames, dtype=np.uint8)
         n_frames, height, width = self._frames.shape
         self.info = StreamInfo(n_frames, height, width, frame_rate_hz=None)
@@ -40,7 +40,7 @@ class MemorySource(Closing):
 
 
 class ReadOnlySource(MemorySource):
-    """The same with arrays that cannot be written to."""
+    """A `MemorySource` whose arrays are read-only."""
 
     def __init__(self, frames: ArrayLike, valid: BoolArray | None = None) -> None:
         super().__init__(frames, valid)
@@ -56,7 +56,7 @@ class ReadOnlySource(MemorySource):
 
 
 class KnownMotion:
-    """A `photonpano.Trajectory` that a function of one instant gives."""
+    """A `photonpano.Trajectory` defined by a function of one instant."""
 
     def __init__(self, at: Callable[[float], Homography]) -> None:
         self._at = at
@@ -67,21 +67,21 @@ class KnownMotion:
 
 
 def read_only(array: NDArray[Number]) -> NDArray[Number]:
-    """Return a copy that cannot be written to."""
+    """Return a read-only copy."""
     array = array.copy()
     array.flags.writeable = False
     return array
 
 
 def recorded(scene: Scene, motion: Trajectory, n_frames: int, shape: tuple[int, int], seed: int = 0) -> NDArray[np.uint8]:
-    """Record a scene with a binary camera (paper, equation 2).
+    """Simulate frames of a scene from a binary camera (paper, equation 2).
 
     Args:
-        scene: what is seen.
+        scene: the scene.
         motion: pixels of a frame to points of the scene.
         n_frames: number of frames.
         shape: (height, width) of a frame.
-        seed: the chance of the photons.
+        seed: seed of the photon noise.
 
     Returns:
         (n_frames, H, W) of zeros and ones.
@@ -94,13 +94,13 @@ def recorded(scene: Scene, motion: Trajectory, n_frames: int, shape: tuple[int, 
 
 
 def photographed(flux: FloatArray, n_frames: int = 1000, seed: int = 0, unseen: BoolArray | None = None) -> VirtualExposure:
-    """Take a virtual exposure of a camera that stands still, with the photon noise of so many binary frames.
+    """Simulate a virtual exposure of a still camera, with the photon noise of `n_frames` binary frames.
 
     Args:
         flux: (H, W), photons per pixel per frame.
-        n_frames: frames that are merged.
-        seed: the chance of the photons.
-        unseen: (H, W) pixels that are unknown.
+        n_frames: number of merged frames.
+        seed: seed of the photon noise.
+        unseen: (H, W), true for pixels without any observation.
     """
     response = BinaryResponse()
     counts = np.random.default_rng(seed).binomial(n_frames, -np.expm1(-flux))

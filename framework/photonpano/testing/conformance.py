@@ -1,4 +1,4 @@
-"""What every contribution promises, whatever its kind."""
+"""Checks of every contribution, whatever its kind."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ HEAVY = frozenset(
         "zarr",
     }
 )
-"""Libraries that take long to import. numpy is not among them."""
+"""Libraries that take long to import; numpy is allowed."""
 
 _MODULES_OF = """
 import importlib, importlib.util, json, runpy, sys
@@ -62,13 +62,13 @@ print(json.dumps(sorted({name.partition(".")[0] for name in set(sys.modules) - b
 
 @pytest.mark.usefixtures("photonpano_one_thread_inside")
 class Conformance:
-    """Checks of names, configs and imports; the classes of the kinds add what components of the kind promise.
+    """Checks of summaries, configs and imports. Subclasses for each kind add checks of its components.
 
     Attributes:
-        contribution: what is tested; set it in a subclass.
+        contribution: the contribution under test; set it in a subclass.
         config: the keys under `with`. Set it on `self` in a fixture with `autouse=True` if it needs files.
         hook_module: the module that offers the contribution; by default the one in which its `build` is defined.
-        heavy: top-level modules that must not be imported before a component is built, beside those that it requires.
+        heavy: top-level modules that must not be imported before a component is built, in addition to those that it requires.
     """
 
     kind: ClassVar[str]
@@ -84,37 +84,37 @@ class Conformance:
         return self.contribution.config.model_validate(dict(self.config))
 
     def require_libraries(self) -> None:
-        """Skip a test where a library is missing that the contribution says it requires."""
+        """Skip a test if a library that the contribution requires is not installed."""
         for requirement in self.contribution.requires:
             if importlib.util.find_spec(requirement.module) is None:
                 pytest.skip(f"{self.contribution.name} needs {requirement.module}: pip install {requirement.install}")
 
-    def test_the_record_is_of_the_kind_that_this_class_tests(self) -> None:
-        """Specs look components up by kind."""
+    def test_contribution_has_the_kind_of_this_class(self) -> None:
+        """Specs look up components by kind."""
         wanted = KINDS[self.kind].contribution
         assert isinstance(self.contribution, wanted), (
             f"{type(self).__name__} tests a {self.kind}: contribution must be a {wanted.__name__}, "
             f"got {type(self.contribution).__name__}"
         )
 
-    def test_the_name_and_the_summary_fit_a_list(self) -> None:
-        """`photonpano plugins list` gives each a line."""
+    def test_summary_is_one_line_without_full_stop(self) -> None:
+        """`photonpano plugins list` prints each on one line."""
         summary = self.contribution.summary
         assert summary == " ".join(summary.split()), f"the summary must be one line without spaces around it, got {summary!r}"
-        assert summary, f"the summary of {self.contribution.name!r} is empty; say in a line what the component does"
-        assert not summary.endswith("."), f"the summary is a line of a list: drop the full stop of {summary!r}"
+        assert summary, f"the summary of {self.contribution.name!r} is empty; describe the component in one line"
+        assert not summary.endswith("."), f"the summary must not end with a full stop: {summary!r}"
 
-    def test_the_config_is_closed_and_frozen(self) -> None:
-        """A misspelt key is an error, and components that share a config cannot change it."""
+    def test_config_is_closed_and_frozen(self) -> None:
+        """A misspelt key is an error, and no component can modify a config that others share."""
         for model in models_in(self.contribution.config):
             extra, frozen = model.model_config.get("extra"), model.model_config.get("frozen")
             assert (extra, frozen) == ("forbid", True), (
                 f"{model.__name__} must be closed and frozen: derive it from photonpano.Config; "
-                f"its model_config says extra={extra!r}, frozen={frozen!r}"
+                f"its model_config has extra={extra!r}, frozen={frozen!r}"
             )
 
-    def test_every_key_of_the_config_is_described(self) -> None:
-        """The description is what users see in `plugins show`, in messages and in editors."""
+    def test_config_keys_have_descriptions(self) -> None:
+        """Users see descriptions in `plugins show`, in messages and in editors."""
         missing = [
             f"{model.__name__}.{key}"
             for model in models_in(self.contribution.config)
@@ -122,34 +122,34 @@ class Conformance:
             if not field.description
         ]
         assert not missing, (
-            f"every key needs a description, with its unit: write Field(..., description='...') for {', '.join(missing)}"
+            f"every key needs a description with its unit: add Field(..., description='...') to {', '.join(missing)}"
         )
 
-    def test_an_unknown_key_is_refused(self) -> None:
-        """Users misspell."""
+    def test_config_refuses_unknown_key(self) -> None:
+        """Typing errors are reported, not ignored."""
         try:
             self.contribution.config.model_validate({**self.config, "no-such-key": 1})
             problems = "nothing"
         except ValidationError as error:
             problems = ", ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
         assert problems == "no-such-key: Extra inputs are not permitted", (
-            f"an unknown key must be refused, and nothing else of the config under test; pydantic finds: {problems}"
+            f"the config must refuse an unknown key, and accept the config under test; problems found: {problems}"
         )
 
-    def test_the_config_comes_back_from_a_run_record(self) -> None:
-        """`run.json` holds the spec of the run, from which it can be repeated."""
+    def test_config_survives_json_round_trip(self) -> None:
+        """`run.json` contains the spec, from which a run can be repeated."""
         settings = self.settings()
         written = json.loads(json.dumps(settings.model_dump(mode="json")))
-        again = raising_nothing(
+        again = must_not_raise(
             f"reading the config from the record {written}", self.contribution.config.model_validate, written
         )
         assert again == settings, (
-            f"a config that is written as JSON must be read as the same config; {settings!r} was written as {written} "
-            f"and became {again!r}"
+            f"a config that is written as JSON must be read as the same config; {settings!r} was written as {written}, which "
+            f"was read as {again!r}"
         )
 
-    def test_the_hook_module_imports_nothing_heavy(self) -> None:
-        """It is imported whenever plugins are listed; libraries are imported in `build`."""
+    def test_hook_module_imports_no_heavy_library(self) -> None:
+        """It is imported whenever plugins are listed; `build` imports libraries."""
         module = self.hook_module or self.contribution.build.__module__
         heavy = self.heavy | {requirement.module.partition(".")[0] for requirement in self.contribution.requires}
         imported = sorted(modules_of(module) & heavy)
@@ -159,15 +159,13 @@ class Conformance:
         )
 
     def require_methods(self, component: object) -> None:
-        """Require what a component of the kind must have."""
+        """Require the methods of the kind."""
         missing = [name for name in self.methods if not hasattr(component, name)]
-        assert not missing, (
-            f"what build() returns must be a {self.kind}; {type(component).__name__} has no {' and no '.join(missing)}"
-        )
+        assert not missing, f"build() must return a {self.kind}; {type(component).__name__} has no {' and no '.join(missing)}"
 
 
-def raising_nothing(what: str, work: Callable[..., Any], *arguments: Any) -> Any:
-    """Do what must not raise, whatever the arguments."""
+def must_not_raise(what: str, work: Callable[..., Any], *arguments: Any) -> Any:
+    """Call `work`; fail with a message if it raises."""
     try:
         return work(*arguments)
     except Exception as error:
@@ -175,9 +173,9 @@ def raising_nothing(what: str, work: Callable[..., Any], *arguments: Any) -> Any
 
 
 def models_in(config: type[BaseModel]) -> list[type[BaseModel]]:
-    """Return a config and the models of the mappings in it, each once."""
+    """Return a config model and all models nested in it, each once."""
     found = [config]
-    for model in found:  # which grows meanwhile
+    for model in found:  # grows meanwhile
         found += [each for field in model.model_fields.values() for each in _models(field.annotation) if each not in found]
     return found
 
@@ -191,12 +189,12 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 @cache
 def modules_of(module: str) -> frozenset[str]:
-    """Return the top-level modules that a fresh interpreter imports with a module; one that is on no path is run as a file."""
+    """Return the top-level modules that a fresh interpreter imports with a module; runs its file if it is on no path."""
     file = getattr(sys.modules.get(module), "__file__", None)
     argument = json.dumps([module, file, sys.path])
     done = subprocess.run([sys.executable, "-c", _MODULES_OF, argument], capture_output=True, text=True, check=False)
     assert done.returncode == 0, (
-        f"{module}, which offers the contribution, cannot be imported in a fresh interpreter; set hook_module if it is another "
-        f"one:\n{done.stderr}"
+        f"the hook module {module} cannot be imported in a fresh interpreter; set hook_module if the contribution comes from "
+        f"another module:\n{done.stderr}"
     )
     return frozenset(json.loads(done.stdout.splitlines()[-1]))

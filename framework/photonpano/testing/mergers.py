@@ -1,4 +1,4 @@
-"""What mergers promise."""
+"""Checks of mergers."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from photonpano.protocols import Merger, Source, Trajectory
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
 from photonpano.testing.sameness import fingerprint, in_threads
 from photonpano.testing.scenes import Scene
-from photonpano.testing.stages import StageConformance, unharmed
+from photonpano.testing.stages import StageConformance, accepts_read_only
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, FrameSpan, Group, Homography, VirtualExposure
 
 SHAPE = (40, 56)
 N_FRAMES = 240
 GROUP = Group(FrameSpan(20, 220), 119.5)
 EARLY = Group(FrameSpan(20, 220), 40.0)
-"""Seen from near its beginning."""
+"""A group whose reference is near its beginning."""
 _STILL = np.array([[1, 0, 300.0], [0, 1, -80.0], [0, 0, 1]])
 _Z = 4.5
-"""So many standard deviations are not chance: once in 150,000 times."""
+"""Standard errors of a significant bias: noise exceeds them once in 150,000 times."""
 _BANDS = 4
 _DARK_RATE = np.float64(0.2)
-"""Dark counts of a pixel in a frame."""
+"""Dark counts per pixel per frame."""
 _MARGIN = 8
-"""Pixels at the border of a moving camera are seen by few frames."""
+"""Width of the border that few frames of the moving camera see, px."""
 
 
 class MergerConformance(StageConformance):
-    """Checks of a merger on binary frames of 40x56 px, of a camera that stands still and of one that pans and rolls.
+    """Checks of a merger on binary frames of 40x56 px, of a still camera and of one that pans and rolls.
 
     Attributes:
-        contribution: what is tested.
-        config: keys under `with`.
-        tolerance_px: how far the image may be displaced when frames are merged along a known motion.
-        scales: pixels of an exposure per pixel of a frame, for which it can be asked.
-        compensates: whether it uses the motion known so far; a naive average does not.
-        excess_variance: how many times as large as that of photon noise the variance may be; more for one that drops photons.
+        contribution: the contribution under test.
+        config: the keys under `with`.
+        tolerance_px: largest displacement of the image when frames are merged along a known motion.
+        scales: supported scales, pixels of an exposure per pixel of a frame.
+        compensates: whether it uses the motion; a naive average does not.
+        excess_variance: largest ratio of the variance to that of photon noise; more for one that drops photons.
     """
 
     kind: ClassVar[str] = "merger"
@@ -64,63 +64,66 @@ class MergerConformance(StageConformance):
         scale: float = 1.0,
         threads: int = 1,
     ) -> VirtualExposure:
-        """Merge with a merger that has just been built."""
+        """Merge with a new merger."""
         exposure: VirtualExposure = self.built(source.info, threads).merge(source, group, trajectory, scale)
         return exposure
 
-    def _everywhere(self) -> Iterator[tuple[str, VirtualExposure, float]]:
+    def _cases(self) -> Iterator[tuple[str, VirtualExposure, float]]:
         for scale in self.scales:
-            for what, trajectory in (("no motion known yet", None), ("a known motion", MOTION)):
+            for what, trajectory in (("no motion", None), ("a known motion", MOTION)):
                 source = MemorySource(moving_frames(), dead_pixels())
                 yield f"{what} and scale {scale:g}", self.merged(source, GROUP, trajectory, scale), scale
 
-    def test_an_exposure_has_the_size_that_the_scale_asks_for(self) -> None:
-        """Flux and weight are float32, on the grid of a frame rescaled."""
-        for where, exposure, scale in self._everywhere():
-            assert isinstance(exposure, VirtualExposure), f"merge() returns a VirtualExposure, got a {type(exposure).__name__}"
+    def test_exposure_has_scaled_frame_shape(self) -> None:
+        """Flux and weight are float32, on the rescaled grid of a frame."""
+        for where, exposure, scale in self._cases():
+            assert isinstance(exposure, VirtualExposure), (
+                f"merge() must return a VirtualExposure, got a {type(exposure).__name__}"
+            )
             wanted = tuple(round(side * scale) for side in SHAPE)
             for name, image in (("flux", exposure.flux), ("weight", exposure.weight)):
                 assert image.shape == wanted, (
-                    f"with {where}, {name} must be of {wanted}, got {image.shape}; scales = (1.0,) if it knows no other"
+                    f"with {where}, {name} must have the shape {wanted}, got {image.shape}; "
+                    "set scales = (1.0,) if no other is supported"
                 )
                 assert image.dtype == np.float32, f"with {where}, {name} must be float32, got {image.dtype}"
 
-    def test_an_exposure_says_what_it_is_made_of(self) -> None:
-        """Later stages ask it for its group, its scale and its camera."""
+    def test_exposure_names_group_scale_and_response(self) -> None:
+        """Later stages rely on these attributes."""
         source = MemorySource(still_frames())
         for scale in self.scales:
             exposure = self.merged(source, GROUP, None, scale)
             named = exposure.group, exposure.scale, exposure.response
             assert named == (GROUP, scale, source.response), (
-                f"an exposure carries the group and the scale it was asked for, and the response of the source; got {named}"
+                f"an exposure must have the given group and scale, and the response of the source; got {named}"
             )
 
-    def test_flux_is_nan_exactly_where_the_weight_is_zero(self) -> None:
-        """Unknown pixels are NaN with weight 0; all others are known."""
-        for where, exposure, _ in self._everywhere():
+    def test_flux_is_nan_exactly_where_weight_is_0(self) -> None:
+        """Unknown pixels are NaN with weight 0; all others are finite and not negative."""
+        for where, exposure, _ in self._cases():
             unknown, unseen = np.isnan(exposure.flux), exposure.weight == 0
             wrong = int((unknown & ~unseen).sum()), int((unseen & ~unknown).sum())
             assert wrong == (0, 0), (
-                f"flux is NaN exactly where the weight is 0; with {where}, {wrong[0]} pixels are NaN and have a weight, and "
-                f"{wrong[1]} have a flux and weight 0"
+                f"flux must be NaN exactly where the weight is 0; with {where}, {wrong[0]} pixels are NaN and have a weight, "
+                f"and {wrong[1]} have a flux and weight 0"
             )
             known = exposure.flux[~unknown]
             finite = bool(np.isfinite(known).all() and np.isfinite(exposure.weight).all())
-            assert finite, f"with {where}, flux or weight is infinite in places; response.flux() bounds the flux"
+            assert finite, f"with {where}, flux or weight is infinite at some pixels; response.flux() is always finite"
             least = min(float(known.min()), float(exposure.weight.min()))
-            assert least >= 0, f"with {where}, flux or weight is negative in places, {least:.3g} at the least"
+            assert least >= 0, f"with {where}, flux or weight is negative at some pixels, at least {least:.3g}"
 
-    def test_the_weight_is_the_number_of_frames(self) -> None:
-        """Of a camera that stands still every pixel was seen in all frames of the group, and in no others."""
+    def test_weight_is_number_of_frames(self) -> None:
+        """A still camera sees every pixel in all frames of the group."""
         exposure = self.merged(MemorySource(still_frames()))
         furthest = float(exposure.weight.ravel()[np.abs(exposure.weight - len(GROUP.span)).argmax()])
         assert np.isclose(furthest, len(GROUP.span), rtol=1e-3), (
-            f"the weight is how many frames a pixel was seen in; of a group of {len(GROUP.span)} frames it is {furthest:g} in "
-            "places"
+            f"the weight must be the number of frames in which a pixel was seen; for a group of {len(GROUP.span)} frames and a "
+            f"still camera it is {furthest:g} at some pixels"
         )
 
-    def test_only_the_frames_of_the_group_count(self) -> None:
-        """The camera may see something else before and afterwards."""
+    def test_flux_depends_on_frames_of_group_only(self) -> None:
+        """Frames before and after it have no influence."""
         frames = still_frames()
         changed = frames.copy()
         changed[: GROUP.span.start] = 1
@@ -132,33 +135,33 @@ class MergerConformance(StageConformance):
         )
 
     def test_flux_is_unbiased_on_photon_noise(self) -> None:
-        """In the dark and in the bright, to within the statistical error of so many photons."""
-        known = chance_of_light(still_flux())
+        """Its bias is below the statistical error, for dark and for bright pixels."""
+        known = lit_probability(still_flux())
         exposure = self.merged(MemorySource(still_frames()))
         error = exposure.response.mean_count(exposure.flux) - known
         z = error / np.sqrt(known * (1 - known) / len(GROUP.span))
         for band in np.array_split(np.argsort(known, axis=None), _BANDS):
             mean = z.ravel()[band].mean() * np.sqrt(len(band))
             assert abs(mean) < _Z, (
-                f"the flux must be unbiased: of {len(band)} pixels with a flux of {still_flux().ravel()[band].mean():.2f} the "
-                f"mean is off by {mean:+.1f} standard errors ({error.ravel()[band].mean():+.3g} counts a frame). Add up "
+                f"the flux must be unbiased: over {len(band)} pixels with a flux of {still_flux().ravel()[band].mean():.2f} "
+                f"the mean is off by {mean:+.1f} standard errors ({error.ravel()[band].mean():+.3g} counts per frame). Sum the "
                 "counts, and estimate the flux once, with response.flux()"
             )
 
-    def test_flux_is_no_noisier_than_photons(self) -> None:
+    def test_flux_has_no_more_than_photon_noise(self) -> None:
         """The variance of n binary frames is p (1 - p) / n."""
-        known = chance_of_light(still_flux())
+        known = lit_probability(still_flux())
         exposure = self.merged(MemorySource(still_frames()))
         error = exposure.response.mean_count(exposure.flux) - known
         ratio = float(np.mean(error**2 / (known * (1 - known) / len(GROUP.span))))
         assert ratio < self.excess_variance, (
-            f"the flux is {ratio:.2f} times as noisy, in variance, as the photons of {len(GROUP.span)} frames are "
-            f"(at most excess_variance = {self.excess_variance:g}); are all frames of the group counted?"
+            f"the variance of the flux is {ratio:.2f} times that of the photon noise of {len(GROUP.span)} frames "
+            f"(at most excess_variance = {self.excess_variance:g}); are all frames of the group summed?"
         )
 
-    def test_what_the_source_takes_out_of_sums_is_no_flux(self) -> None:
-        """Dark counts are not seen as light; a merger that cannot have them taken out refuses the source."""
-        known = float(chance_of_light(still_flux()).mean())
+    def test_dark_counts_are_subtracted_or_source_is_refused(self) -> None:
+        """A merger that cannot subtract dark counts raises an InputError."""
+        known = float(lit_probability(still_flux()).mean())
         for trajectory in (None, KnownMotion(lambda _: np.eye(3))):
             source = DarkSource(still_frames())
             try:
@@ -167,47 +170,47 @@ class MergerConformance(StageConformance):
                 continue
             mean = float(exposure.response.mean_count(exposure.flux).mean())
             assert abs(mean / known - 1) < 0.02, (
-                f"what source.corrected takes out of sums must not be in the flux; the mean count is {mean:.4f}, not "
-                f"{known:.4f}. `photonpano.merging.accumulate` does so; or raise an InputError for a LinearlyCorrectedSource"
+                f"dark counts, which source.corrected subtracts, must not be part of the flux; the mean count is {mean:.4f}, "
+                f"not {known:.4f}. Use `photonpano.merging.accumulate`, or raise an InputError for a LinearlyCorrectedSource"
             )
 
-    def test_masked_pixels_do_not_count(self) -> None:
-        """Hot pixels are lit in every frame, and `source.valid` is false for them."""
+    def test_masked_pixels_have_no_influence(self) -> None:
+        """`source.valid` is false for hot pixels, which are lit in every frame."""
         valid = dead_pixels()
         hot = np.where(valid, still_frames(), 1)
         exposure = self.merged(MemorySource(hot, valid))
         seen = float(exposure.weight[~valid].max())
-        assert seen == 0, f"where source.valid is false, the weight of a camera that stands still must be 0; it is {seen:g}"
+        assert seen == 0, f"for a still camera the weight must be 0 where source.valid is false; it is {seen:g}"
         clean = self.merged(MemorySource(np.where(valid, still_frames(), 0), valid))
         same = np.array_equal(exposure.flux, clean.flux, equal_nan=True)
-        assert same, "what masked pixels count must not matter; the flux changes with it elsewhere"
+        assert same, "masked pixels must have no influence; the flux of other pixels changes with their counts"
 
-    def test_masked_pixels_do_not_count_along_a_motion(self) -> None:
-        """Other pixels saw those places; a hot one would draw a line."""
+    def test_masked_pixels_have_no_influence_along_motion(self) -> None:
+        """Other pixels saw the same places, and a hot pixel would leave a trail."""
         self._require_compensation()
         valid = dead_pixels()
         hot, dark = (self.merged(MemorySource(np.where(valid, moving_frames(), lit), valid), GROUP, MOTION) for lit in (1, 0))
         same = np.array_equal(hot.flux, dark.flux, equal_nan=True)
-        assert same, "what masked pixels count must not matter; along a known motion the flux changes with it"
+        assert same, "masked pixels must have no influence; along a known motion the flux changes with their counts"
 
     @pytest.mark.parametrize("group", [GROUP, EARLY], ids=["from the middle", "from near the beginning"])
-    def test_it_compensates_along_a_known_motion(self, group: Group) -> None:
-        """The scene is as sharp as in a frame, and lies where it does at the reference instant of the group."""
+    def test_merge_compensates_known_motion(self, group: Group) -> None:
+        """The scene is as sharp as in a frame, and in its place at the reference instant of the group."""
         self._require_compensation()
         exposure = self.merged(MemorySource(moving_frames()), group, MOTION)
-        shift, contrast = likeness(exposure, chance_of_light(view_at(group.reference)))
+        shift, contrast = displacement_and_contrast(exposure, lit_probability(view_at(group.reference)))
         assert contrast > 0.7, (
             f"along a known motion the image must stay sharp; its contrast is {contrast:.0%} of that of the scene, and "
-            f"that of an average of the frames as they lie {average_contrast():.0%}. Pixels of frame t are mapped to "
-            "those of the reference instant r by inverse(trajectory.at(r)) @ trajectory.at(t)"
+            f"that of an unwarped average {average_contrast():.0%}. Map pixels of frame t to those of the reference "
+            "instant r by inverse(trajectory.at(r)) @ trajectory.at(t)"
         )
         assert np.hypot(*shift) <= self.tolerance_px, (
-            f"the image must show the scene as it lies at instant {group.reference:g}; it is displaced by "
+            f"the image must show the scene in its place at instant {group.reference:g}; it is displaced by "
             f"({shift[0]:+.2f}, {shift[1]:+.2f}) px in x and y, more than tolerance_px = {self.tolerance_px:g}"
         )
 
-    def test_where_the_reference_plane_lies_does_not_matter(self) -> None:
-        """Warps are relative to the reference instant of the group; the plane of the trajectory is arbitrary."""
+    def test_exposure_does_not_depend_on_reference_plane(self) -> None:
+        """Warps are relative to the reference instant of the group; the reference plane is arbitrary."""
         self._require_compensation()
         source = MemorySource(moving_frames())
         there = KnownMotion(lambda frame: translation(5000, -700) @ MOTION.at([frame])[0])
@@ -215,44 +218,44 @@ class MergerConformance(StageConformance):
         inside = (slice(_MARGIN, -_MARGIN), slice(_MARGIN, -_MARGIN))
         far = float(np.abs(here.flux - moved.flux)[inside].max())
         assert far < 1e-2, (
-            "an exposure is seen from its group's reference instant, wherever the plane of the trajectory lies; with the "
-            f"plane moved by (5000, -700) px the flux changes by {far:.2g}"
+            "an exposure must not depend on the reference plane of the trajectory, only on the motion within its group; with "
+            f"the plane moved by (5000, -700) px the flux changes by {far:.2g}"
         )
 
-    def test_brightness_is_the_same_at_every_scale(self) -> None:
+    def test_flux_does_not_depend_on_scale(self) -> None:
         """Flux is photons per pixel of a frame, whatever the grid."""
-        known = float(chance_of_light(still_flux()).mean())
+        known = float(lit_probability(still_flux()).mean())
         for scale in self.scales:
             exposure = self.merged(MemorySource(still_frames()), GROUP, None, scale)
             mean = float(np.nanmean(exposure.response.mean_count(exposure.flux)))
             assert abs(mean / known - 1) < 0.02, (
-                f"flux is counted per pixel of a frame; at scale {scale:g} the mean count is {mean:.4f}, not {known:.4f}"
+                f"flux must be that of a pixel of a frame; at scale {scale:g} the mean count is {mean:.4f}, not {known:.4f}"
             )
 
-    def test_what_it_is_given_is_left_as_it_is(self) -> None:
+    def test_merge_leaves_inputs_unchanged(self) -> None:
         """Counts and masks are shared between threads."""
         for trajectory in (None, MOTION):
             source = MemorySource(moving_frames(), dead_pixels())
             self.merged(source, GROUP, trajectory)
             same = np.array_equal(source.valid, dead_pixels())
-            assert same, "merge() writes to source.valid; copy it first"
-            with unharmed("merge()"):
+            assert same, "merge() modifies source.valid; copy it before you change it"
+            with accepts_read_only("merge()"):
                 self.merged(ReadOnlySource(moving_frames(), dead_pixels()), GROUP, trajectory)
 
-    def test_the_same_frames_give_the_same_bytes(self) -> None:
-        """A run can be repeated; several groups are merged at once by one merger."""
+    def test_merge_is_deterministic(self) -> None:
+        """A run can be repeated, and one merger merges several groups at once."""
         source = MemorySource(moving_frames(), dead_pixels())
         for trajectory in (None, MOTION):
             expected = fingerprint(self.merged(source, GROUP, trajectory))
             merger = self.built(source.info)
-            others = {"merged once more": fingerprint(self.merged(source, GROUP, trajectory))}
-            others["with four threads at its disposal"] = fingerprint(self.merged(source, GROUP, trajectory, threads=4))
+            others = {"merged again": fingerprint(self.merged(source, GROUP, trajectory))}
+            others["with four threads"] = fingerprint(self.merged(source, GROUP, trajectory, threads=4))
             for found in in_threads(partial(_merged_by, merger, source, trajectory)):
-                others.setdefault("merged in several threads at once", found)
+                others.setdefault("in several threads at once", found)
                 if found != expected:
-                    others["merged in several threads at once"] = found
+                    others["in several threads at once"] = found
             wrong = [how for how, found in others.items() if found != expected]
-            assert not wrong, f"the same frames must give the same bytes; {' and '.join(wrong)}, the exposure is another"
+            assert not wrong, f"the same frames must give the same bytes; {' and '.join(wrong)}, the exposure differs"
 
     def _require_compensation(self) -> None:
         if not self.compensates:
@@ -260,10 +263,10 @@ class MergerConformance(StageConformance):
 
 
 class DarkSource(MemorySource):
-    """Adds dark counts to frames, and knows how to take them out: a `photonpano.LinearlyCorrectedSource`."""
+    """Adds dark counts to frames and subtracts them from sums: a `photonpano.LinearlyCorrectedSource`."""
 
     def __init__(self, frames: NDArray[np.uint8]) -> None:
-        dark = np.random.default_rng(9).random(frames.shape) < chance_of_light(_DARK_RATE)
+        dark = np.random.default_rng(9).random(frames.shape) < lit_probability(_DARK_RATE)
         super().__init__(frames | dark)
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
@@ -277,13 +280,13 @@ def _merged_by(merger: Merger, source: Source, trajectory: Trajectory | None, th
     return fingerprint(merger.merge(source, GROUP, trajectory, 1.0))
 
 
-def chance_of_light(flux: FloatArray | np.float64) -> FloatArray:
+def lit_probability(flux: FloatArray | np.float64) -> FloatArray:
     """Return the probability that a binary pixel is lit (paper, equation 2)."""
     return np.asarray(-np.expm1(-flux))
 
 
 def _to_scene(frame: float) -> Homography:
-    """Return where the moving camera looks: it pans by 0.1 px a frame and rolls by 0.02 degrees a frame."""
+    """Return the pose of the moving camera, which pans by 0.1 px and rolls by 0.02 degrees per frame."""
     angle = np.deg2rad(0.02) * (frame - N_FRAMES / 2)
     cos, sin = np.cos(angle), np.sin(angle)
     centre = translation((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
@@ -298,25 +301,25 @@ _SCENE = Scene(seed=3)
 
 @cache
 def still_flux() -> FloatArray:
-    """Return what the camera that stands still sees: (H, W)."""
+    """Return the flux that the still camera sees: (H, W)."""
     return _SCENE.view(_STILL, SHAPE)
 
 
 @cache
 def still_frames() -> NDArray[np.uint8]:
-    """Return the frames of the camera that stands still."""
-    frames = np.random.default_rng(5).random((N_FRAMES, *SHAPE)) < chance_of_light(still_flux())
+    """Return the frames of the still camera."""
+    frames = np.random.default_rng(5).random((N_FRAMES, *SHAPE)) < lit_probability(still_flux())
     return read_only(frames.astype(np.uint8))
 
 
 @cache
 def moving_frames() -> NDArray[np.uint8]:
-    """Return the frames of the camera that moves."""
+    """Return the frames of the moving camera."""
     return read_only(recorded(_SCENE, MOTION, N_FRAMES, SHAPE, seed=5))
 
 
 def dead_pixels() -> BoolArray:
-    """Return a mask with three columns and some single pixels that are not to be used."""
+    """Return a mask that is false for three columns and some single pixels."""
     valid = np.random.default_rng(7).random(SHAPE) > 0.02
     valid[:, 30:33] = False
     return valid
@@ -327,10 +330,10 @@ def view_at(instant: float) -> FloatArray:
     return _SCENE.view(MOTION.at([instant])[0], SHAPE)
 
 
-def likeness(exposure: VirtualExposure, known: FloatArray) -> tuple[FloatArray, float]:
-    """Return how far an exposure is displaced, (x, y) in px, and its contrast as a share of that of what it should show.
+def displacement_and_contrast(exposure: VirtualExposure, known: FloatArray) -> tuple[FloatArray, float]:
+    """Return the displacement of an exposure, (x, y) in px, and its contrast, as a share of the expected one.
 
-    To first order, an image of contrast c that is displaced by d is the mean + c (known - mean) - c d . gradient.
+    To first order, an image of contrast c that is displaced by d is mean + c (known - mean) - c d . gradient.
     """
     inside = (slice(_MARGIN, -_MARGIN), slice(_MARGIN, -_MARGIN))
     down, right = np.gradient(known)
@@ -344,9 +347,9 @@ def likeness(exposure: VirtualExposure, known: FloatArray) -> tuple[FloatArray, 
 
 @cache
 def average_contrast() -> float:
-    """Return the contrast of the frames of the moving camera, averaged as they lie."""
+    """Return the contrast of the unwarped average of the moving camera's frames."""
     source = MemorySource(moving_frames())
     frames = len(GROUP.span)
     flux = source.response.flux((source.counts(GROUP.span) / frames).astype(np.float32), frames)
     exposure = VirtualExposure(flux, np.full(SHAPE, frames, np.float32), GROUP, 1.0, source.response)
-    return likeness(exposure, chance_of_light(view_at(GROUP.reference)))[1]
+    return displacement_and_contrast(exposure, lit_probability(view_at(GROUP.reference)))[1]

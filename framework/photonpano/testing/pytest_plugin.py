@@ -1,6 +1,6 @@
-"""Loaded by pytest wherever photonpano is installed: failed checks of the kit show the values that were compared.
+"""Plugin of pytest: failed checks of the kit show the compared values.
 
-Everybody's pytest imports this module, so it imports nothing but pytest.
+Every pytest imports this module where photonpano is installed, so it imports pytest only.
 """
 
 from __future__ import annotations

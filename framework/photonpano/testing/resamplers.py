@@ -1,4 +1,4 @@
-"""What resamplers promise."""
+"""Checks of resamplers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from photonpano.values import Group
 
 LEVELS = (1, 2, 3, 4)
 LONG = (STREAM.n_frames, STREAM.n_frames + 37)
-"""A capture that the config suits, and one whose length divides by little."""
+"""Lengths of captures that suit the config, one of them with few divisors."""
 SHORT = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233)
 
 
@@ -22,8 +22,8 @@ class ResamplerConformance(StageConformance):
     """Checks of a resampler, for captures of about 2,000 frames and for short ones.
 
     Attributes:
-        contribution: what is tested.
-        config: keys that suit a capture of 2,000 frames.
+        contribution: the contribution under test.
+        config: the keys under `with`, which must suit a capture of 2,000 frames.
     """
 
     kind: ClassVar[str] = "resampler"
@@ -32,64 +32,69 @@ class ResamplerConformance(StageConformance):
     contribution: ResamplerContribution
 
     def groups(self, n_frames: int, level: int) -> Any:
-        """Ask a resampler that has just been built."""
+        """Return the groups of a new resampler."""
         return self.built(replace(STREAM, n_frames=n_frames)).groups(n_frames, level)
 
-    def _everywhere(self) -> Iterator[tuple[str, int, Any]]:
+    def _cases(self) -> Iterator[tuple[str, int, Any]]:
         for n_frames in LONG:
             for level in LEVELS:
                 yield f"level {level} of {n_frames} frames", n_frames, self.groups(n_frames, level)
 
-    def test_groups_are_a_tuple_that_is_not_empty(self) -> None:
-        """A level without groups has nothing to locate; a generator could be read only once."""
-        for where, _, groups in self._everywhere():
-            assert isinstance(groups, tuple), f"groups() returns a tuple of Group; at {where} it is a {type(groups).__name__}"
-            assert groups, f"at {where} there is no group; a capture that is too short is an InputError"
+    def test_groups_returns_non_empty_tuple(self) -> None:
+        """A level needs a group to locate, and a generator could be read only once."""
+        for where, _, groups in self._cases():
+            assert isinstance(groups, tuple), (
+                f"groups() must return a tuple of Group; at {where} it returned a {type(groups).__name__}"
+            )
+            assert groups, f"groups() returned no group at {where}; raise an InputError if a capture is too short"
             strangers = {type(group).__name__ for group in groups if not isinstance(group, Group)}
-            assert not strangers, f"groups() returns Group objects; at {where} there are {', '.join(strangers)}"
+            assert not strangers, f"groups() must return Group objects; at {where} it returned {', '.join(strangers)}"
 
-    def test_groups_come_in_the_order_of_their_reference_instants(self) -> None:
-        """An interpolator needs instants that increase; one that came twice would be located twice."""
-        for where, _, groups in self._everywhere():
+    def test_groups_are_ordered_by_reference(self) -> None:
+        """Interpolators need increasing instants."""
+        for where, _, groups in self._cases():
             for before, after in pairwise(groups):
                 assert before.reference < after.reference, (
                     f"reference instants must increase; at {where}, {before.reference} is followed by {after.reference}"
                 )
 
-    def test_groups_lie_inside_the_capture(self) -> None:
-        """A source refuses a span that it does not hold."""
-        for where, n_frames, groups in self._everywhere():
+    def test_groups_lie_inside_capture(self) -> None:
+        """Sources refuse spans beyond the capture."""
+        for where, n_frames, groups in self._cases():
             last = max(groups, key=lambda group: group.span.stop)
             assert last.span.stop <= n_frames, f"at {where}, a group reaches beyond the last frame: {last}"
 
-    def test_the_reference_instant_lies_inside_the_span(self) -> None:
-        """An exposure is seen from an instant that its frames show."""
-        for where, _, groups in self._everywhere():
+    def test_reference_lies_inside_span(self) -> None:
+        """The reference instant of an exposure is one of its frames, or between two."""
+        for where, _, groups in self._cases():
             for group in groups:
                 assert group.span.start <= group.reference <= group.span.stop - 1, (
-                    f"the reference lies between the first and the last frame; at {where} it is {group.reference} of {group}"
+                    f"the reference must lie between the first and the last frame; at {where} it is "
+                    f"{group.reference} for {group}"
                 )
 
-    def test_spans_are_whole_python_numbers(self) -> None:
-        """Groups are written to `run.json`, which holds no numbers of numpy."""
-        for where, _, groups in self._everywhere():
+    def test_spans_are_python_integers(self) -> None:
+        """Groups are written to `run.json`, which cannot contain numpy integers."""
+        for where, _, groups in self._cases():
             kinds = {type(end).__name__ for group in groups for end in (group.span.start, group.span.stop)}
-            assert kinds == {"int"}, f"spans hold Python's int; at {where} there is {', '.join(sorted(kinds - {'int'}))}"
+            assert kinds == {"int"}, (
+                f"spans must consist of Python's int; at {where} there is {', '.join(sorted(kinds - {'int'}))}"
+            )
 
-    def test_the_same_question_has_the_same_answer(self) -> None:
-        """Also when levels are asked for in another order, as the estimate of memory does."""
+    def test_groups_depend_on_arguments_only(self) -> None:
+        """They do not depend on the order of calls."""
         for n_frames in LONG:
             together = self.built(replace(STREAM, n_frames=n_frames))
             backwards = {level: together.groups(n_frames, level) for level in reversed(LEVELS)}
             for level in LEVELS:
                 for again in (backwards[level], together.groups(n_frames, level)):
                     assert again == self.groups(n_frames, level), (
-                        f"groups({n_frames}, {level}) must depend on nothing but its arguments, the config and the seed; "
-                        "asked once more, or after other levels, it gave other groups"
+                        f"groups({n_frames}, {level}) must depend on its arguments, the config and the seed only; a second "
+                        "call, or one after other levels, returned other groups"
                     )
 
-    def test_a_short_capture_gives_groups_or_an_input_error(self) -> None:
-        """Users see the sentence of an InputError; anything else is reported as a defect of the plugin."""
+    def test_short_capture_gives_groups_or_input_error(self) -> None:
+        """An InputError is shown to users as it is; any other error is reported as a defect of the plugin."""
         for n_frames in SHORT:
             try:
                 groups = self.groups(n_frames, 1)
@@ -97,14 +102,14 @@ class ResamplerConformance(StageConformance):
                 continue
             except Exception as error:
                 raise AssertionError(
-                    f"a capture that is too short is an InputError; with {n_frames} frames, groups() raised "
+                    f"groups() must raise an InputError if a capture is too short; with {n_frames} frames it raised "
                     f"{type(error).__name__}: {error}"
                 ) from error
-            assert groups, f"with {n_frames} frames there is no group; a capture that is too short is an InputError"
-            assert groups[-1].span.stop <= n_frames, f"with {n_frames} frames, a group is {groups[-1]}"
+            assert groups, f"groups() returned no group for {n_frames} frames; raise an InputError if a capture is too short"
+            assert groups[-1].span.stop <= n_frames, f"with {n_frames} frames, a group lies beyond the end: {groups[-1]}"
 
-    def test_check_foresees_that_a_capture_is_too_short(self) -> None:
-        """`photonpano check` tells it before anything runs."""
+    def test_check_agrees_with_groups_about_short_captures(self) -> None:
+        """`photonpano check` reports captures that are too short before a run."""
         for n_frames in SHORT:
             stream = replace(STREAM, n_frames=n_frames)
             problems = list(self.contribution.check(self.settings(), stream))
@@ -114,6 +119,6 @@ class ResamplerConformance(StageConformance):
             except InputError as error:
                 refused = error
             assert bool(problems) == (refused is not None), (
-                f"check() and groups() must agree about {n_frames} frames; check() says {'; '.join(problems) or 'nothing'}, "
-                f"groups() {f'raises InputError: {refused}' if refused else 'gives groups'}"
+                f"check() and groups() must agree about {n_frames} frames; check() returns "
+                f"{'; '.join(problems) or 'no problem'}, groups() {f'raises InputError: {refused}' if refused else 'returns groups'}"
             )

@@ -1,4 +1,4 @@
-"""Whether two results are the same to the last bit, and the same work done in several threads at once."""
+"""Compare results bit by bit, and run the same work in several threads at once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THREADS = 4
 
 
 def fingerprint(value: Any) -> object:
-    """Return something that is equal for values that hold the same bytes, those that are not numbers included."""
+    """Return a value that is equal for results with the same bytes; unlike `==`, also for NaN."""
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -32,8 +32,8 @@ def fingerprint(value: Any) -> object:
 
 
 @contextmanager
-def global_chance(seed: int) -> Iterator[None]:
-    """Seed the generator that all of numpy shares, which no component must depend on, within a block."""
+def global_seed(seed: int) -> Iterator[None]:
+    """Seed numpy's global generator, on which no component may depend, within a block."""
     before = get_bit_generator()
     set_bit_generator(np.random.MT19937(seed))
     try:
@@ -43,7 +43,7 @@ def global_chance(seed: int) -> Iterator[None]:
 
 
 def in_threads(work: Callable[[int], T]) -> list[T]:
-    """Do some work in several threads that start together, each given its number, and return what each made."""
+    """Call `work(number)` in `THREADS` threads that start together, and return all results."""
     together = Barrier(THREADS)
 
     def start(number: int) -> T:

@@ -1,4 +1,4 @@
-"""A scene whose flux is known at every point, so that a view of it from anywhere is exact."""
+"""A scene whose flux is defined at every point, so that every view of it is exact."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from photonpano.values import FloatArray, Homography
 _WAVES = 64
 _PERIODS_PX = (6.0, 120.0)
 _CONTRAST = 2.5
-"""Waves are squeezed between dark and bright as by a sigmoid this steep, which gives blobs and edges."""
+"""Slope of the sigmoid that limits the sum of waves to the range of the flux, and gives blobs and edges."""
 
 
 class Scene:
-    """A plane of seeded texture, with details of 3 to 60 px, never the same in two places.
+    """A plane with a random texture that does not repeat, with details of 3 to 60 px.
 
-    It is a sum of waves, not an image: nothing is interpolated, and a pixel sees a point.
+    It is a sum of waves, not an image: nothing is interpolated, and a pixel samples a point.
 
     Convention:
         Points of the plane are (x, y) in px; flux is photons per pixel per frame.
@@ -27,8 +27,8 @@ class Scene:
         """Draw a scene.
 
         Args:
-            seed: another seed is another scene.
-            flux: the darkest and the brightest there is.
+            seed: seed of the texture.
+            flux: lowest and highest flux.
         """
         rng = np.random.default_rng(seed)
         periods_px = np.geomspace(*_PERIODS_PX, _WAVES)
@@ -45,7 +45,7 @@ class Scene:
         return np.asarray(low + (high - low) / (1 + np.exp(-_CONTRAST * waves)))
 
     def view(self, homography: Homography, shape: tuple[int, int]) -> FloatArray:
-        """Return what a camera sees: (H, W) flux.
+        """Return the view of a camera: (H, W) flux.
 
         Args:
             homography: (3, 3), pixels of the image to points of the plane.

@@ -1,4 +1,4 @@
-"""What sources promise."""
+"""Checks of sources."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 from photonpano.contributions import SourceContext, SourceContribution
 from photonpano.errors import InputError
 from photonpano.protocols import PackedSource, Source
-from photonpano.testing.conformance import Conformance, raising_nothing
-from photonpano.testing.sameness import fingerprint, global_chance, in_threads
+from photonpano.testing.conformance import Conformance, must_not_raise
+from photonpano.testing.sameness import fingerprint, global_seed, in_threads
 from photonpano.values import FrameSpan, StreamInfo
 
-_MOST_FRAMES = 200
-"""Of a longer capture, the first and the last half of these are looked at."""
+_MAX_FRAMES = 200
+"""Frames that are checked, half of them at each end of a longer capture."""
 
 
 class SourceConformance(Conformance):
     """Checks of a source.
 
     Attributes:
-        contribution: what is tested.
-        config: the keys of a small capture, or those beside what `write` returns.
-        frame_shape: (height, width) of the frames that `write` is given; choose an odd width, if the format can.
-        n_frames: their number.
-        bit_depth: their bits a pixel.
-        wrong: keys that, on top of the config, make it wrong in a way that `check` must tell, such as a missing file.
+        contribution: the contribution under test.
+        config: the keys under `with` of a small capture; those that `write` returns are added.
+        frame_shape: (height, width) of the frames that `write` is given; choose an odd width if the format supports it.
+        n_frames: number of these frames.
+        bit_depth: bits per pixel of these frames.
+        wrong: keys that replace those of the config and that `check` must reject, such as a missing file.
     """
 
     kind: ClassVar[str] = "source"
@@ -43,11 +43,11 @@ class SourceConformance(Conformance):
     wrong: Sequence[Mapping[str, Any]] = ()
 
     def write(self, frames: NDArray[np.generic], folder: Path) -> Mapping[str, Any]:
-        """Write frames as a capture, and return the keys that open it; override it for a source that reads files.
+        """Write frames as a capture and return the keys that open it; override this for a source that reads files.
 
         Args:
             frames: (n_frames, *frame_shape), uint8, or uint16 for a bit depth of more than 8.
-            folder: where to put files; it is empty.
+            folder: an empty folder for the files.
         """
         del frames, folder
         return {}
@@ -67,70 +67,73 @@ class SourceConformance(Conformance):
         self.config = {**self.config, **self.write(self.known_frames(), folder)}
 
     def opened(self) -> Source:
-        """Open the capture under test; close it by `with`."""
+        """Open the capture under test; close it with `with`."""
         self.require_libraries()
         return self.contribution.build(self.settings(), SourceContext(seed=0, threads=2))
 
-    def test_it_has_what_a_source_has(self) -> None:
-        """`photonpano.Source` lists it."""
+    def test_source_has_required_attributes(self) -> None:
+        """See `photonpano.Source`."""
         with self.opened() as source:
             self.require_methods(source)
 
-    def test_info_tells_what_the_frames_are_like(self) -> None:
-        """Memory is planned, and other components are built, from what `info` says before any frame is read."""
+    def test_info_agrees_with_frames(self) -> None:
+        """Memory is planned and components are built from `info`, before any frame is read."""
         with self.opened() as source:
             info = source.info
-            assert isinstance(info, StreamInfo), f"info is a StreamInfo, got a {type(info).__name__}"
+            assert isinstance(info, StreamInfo), f"info must be a StreamInfo, got a {type(info).__name__}"
             sizes = {type(size).__name__ for size in (info.n_frames, info.height, info.width)}
-            assert sizes == {"int"}, f"sizes are Python's int, for the record of a run; got {', '.join(sorted(sizes))}"
+            assert sizes == {"int"}, f"sizes must be Python's int, for the record of a run; got {', '.join(sorted(sizes))}"
             shape, wanted = source.frames(_first(source)).shape, (len(_first(source)), *info.frame_shape)
-            assert shape == wanted, f"info promises {wanted} for {len(_first(source))} frames; frames() returns {shape}"
+            assert shape == wanted, f"info gives the shape {wanted} for {len(_first(source))} frames; frames() returns {shape}"
             values = source.frames(_first(source))
             highest = 1 if info.kind == "binary" else 2**info.bit_depth - 1
-            assert values.dtype.kind in "u", f"frames are unsigned integers, got {values.dtype}"
+            assert values.dtype.kind in "u", f"frames must be unsigned integers, got {values.dtype}"
             assert values.max() <= highest, (
-                f"info promises {info.kind} frames of {info.bit_depth} bits, so at most {highest}; there is a {values.max()}"
+                f"info gives {info.kind} frames of {info.bit_depth} bits, so at most {highest}; "
+                f"frames() returns a {values.max()}"
             )
 
-    def test_valid_is_a_mask_of_a_frame(self) -> None:
-        """It is false for pixels that must not be used."""
+    def test_valid_is_bool_mask_of_frame_shape(self) -> None:
+        """It is true for usable pixels."""
         with self.opened() as source:
             mask, info = source.valid, source.info
-            assert mask.shape == info.frame_shape, f"valid is a mask of {info.frame_shape}, got {mask.shape}"
-            assert mask.dtype == np.bool_, f"valid is bool, got {mask.dtype}"
+            assert mask.shape == info.frame_shape, f"valid must have the shape {info.frame_shape}, got {mask.shape}"
+            assert mask.dtype == np.bool_, f"valid must be bool, got {mask.dtype}"
             some = bool(mask.any())
-            assert some, "valid is false everywhere: no pixel could be used; it is true for pixels that may be"
+            assert some, "valid is false everywhere; it must be true for usable pixels"
 
-    def test_counts_are_uint32_of_a_frame(self) -> None:
-        """Sums of many frames fit, and are added without a cast."""
+    def test_counts_are_uint32_of_frame_shape(self) -> None:
+        """Sums of many frames fit and can be added without a cast."""
         with self.opened() as source:
             counts, info = source.counts(_first(source)), source.info
-            assert counts.shape == info.frame_shape, f"counts() of {info.frame_shape} frames returns {counts.shape}"
-            assert counts.dtype == np.uint32, f"counts() returns uint32, got {counts.dtype}"
+            assert counts.shape == info.frame_shape, f"counts() must return the shape {info.frame_shape}, got {counts.shape}"
+            assert counts.dtype == np.uint32, f"counts() must return uint32, got {counts.dtype}"
 
-    def test_counts_are_the_sum_of_the_frames(self) -> None:
-        """Of any span, one frame included."""
+    def test_counts_equal_sum_of_frames(self) -> None:
+        """For any span, also of one frame."""
         with self.opened() as source:
             for span in _spans(source):
                 difference = _difference(source.counts(span), source.frames(span).sum(axis=0, dtype=np.uint32))
                 assert not difference, f"counts(span) must be the sum of frames(span); for {span}, {difference}"
 
-    def test_packed_frames_are_the_frames(self) -> None:
-        """Of a `photonpano.PackedSource`: what numpy packs along the width, zeros after it, and the caller's own."""
+    def test_packed_equals_packbits_of_frames(self) -> None:
+        """For a `photonpano.PackedSource`; the array belongs to the caller."""
         with self.opened() as source:
             if not isinstance(source, PackedSource):
                 return
             for span in _spans(source):
                 packed, expected = source.packed(span), np.packbits(source.frames(span), axis=-1)
-                assert packed.dtype == np.uint8, f"packed() returns uint8, got {packed.dtype}"
+                assert packed.dtype == np.uint8, f"packed() must return uint8, got {packed.dtype}"
                 difference = _difference(packed, expected)
                 assert not difference, f"packed(span) must be numpy.packbits(frames(span), axis=-1); for {span}, {difference}"
                 packed[...] = 255
                 difference = _difference(source.packed(span), expected)
-                assert not difference, f"after a caller wrote to what packed() had returned, it gives another: {difference}"
+                assert not difference, (
+                    f"after its caller changed the array that packed() returned, it returns other frames: {difference}"
+                )
 
-    def test_spans_neither_overlap_nor_leave_gaps(self) -> None:
-        """A span is half-open: `[start, stop)`."""
+    def test_counts_of_adjacent_spans_add_up(self) -> None:
+        """Spans are half-open: `[start, stop)`."""
         with self.opened() as source:
             for span in _spans(source):
                 if len(span) == 1:
@@ -139,11 +142,11 @@ class SourceConformance(Conformance):
                 parts = FrameSpan(span.start, middle), FrameSpan(middle, span.stop)
                 difference = _difference(source.counts(parts[0]) + source.counts(parts[1]), source.counts(span))
                 assert not difference, (
-                    f"a span holds its first frame and not the one at its stop; counts of {parts[0]} and of {parts[1]} must "
+                    f"a span must contain its start and not its stop; counts of {parts[0]} and of {parts[1]} must "
                     f"add up to those of {span}, but {difference}"
                 )
 
-    def test_a_frame_is_the_same_in_any_span(self) -> None:
+    def test_frame_is_the_same_in_any_span(self) -> None:
         """Frame i of the capture is frame i - start of a span."""
         with self.opened() as source:
             for span in _spans(source):
@@ -152,26 +155,27 @@ class SourceConformance(Conformance):
                     frame = span.start + index
                     difference = _difference(together[index], source.frames(FrameSpan(frame, frame + 1))[0])
                     assert not difference, (
-                        f"frames(span)[i] is frame span.start + i; frame {frame} of {span} is not the one alone: {difference}"
+                        f"frames(span)[i] must be frame span.start + i; frame {frame} of {span} differs from that frame alone: "
+                        f"{difference}"
                     )
 
-    def test_it_reads_the_frames_that_were_written(self) -> None:
-        """Rows, columns and bits are where they were, and no frame is missing."""
+    def test_frames_equal_written_frames(self) -> None:
+        """Rows, columns and bits are in their places, and no frame is missing."""
         if type(self).write is SourceConformance.write:
-            pytest.skip("write() is not overridden: the frames of this source are not known")
+            pytest.skip("write() is not overridden, so the frames of this source are unknown")
         known = self.known_frames()
         with self.opened() as source:
             shape = (source.info.n_frames, *source.info.frame_shape)
-            assert shape == known.shape, f"frames of {known.shape} (frames, height, width) were written; info says {shape}"
+            assert shape == known.shape, f"{known.shape} (frames, height, width) were written; info gives {shape}"
             read = source.frames(source.info.span)
             wrong = [index for index in range(len(known)) if _difference(read[index], known[index])]
             assert not wrong, (
-                f"{len(wrong)} of {len(known)} frames differ from what was written; in frame {wrong[0]}, "
+                f"{len(wrong)} of {len(known)} frames differ from those that were written; in frame {wrong[0]}, "
                 f"{_difference(read[wrong[0]], known[wrong[0]])}"
             )
 
-    def test_a_span_beyond_the_capture_is_an_input_error(self) -> None:
-        """Frames that do not exist are not invented, nor left out in silence."""
+    def test_span_beyond_capture_raises_input_error(self) -> None:
+        """Missing frames are neither invented nor silently left out."""
         with self.opened() as source:
             n_frames = source.info.n_frames
             for span in (FrameSpan(n_frames - 1, n_frames + 1), FrameSpan(n_frames, n_frames + 1)):
@@ -182,8 +186,8 @@ class SourceConformance(Conformance):
                         f"`self.info.require(span)` does; it {outcome}"
                     )
 
-    def test_what_was_returned_does_not_change(self) -> None:
-        """It belongs to the caller, who may keep it and write to it."""
+    def test_returned_arrays_belong_to_caller(self) -> None:
+        """The caller may keep and change them."""
         with self.opened() as source:
             span = _first(source)
             for method in (source.counts, source.frames):
@@ -191,54 +195,55 @@ class SourceConformance(Conformance):
                 kept = first.copy()
                 method(_last(source))
                 difference = _difference(first, kept)
-                assert not difference, f"{method.__name__}() overwrites what it returned: return a new array"
+                assert not difference, f"{method.__name__}() overwrites an array that it returned before; return a new array"
                 if first.flags.writeable:
                     first[...] = 0
                 difference = _difference(method(span), kept)
                 assert not difference, (
-                    f"after a caller wrote to what {method.__name__}() had returned, it returns something else: return a copy"
+                    f"after its caller changed the array that {method.__name__}() returned, it returns other values; "
+                    "return a copy"
                 )
 
-    def test_several_threads_read_what_one_does(self) -> None:
-        """Groups are merged at the same time."""
+    def test_threads_read_the_same_frames(self) -> None:
+        """Groups are merged concurrently."""
         with self.opened() as source:
             spans = _spans(source)
 
             def read(first: int) -> dict[FrameSpan, object]:
-                """Begin with another span in each thread."""
+                """Start with another span in each thread."""
                 order = spans[first:] + spans[:first]
                 return {span: fingerprint((source.counts(span), source.frames(span))) for span in order}
 
             expected = read(0)
-            for found in raising_nothing("reading in several threads at once", in_threads, read):
+            for found in must_not_raise("reading in several threads at once", in_threads, read):
                 wrong = [str(span) for span in spans if found[span] != expected[span]]
                 assert not wrong, (
-                    f"when several threads read at once, {', '.join(wrong)} come out differently; do they share a position "
-                    "in a file, or a buffer?"
+                    f"when several threads read at once, {', '.join(wrong)} are read differently; do the threads share a file "
+                    "position or a buffer?"
                 )
 
-    def test_opened_again_it_gives_the_same_bytes(self) -> None:
-        """A run can be repeated; chance derives from the seed of the context."""
+    def test_reopened_source_gives_same_bytes(self) -> None:
+        """A run can be repeated; random numbers follow from the seed of the context."""
         seen = []
-        for chance in (1, 2):
-            with global_chance(chance), self.opened() as source:
+        for seed in (1, 2):
+            with global_seed(seed), self.opened() as source:
                 seen.append([fingerprint((source.info, source.valid, source.frames(span))) for span in _spans(source)])
-        assert seen[0] == seen[1], "the same config and seed must give the same frames; opened again, the source gives others"
+        assert seen[0] == seen[1], "the same config and seed must give the same frames; opened again, the source returns others"
 
-    def test_the_response_turns_flux_into_counts_and_back(self) -> None:
-        """`response.flux(response.mean_count(flux))` is the flux."""
+    def test_response_flux_inverts_mean_count(self) -> None:
+        """`response.flux(response.mean_count(flux))` equals the flux."""
         with self.opened() as source:
             flux, frames = np.array([0.0, 0.01, 0.3, 1.0, 2.0, np.nan], np.float32), 10_000
             again = source.response.flux(source.response.mean_count(flux), frames)
-            undone = np.allclose(again, flux, rtol=1e-3, atol=1e-5, equal_nan=True)
-            assert undone, (
-                f"response.flux must undo response.mean_count, and keep NaN; {flux.tolist()} becomes {again.tolist()}"
+            inverted = np.allclose(again, flux, rtol=1e-3, atol=1e-5, equal_nan=True)
+            assert inverted, (
+                f"response.flux must invert response.mean_count, and keep NaN; {flux.tolist()} becomes {again.tolist()}"
             )
             lit = source.response.flux(source.response.mean_count(np.array([1e9], np.float32)), frames).tolist()
-            assert np.isfinite(lit[0]), f"a pixel that is always lit must have a finite flux, got {lit}"
+            assert np.isfinite(lit[0]), f"a saturated pixel must have a finite flux, got {lit}"
 
-    def test_with_gives_the_source_and_hides_no_error(self) -> None:
-        """`with build(...) as source:` is how runs use it."""
+    def test_with_block_returns_source_and_propagates_errors(self) -> None:
+        """Runs use `with build(...) as source:`."""
         hidden = True
         try:
             with self.opened() as entered:
@@ -246,19 +251,19 @@ class SourceConformance(Conformance):
                 raise LookupError("an error of the caller")
         except LookupError:
             hidden = False
-        assert not hidden, "__exit__ must not return True: an error that was raised inside of `with` has disappeared"
+        assert not hidden, "__exit__ must not return True: it suppressed an error that was raised inside of `with`"
 
-    def test_check_finds_no_problem_with_the_config_under_test(self) -> None:
-        """Problems are sentences; an empty sequence says that the capture can be opened."""
+    def test_check_accepts_config_under_test(self) -> None:
+        """`check` returns a sequence of sentences, empty if there is no problem."""
         problems = self.contribution.check(self.settings())
-        assert not isinstance(problems, str), f"check() returns a sequence of sentences, got the text {problems!r}"
-        assert not list(problems), f"the capture under test can be opened, but check() says: {'; '.join(problems)}"
+        assert not isinstance(problems, str), f"check() must return a sequence of sentences, got the text {problems!r}"
+        assert not list(problems), f"check() must accept the capture under test; it returned: {'; '.join(problems)}"
 
-    def test_check_finds_what_is_wrong(self) -> None:
-        """What `photonpano check` lets pass should not fail at the start of a run."""
+    def test_check_rejects_wrong_configs(self) -> None:
+        """`photonpano check` reports them before a run."""
         for keys in self.wrong:
             settings = self.contribution.config.model_validate({**self.config, **keys})
-            assert list(self.contribution.check(settings)), f"check() finds nothing wrong with {dict(keys)}"
+            assert list(self.contribution.check(settings)), f"check() must reject {dict(keys)}; it returned no problem"
             outcome = _outcome_of(lambda each: self.contribution.build(each, SourceContext()), settings)
             assert outcome == "InputError", f"opening a capture with {dict(keys)} must raise InputError; it {outcome}"
 
@@ -282,9 +287,9 @@ def _last(source: Source) -> FrameSpan:
 
 
 def _spans(source: Source) -> list[FrameSpan]:
-    """Return spans at both ends and between, of one frame and of many."""
+    """Return spans of one and of many frames, at both ends and in between."""
     stop = source.info.n_frames
-    half = min(stop, _MOST_FRAMES // 2)
+    half = min(stop, _MAX_FRAMES // 2)
     middle = half // 2
     return [
         FrameSpan(0, 1),
@@ -297,7 +302,7 @@ def _spans(source: Source) -> list[FrameSpan]:
 
 
 def _difference(found: NDArray[np.generic], expected: NDArray[np.generic]) -> str:
-    """Say where two arrays differ; nothing if they do not."""
+    """Describe where two arrays differ; an empty text if they do not."""
     if found.shape != expected.shape:
         return f"shapes are {found.shape} and {expected.shape}"
     places = np.argwhere(found != expected)

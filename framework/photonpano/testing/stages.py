@@ -1,4 +1,4 @@
-"""What the components of the four stages promise beside that: they are built without data, and depend on their input alone."""
+"""Checks of the components of all four stages: they are built before any frame is read, and read-only inputs are enough."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from photonpano.testing.conformance import Conformance
 from photonpano.values import CaptureSummary, DecisionValue, StreamInfo
 
 STREAM = StreamInfo(2000, 254, 496, frame_rate_hz=96_800.0)
-"""The capture for which a component is built, where nothing else is said."""
-SUMMARY = CaptureSummary(flux=0.5, speed_px=0.15, how="as the kit says")
+"""The capture for which components are built by default."""
+SUMMARY = CaptureSummary(flux=0.5, speed_px=0.15, how="set by the conformance kit")
 
 
 class StageConformance(Conformance):
@@ -23,52 +23,50 @@ class StageConformance(Conformance):
     contribution: StageContribution
 
     def built(self, stream: StreamInfo = STREAM, threads: int = 1) -> Any:
-        """Build the component for a capture that looks like this; what the frames tell can be asked for afterwards."""
+        """Build the component for a capture; its summary is available only afterwards."""
         self.require_libraries()
-        working = False
+        is_built = False
 
         def capture() -> CaptureSummary:
-            if not working:
-                raise CaptureUnreadError("the component is being built, and no frame has been read")
+            if not is_built:
+                raise CaptureUnreadError("no frame has been read while the component is being built")
             return SUMMARY
 
         context = StageContext(stream, BinaryResponse(), seed=0, threads=threads, capture=capture, decide=_decided)
         component = self.contribution.build(self.settings(), context)
-        working = True
+        is_built = True
         return component
 
-    def test_it_is_built_before_any_frame_is_read(self) -> None:
-        """`photonpano check` and `explain` build components, and read no frames."""
+    def test_build_reads_no_frames(self) -> None:
+        """`photonpano check` and `explain` build components without reading frames."""
         try:
             component = self.built()
         except CaptureUnreadError as error:
-            raise AssertionError(
-                "build() asks context.capture(); ask when the component works, not when it is built"
-            ) from error
+            raise AssertionError("build() calls context.capture(); call it later, when the component is used") from error
         self.require_methods(component)
 
-    def test_check_finds_no_problem_with_the_config_under_test(self) -> None:
-        """Problems are sentences; an empty sequence says that a run may start."""
+    def test_check_accepts_config_under_test(self) -> None:
+        """`check` returns a sequence of sentences, empty if there is no problem."""
         problems = self.contribution.check(self.settings(), STREAM)
-        assert not isinstance(problems, str), f"check() returns a sequence of sentences, got the text {problems!r}"
-        assert not list(problems), f"the config under test should suit {STREAM}; check() says: {'; '.join(problems)}"
+        assert not isinstance(problems, str), f"check() must return a sequence of sentences, got the text {problems!r}"
+        assert not list(problems), f"check() must accept the config under test for {STREAM}; it returned: {'; '.join(problems)}"
 
 
 def _decided(what: str, value: DecisionValue, reason: str) -> None:
-    """Require of a decision that it can be recorded."""
+    """Check that a decision can be recorded."""
     assert isinstance(value, bool | int | float | str), (
-        f"decide() records a number, a text, true or false; the value of {what!r} is a {type(value).__name__}"
+        f"decide() needs a number, a text or a bool; the value of {what!r} is a {type(value).__name__}"
     )
-    assert reason, f"decide() needs a reason for {what!r}: a clause with the numbers that decided"
+    assert reason, f"decide() needs a reason for {what!r}: a clause with the numbers behind it"
 
 
 @contextmanager
-def unharmed(what: str) -> Iterator[None]:
-    """Say what is wrong when a component that has done its work before fails with arrays that cannot be written to."""
+def accepts_read_only(what: str) -> Iterator[None]:
+    """Fail with a message if a component, which worked before, fails with read-only arrays."""
     try:
         yield
     except Exception as error:
         raise AssertionError(
-            f"{what} fails when the arrays that it is given cannot be written to; others use them as well: copy what you "
-            f"change ({type(error).__name__}: {error})"
+            f"{what} fails with read-only arrays; other components share them, so copy an array before you change it "
+            f"({type(error).__name__}: {error})"
         ) from error

@@ -1,4 +1,4 @@
-"""Runs single checks of the kit on components, most of which are broken on purpose."""
+"""Run single checks of the kit on components, most of them broken on purpose."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from photonpano.registry import KINDS
 
 
 class NoKeys(Config):
-    """Nothing to choose."""
+    """No keys."""
 
 
 def cases(check: Callable, kit: Any) -> Iterator[dict[str, Any]]:
@@ -29,7 +29,7 @@ def cases(check: Callable, kit: Any) -> Iterator[dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def checks_of() -> Callable[..., set[str]]:
-    """Return the names of the checks of a class of the kit, without those that it inherits from another."""
+    """Return the names of the checks of a class of the kit, without those of another class that it inherits from."""
 
     def checks_of(kit: type, beside: type = object) -> set[str]:
         return {name for name in set(dir(kit)) - set(dir(beside)) if name.startswith("test_")}
@@ -38,13 +38,13 @@ def checks_of() -> Callable[..., set[str]]:
 
 
 @pytest.fixture
-def complaint(tmp_path: Path) -> Callable[..., str | None]:
-    """Run a check on what `build(context)` makes, and return what it complains of; None if it is content.
+def failure(tmp_path: Path) -> Callable[..., str | None]:
+    """Run a check on the component that `build(context)` returns; return its message, or None if it passes.
 
     `record` holds fields of the contribution; other keywords are attributes of the class of the kit.
     """
 
-    def complaint(kit: type, check: str, build: Any, record: dict[str, Any] | None = None, **attributes: Any) -> str | None:
+    def failure(kit: type, check: str, build: Any, record: dict[str, Any] | None = None, **attributes: Any) -> str | None:
         fields = {"name": "toy", "summary": "A toy", "config": NoKeys, "build": lambda _, context: build(context)}
         contribution = KINDS[kit.kind].contribution(**fields | (record or {}))
         subject = type("TestToy", (kit,), {"contribution": contribution, **attributes})()
@@ -57,16 +57,16 @@ def complaint(tmp_path: Path) -> Callable[..., str | None]:
                 return str(error)
         return None
 
-    return complaint
+    return failure
 
 
 @pytest.fixture
-def catches(complaint: Callable[..., str | None]) -> Callable[..., None]:
-    """Require that a check complains, in words that match: `catches(kit, check, build, words)`."""
+def catches(failure: Callable[..., str | None]) -> Callable[..., None]:
+    """Require that a check fails with a message that matches: `catches(kit, check, build, words)`."""
 
     def catches(kit: type, check: str, build: Any, words: str, **attributes: Any) -> None:
-        found = complaint(kit, check, build, **attributes)
-        assert found is not None, f"{check} is content"
+        found = failure(kit, check, build, **attributes)
+        assert found is not None, f"{check} passes"
         assert re.search(words, found), found
 
     return catches

@@ -1,4 +1,4 @@
-"""What is checked of every contribution, on resamplers."""
+"""Checks of every contribution, run on resamplers."""
 
 from __future__ import annotations
 
@@ -72,72 +72,77 @@ def too_long(config, stream):
 LOCATOR = discover().find("locator", "direct").contribution
 BROKEN = [
     (
-        "test_the_record_is_of_the_kind_that_this_class_tests",
+        "test_contribution_has_the_kind_of_this_class",
         All,
         {"contribution": LOCATOR},
         "TestToy tests a resampler: .* got Loc",
     ),
-    ("test_the_name_and_the_summary_fit_a_list", All, {"record": {"summary": "A toy "}}, "one line without spaces around it"),
-    ("test_the_name_and_the_summary_fit_a_list", All, {"record": {"summary": "A toy."}}, "drop the full stop of 'A toy.'"),
+    ("test_summary_is_one_line_without_full_stop", All, {"record": {"summary": "A toy "}}, "one line without spaces around it"),
     (
-        "test_the_config_is_closed_and_frozen",
+        "test_summary_is_one_line_without_full_stop",
+        All,
+        {"record": {"summary": "A toy."}},
+        "must not end with a full stop: 'A toy.'",
+    ),
+    (
+        "test_config_is_closed_and_frozen",
         All,
         {"record": {"config": WithOpenPart}},
         "Open must be closed and .* extra=None",
     ),
-    ("test_every_key_of_the_config_is_described", All, {"record": {"config": WithUndescribedParts}}, "for Undescribed.size"),
+    ("test_config_keys_have_descriptions", All, {"record": {"config": WithUndescribedParts}}, "to Undescribed.size"),
     (
-        "test_an_unknown_key_is_refused",
+        "test_config_refuses_unknown_key",
         All,
         {"record": {"config": DropsTypingErrors}},
-        "must be refused, .* pydantic finds: nothing",
+        "must refuse an unknown key, .* problems found: nothing",
     ),
     (
-        "test_an_unknown_key_is_refused",
+        "test_config_refuses_unknown_key",
         All,
         {"config": {"size": 3}},
-        "pydantic finds: size: Extra inputs .*, no-such-key: Extra",
+        "problems found: size: Extra inputs .*, no-such-key: Extra",
     ),
     (
-        "test_the_config_comes_back_from_a_run_record",
+        "test_config_survives_json_round_trip",
         All,
         {"record": {"config": WritesUnits}},
         "'3 frames'.* must not raise; it raised Valid",
     ),
     (
-        "test_the_hook_module_imports_nothing_heavy",
+        "test_hook_module_imports_no_heavy_library",
         All,
         {"hook_module": "hooks_with_scipy"},
         "importing hooks_with_scipy imports scipy",
     ),
     (
-        "test_the_hook_module_imports_nothing_heavy",
+        "test_hook_module_imports_no_heavy_library",
         All,
         {"hook_module": "there_is_none"},
-        "there_is_none.* cannot be imported in a",
+        "hook module there_is_none cannot be imported in a",
     ),
     (
-        "test_the_hook_module_imports_nothing_heavy",
+        "test_hook_module_imports_no_heavy_library",
         All,
         {"hook_module": "hooks_with_wave", "record": {"requires": (Requirement("wave", "wave"),)}},
         "importing hooks_with_wave imports wave; move that import into the function `build`",
     ),
     (
-        "test_it_is_built_before_any_frame_is_read",
+        "test_build_reads_no_frames",
         Impatient,
         {},
-        "asks context.capture.., ask when|asks context.capture..; ask when",
+        "calls context.capture..; call it later",
     ),
-    ("test_it_is_built_before_any_frame_is_read", DecidesOnAnObject, {}, "the value of 'size' is a object"),
-    ("test_it_is_built_before_any_frame_is_read", lambda _: "a text", {}, "must be a resampler; str has no groups"),
+    ("test_build_reads_no_frames", DecidesOnAnObject, {}, "the value of 'size' is a object"),
+    ("test_build_reads_no_frames", lambda _: "a text", {}, "must return a resampler; str has no groups"),
     (
-        "test_check_finds_no_problem_with_the_config_under_test",
+        "test_check_accepts_config_under_test",
         All,
         {"record": {"check": too_long}},
-        "says: groups are longer than",
+        "returned: groups are longer than",
     ),
     (
-        "test_check_finds_no_problem_with_the_config_under_test",
+        "test_check_accepts_config_under_test",
         All,
         {"record": {"check": lambda *_: "too long"}},
         "a sequence of sentences, got the text 'too long'",
@@ -153,27 +158,27 @@ def hook_modules(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("check", "broken", "more", "words"), BROKEN)
-def test_it_is_caught(check, broken, more, words, catches):
+def test_check_fails_on_broken_component(check, broken, more, words, catches):
     catches(ResamplerConformance, check, broken, words, **more)
 
 
-def test_every_check_catches_something(checks_of):
+def test_every_check_has_a_broken_component(checks_of):
     assert checks_of(StageConformance) == {check for check, *_ in BROKEN}
 
 
-def test_an_honest_one_passes(checks_of, complaint):
-    """It is built by a function of a test, which is imported as a file."""
+def test_checks_pass_on_correct_component(checks_of, failure):
+    """Its build function is defined in a test, whose module is run as a file."""
     for check in checks_of(StageConformance):
-        assert complaint(ResamplerConformance, check, All) is None, check
+        assert failure(ResamplerConformance, check, All) is None, check
     assert checks_of(Conformance) < checks_of(StageConformance)
 
 
-def test_a_component_whose_library_is_missing_is_not_tested(complaint):
+def test_check_is_skipped_if_library_is_missing(failure):
     missing = {"requires": (Requirement("no_such_library", "photonpano[none]"),)}
     with pytest.raises(pytest.skip.Exception, match=r"toy needs no_such_library: pip install photonpano\[none\]"):
-        complaint(ResamplerConformance, "test_groups_lie_inside_the_capture", All, record=missing)
+        failure(ResamplerConformance, "test_groups_lie_inside_capture", All, record=missing)
 
 
-def test_models_are_found_wherever_they_stand():
+def test_models_in_finds_nested_models():
     assert models_in(WithUndescribedParts) == [WithUndescribedParts, Undescribed]
     assert models_in(WithOpenPart) == [WithOpenPart, Open]

@@ -68,7 +68,7 @@ class OneAtATime(Straight):
 
 
 class Smoothed(Straight):
-    """Looks at the other instants that it is asked for."""
+    """Depends on the other instants of the call."""
 
     def at(self, frame_indices):
         frames = np.asarray(frame_indices, dtype=float)
@@ -110,35 +110,39 @@ def along(trajectory):
 
 
 BROKEN = [
-    ("test_it_passes_its_knots", NeedsTwoKnots, r"fit\(\) of knots whose number is 1 must not raise"),
-    ("test_it_passes_its_knots", Inverted, "must pass its 1 knots within tolerance_px = 0.001; at instant 24.5 it misses by"),
-    ("test_it_passes_knots_whose_information_is_known", TrustsInformation, "with information, too, .* it misses by"),
-    ("test_it_is_defined_for_every_instant", along(UndefinedBeyond), "beyond the 1 knots; it is not at 1000"),
-    ("test_it_is_defined_for_every_instant", along(MirrorsBeyond), "maps that can be inverted; that of 2020 cannot"),
-    ("test_every_homography_has_h33_of_1", along(Unscaled), "returned one with 2: divide by it"),
-    ("test_many_instants_give_what_each_gives_alone", along(OneAtATime), r"for 6 instants its shape is \(1, 3, 3\)"),
-    ("test_many_instants_give_what_each_gives_alone", along(Smoothed), r"at\(130\) alone, and among 6, differ by"),
-    ("test_many_instants_give_what_each_gives_alone", along(Single), r"returns float32"),
+    ("test_trajectory_passes_its_knots", NeedsTwoKnots, r"fit\(\) with 1 knots must not raise"),
     (
-        "test_a_constant_velocity_is_kept_between_knots",
+        "test_trajectory_passes_its_knots",
+        Inverted,
+        r"must pass its knots \(here 1\) within tolerance_px = 0.001; at instant 24.5 it is .* px off",
+    ),
+    ("test_trajectory_passes_knots_with_information", TrustsInformation, "with information, .* it is .* px off"),
+    ("test_trajectory_is_defined_for_every_instant", along(UndefinedBeyond), r"beyond the knots \(here 1\); it is not at 1000"),
+    ("test_trajectory_is_defined_for_every_instant", along(MirrorsBeyond), "must return invertible maps; at 2020 it is not"),
+    ("test_homographies_have_h33_of_1", along(Unscaled), "returned one with 2: divide by it"),
+    ("test_instants_are_independent_of_each_other", along(OneAtATime), r"for 6 instants it returned \(1, 3, 3\)"),
+    ("test_instants_are_independent_of_each_other", along(Smoothed), r"at\(130\) alone, and among 6 instants, differ by"),
+    ("test_instants_are_independent_of_each_other", along(Single), r"returned float32"),
+    (
+        "test_constant_velocity_is_kept_between_knots",
         along(Nearest),
         "with 2 knots, at instant 77.25 the trajectory is 8.34 px",
     ),
-    ("test_knots_are_left_as_they_are", WritesToKnots, "changes the arrays that it was given"),
-    ("test_knots_are_left_as_they_are", WritesAndUndoes, "fails when the arrays that it is given cannot be written to"),
-    ("test_the_same_knots_give_the_same_bytes", along(LeftToChance), "two fits of the same knots differ"),
+    ("test_fit_leaves_inputs_unchanged", WritesToKnots, "modifies its arguments"),
+    ("test_fit_leaves_inputs_unchanged", WritesAndUndoes, "fails with read-only arrays"),
+    ("test_fit_is_deterministic", along(LeftToChance), "two fits to the same knots differ"),
 ]
 
 
 @pytest.mark.parametrize(("check", "broken", "words"), BROKEN)
-def test_it_is_caught(check, broken, words, catches):
+def test_check_fails_on_broken_component(check, broken, words, catches):
     catches(InterpolatorConformance, check, broken, words)
 
 
-def test_every_check_catches_something(checks_of):
+def test_every_check_has_a_broken_component(checks_of):
     assert checks_of(InterpolatorConformance, StageConformance) == {check for check, *_ in BROKEN}
 
 
-def test_an_honest_one_passes(checks_of, complaint):
+def test_checks_pass_on_correct_component(checks_of, failure):
     for check in checks_of(InterpolatorConformance, Conformance):
-        assert complaint(InterpolatorConformance, check, Honest) is None, check
+        assert failure(InterpolatorConformance, check, Honest) is None, check

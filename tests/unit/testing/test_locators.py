@@ -69,7 +69,7 @@ class SeesHolesAsBlack(Honest):
 
 
 class StandsStill(Honest):
-    """Takes a failure for a camera that does not move."""
+    """Returns an identity for a failure."""
 
     def register(self, moving, fixed, initial):
         found = super().register(moving, fixed, initial)
@@ -102,7 +102,7 @@ class Boasts(Honest):
 
 
 class LeavesSixAlone(Honest):
-    """Finds shifts, and says that the other six may be anything that cameras do."""
+    """Estimates shifts, with little information on the other six parameters."""
 
     def changed(self, found):
         information = np.zeros((8, 8))
@@ -111,7 +111,7 @@ class LeavesSixAlone(Honest):
 
 
 class Covariance(Honest):
-    """Gives the covariance in place of its inverse."""
+    """Returns the covariance instead of its inverse."""
 
     def changed(self, found):
         return replace(found, information=np.linalg.inv(found.information))
@@ -164,99 +164,99 @@ class LeftToChance(Honest):
 
 BROKEN = [
     (
-        "test_the_map_takes_pixels_of_moving_to_pixels_of_fixed",
+        "test_homography_maps_moving_to_fixed",
         Inverse,
-        "this is the inverse: off by 29.5 px, and by 0.0 px if",
+        "this one is the inverse: its error is 29.5 px, and 0.0 px the",
     ),
-    ("test_the_map_is_a_homography_with_h33_of_1", Unscaled, "has h33 = 1, got 2: divide by it"),
-    ("test_the_map_is_a_homography_with_h33_of_1", Single, "geometry is float64, got a homography of float32"),
+    ("test_homography_is_float64_with_h33_of_1", Unscaled, "must have h33 = 1, got 2: divide by it"),
+    ("test_homography_is_float64_with_h33_of_1", Single, "geometry must be float64, got a homography of float32"),
     (
-        "test_a_known_motion_is_found",
+        "test_register_finds_motion_without_start",
         ShiftsAlone,
-        r"a rotation without a start must be found within tolerance_px = 0.5; corners",
+        "the rotation without a start must be estimated within tolerance_px = 0.5; its mean corner",
     ),
     (
-        "test_a_known_motion_is_found",
+        "test_register_finds_motion_without_start",
         NeedsAStart,
-        "a sub-pixel shift without a start must be found, .* NotLocated: there is no start",
+        "the sub-pixel shift without a start, .* must be located; .* NotLocated: there is no start",
     ),
-    ("test_a_known_motion_is_found_from_a_start_nearby", TrustsItsStart, r"corners are 1.08 px off on average"),
+    ("test_register_finds_motion_from_nearby_start", TrustsItsStart, "its mean corner error is 1.08 px"),
     (
-        "test_pixels_that_were_not_seen_are_not_looked_at",
+        "test_unseen_pixels_have_no_influence",
         SeesHolesAsBlack,
-        "four fifths of the pixels|masked pixels must not pull",
+        "a fifth of the pixels is masked|masked pixels must have no influence",
     ),
     (
-        "test_an_image_without_texture_is_not_located",
+        "test_image_without_texture_is_not_located",
         StandsStill,
         "where both are flat, register.. must return NotLocated; with",
     ),
     (
-        "test_an_image_without_texture_is_not_located",
+        "test_image_without_texture_is_not_located",
         RaisesOnBlank,
         "of which both are unseen must not raise; it raised ZeroDi",
     ),
-    ("test_an_image_without_texture_is_not_located", SaysNothing, "NotLocated needs a reason"),
-    ("test_two_places_that_differ_are_not_located", StandsStill, "images that share nothing must not be located; without a"),
+    ("test_image_without_texture_is_not_located", SaysNothing, "NotLocated needs a reason"),
+    ("test_different_places_are_not_located", StandsStill, "images of different places must not be located; without a"),
     (
-        "test_a_very_small_image_does_not_raise",
+        "test_very_small_image_does_not_raise",
         NeedsALargeImage,
         "12x18 px must not raise; it raised RuntimeError: the pyramid",
     ),
     (
-        "test_information_is_the_inverse_covariance_of_what_was_found",
+        "test_information_is_inverse_covariance_of_errors",
         Boasts,
-        r"corners err by 0.0\d+ px, and it predicts 0.000\d",
+        r"the corner error is 0.0\d+ px, and it predicts 0.000\d",
     ),
-    ("test_information_is_the_inverse_covariance_of_what_was_found", Covariance, "and it predicts"),
-    ("test_information_is_the_inverse_covariance_of_what_was_found", OfTheRows, "in the order of photonpano.geometry.param"),
+    ("test_information_is_inverse_covariance_of_errors", Covariance, "and it predicts"),
+    ("test_information_is_inverse_covariance_of_errors", OfTheRows, "in the order of photonpano.geometry.param"),
     (
-        "test_information_is_the_inverse_covariance_of_what_was_found",
+        "test_information_is_inverse_covariance_of_errors",
         InDoubt,
-        "is positive definite; its least eigenvalue is -",
+        "must be positive definite; its smallest eigenvalue is -",
     ),
-    ("test_residual_and_evidence_can_be_recorded", CountsNothing, "evidence is finite numbers by name; got {'share': nan}"),
-    ("test_a_description_does_not_hold_the_exposure", KeepsTheExposure, "what it returned, VirtualExposure.* holds its flux"),
-    ("test_exposures_and_starts_are_left_as_they_are", FillsInPlace, "the locator changes an exposure"),
+    ("test_residual_and_evidence_are_finite", CountsNothing, "evidence must be finite numbers by name; got {'share': nan}"),
+    ("test_description_does_not_hold_exposure", KeepsTheExposure, "VirtualExposure.*, which it returned, refers to its flux"),
+    ("test_register_leaves_inputs_unchanged", FillsInPlace, "the locator modifies an exposure"),
     (
-        "test_exposures_and_starts_are_left_as_they_are",
+        "test_register_leaves_inputs_unchanged",
         WritesAndUndoes,
-        "fails when the arrays that it is given cannot be writ",
+        "fails with read-only arrays",
     ),
-    ("test_the_same_pair_gives_the_same_bytes", LeftToChance, "registered once more with the same descriptions and described"),
+    ("test_register_is_deterministic", LeftToChance, "registered again with the same descriptions and described"),
 ]
 
 
 @pytest.mark.parametrize(("check", "broken", "words"), BROKEN)
-def test_it_is_caught(check, broken, words, catches):
+def test_check_fails_on_broken_component(check, broken, words, catches):
     catches(LocatorConformance, check, broken, words)
 
 
-def test_every_check_catches_something(checks_of):
+def test_every_check_has_a_broken_component(checks_of):
     assert checks_of(LocatorConformance, StageConformance) == {check for check, *_ in BROKEN}
 
 
-def test_what_needs_a_start_passes_if_it_says_so(complaint):
-    check = "test_the_map_takes_pixels_of_moving_to_pixels_of_fixed"
-    assert complaint(LocatorConformance, check, NeedsAStart, needs_start=True) is None
+def test_locator_that_needs_start_passes_with_needs_start(failure):
+    check = "test_homography_maps_moving_to_fixed"
+    assert failure(LocatorConformance, check, NeedsAStart, needs_start=True) is None
 
 
-def test_what_finds_shifts_alone_passes_if_it_says_so(complaint):
-    check = "test_a_known_motion_is_found"
-    assert complaint(LocatorConformance, check, ShiftsAlone, motions=("shift",), tolerance_px=1.0) is None
+def test_locator_of_shifts_passes_with_motions(failure):
+    check = "test_register_finds_motion_without_start"
+    assert failure(LocatorConformance, check, ShiftsAlone, motions=("shift",), tolerance_px=1.0) is None
 
 
-def test_what_estimates_a_few_parameters_answers_for_these_if_it_says_so(complaint):
-    check = "test_information_is_the_inverse_covariance_of_what_was_found"
-    assert "and it predicts" in str(complaint(LocatorConformance, check, LeavesSixAlone, motions=("shift",)))
-    assert complaint(LocatorConformance, check, LeavesSixAlone, motions=("shift",), free=(4, 5)) is None
-    assert "and it predicts" in str(complaint(LocatorConformance, check, Boasts, motions=("shift",), free=(4, 5)))
+def test_information_is_compared_for_free_parameters_only(failure):
+    check = "test_information_is_inverse_covariance_of_errors"
+    assert "and it predicts" in str(failure(LocatorConformance, check, LeavesSixAlone, motions=("shift",)))
+    assert failure(LocatorConformance, check, LeavesSixAlone, motions=("shift",), free=(4, 5)) is None
+    assert "and it predicts" in str(failure(LocatorConformance, check, Boasts, motions=("shift",), free=(4, 5)))
 
 
-def test_what_finds_no_motion_is_held_to_the_rest_if_it_says_so(complaint):
-    check = "test_the_map_is_a_homography_with_h33_of_1"
+def test_locator_without_motions_skips_checks_of_motion_only(failure):
+    check = "test_homography_is_float64_with_h33_of_1"
     with pytest.raises(pytest.skip.Exception, match="motions"):
-        complaint(LocatorConformance, check, Unscaled, motions=())
-    check = "test_two_places_that_differ_are_not_located"
-    assert complaint(LocatorConformance, check, Honest, motions=(), shape=(48, 64)) is None
-    assert "must not be located" in complaint(LocatorConformance, check, StandsStill, motions=(), shape=(48, 64))
+        failure(LocatorConformance, check, Unscaled, motions=())
+    check = "test_different_places_are_not_located"
+    assert failure(LocatorConformance, check, Honest, motions=(), shape=(48, 64)) is None
+    assert "must not be located" in failure(LocatorConformance, check, StandsStill, motions=(), shape=(48, 64))

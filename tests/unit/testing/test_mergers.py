@@ -54,7 +54,7 @@ class Normalised(Honest):
 
 
 class SmoothsInTime(Honest):
-    """Takes the frames around a group as well."""
+    """Uses the frames around a group, too."""
 
     def merge(self, source, group, trajectory, scale):
         exposure = super().merge(source, group, trajectory, scale)
@@ -91,7 +91,7 @@ class Unmasked:
 
 
 class SeesDarkCounts(Honest):
-    """Passes over what the source would take out."""
+    """Does not subtract dark counts."""
 
     def merge(self, source, group, trajectory, scale):
         plain = MemorySource(source.frames(source.info.span), source.valid)
@@ -126,7 +126,7 @@ class HalfAPixelOff(Honest):
 
 
 class SeenFromThePlane(Honest):
-    """Wraps the image around where the plane of the trajectory puts it."""
+    """Shifts the image with the reference plane."""
 
     def merge(self, source, group, trajectory, scale):
         exposure = super().merge(source, group, trajectory, scale)
@@ -160,7 +160,7 @@ class DependsOnThreads(Honest):
 
 
 class Raw:
-    """Sums counts, and divides them by nothing."""
+    """Sums counts without dividing by the number of frames."""
 
     def __init__(self, context):
         pass
@@ -171,63 +171,71 @@ class Raw:
 
 
 BROKEN = [
-    ("test_an_exposure_has_the_size_that_the_scale_asks_for", OneScale, r"flux must be of \(20, 28\), got \(40, 56\)"),
-    ("test_an_exposure_says_what_it_is_made_of", NamesTheCapture, r"carries the group and the scale .* got \(None, 0.5"),
+    ("test_exposure_has_scaled_frame_shape", OneScale, r"flux must have the shape \(20, 28\), got \(40, 56\)"),
     (
-        "test_flux_is_nan_exactly_where_the_weight_is_zero",
+        "test_exposure_names_group_scale_and_response",
+        NamesTheCapture,
+        r"must have the given group and scale, .* got \(None, 0.5",
+    ),
+    (
+        "test_flux_is_nan_exactly_where_weight_is_0",
         FillsHoles,
         r"0 pixels are NaN and have a weight, and \d+ have a flux",
     ),
-    ("test_flux_is_nan_exactly_where_the_weight_is_zero", Raw, "negative in places"),
-    ("test_the_weight_is_the_number_of_frames", Normalised, "of a group of 200 frames it is 1 in places"),
-    ("test_only_the_frames_of_the_group_count", SmoothsInTime, "that of frames 20 to 219 changes with frames before"),
+    ("test_flux_is_nan_exactly_where_weight_is_0", Raw, "negative at some pixels"),
+    ("test_weight_is_number_of_frames", Normalised, "for a group of 200 frames and a still camera it is 1 at some pixels"),
+    ("test_flux_depends_on_frames_of_group_only", SmoothsInTime, "that of frames 20 to 219 changes with frames before"),
     ("test_flux_is_unbiased_on_photon_noise", AveragesFlux, r"the mean is off by \+\d+.\d standard errors"),
-    ("test_flux_is_no_noisier_than_photons", DropsHalf, r"the flux is (1.9|2.0|2.1)\d times as noisy"),
-    ("test_what_the_source_takes_out_of_sums_is_no_flux", SeesDarkCounts, r"the mean count is 0.\d+, not 0.\d+"),
-    ("test_masked_pixels_do_not_count", KnowsNoMask, "the weight of a camera that stands still must be 0; it is 200"),
+    ("test_flux_has_no_more_than_photon_noise", DropsHalf, r"the variance of the flux is (1.9|2.0|2.1)\d times"),
+    ("test_dark_counts_are_subtracted_or_source_is_refused", SeesDarkCounts, r"the mean count is 0.\d+, not 0.\d+"),
     (
-        "test_masked_pixels_do_not_count_along_a_motion",
+        "test_masked_pixels_have_no_influence",
+        KnowsNoMask,
+        "for a still camera the weight must be 0 where source.valid is false; it is 200",
+    ),
+    (
+        "test_masked_pixels_have_no_influence_along_motion",
         ForgetsTheMaskAlongAMotion,
         "along a known motion the flux changes with",
     ),
-    ("test_it_compensates_along_a_known_motion", Naive, r"contrast is \d\d% .* average of the frames as they lie \d\d%"),
-    ("test_it_compensates_along_a_known_motion", WarpsTheOtherWay, "along a known motion the image must stay sharp"),
-    ("test_it_compensates_along_a_known_motion", HalfAPixelOff, r"displaced by \([+-]0.[45]\d, [+-]0.[45]\d\) px in x and y"),
+    ("test_merge_compensates_known_motion", Naive, r"contrast is \d\d% .* unwarped average \d\d%"),
+    ("test_merge_compensates_known_motion", WarpsTheOtherWay, "along a known motion the image must stay sharp"),
+    ("test_merge_compensates_known_motion", HalfAPixelOff, r"displaced by \([+-]0.[45]\d, [+-]0.[45]\d\) px in x and y"),
     (
-        "test_where_the_reference_plane_lies_does_not_matter",
+        "test_exposure_does_not_depend_on_reference_plane",
         SeenFromThePlane,
         r"moved by \(5000, -700\) px the flux changes by",
     ),
-    ("test_brightness_is_the_same_at_every_scale", PerPixelOfTheExposure, "at scale 0.5 the mean count is"),
-    ("test_what_it_is_given_is_left_as_it_is", CleansTheMask, "writes to source.valid"),
-    ("test_what_it_is_given_is_left_as_it_is", WritesToCounts, "fails when the arrays that it is given cannot be written to"),
+    ("test_flux_does_not_depend_on_scale", PerPixelOfTheExposure, "at scale 0.5 the mean count is"),
+    ("test_merge_leaves_inputs_unchanged", CleansTheMask, "modifies source.valid"),
+    ("test_merge_leaves_inputs_unchanged", WritesToCounts, "fails with read-only arrays"),
     (
-        "test_the_same_frames_give_the_same_bytes",
+        "test_merge_is_deterministic",
         DependsOnThreads,
-        "with four threads at its disposal, the exposure is another",
+        "with four threads, the exposure differs",
     ),
 ]
 
 
 @pytest.mark.parametrize(("check", "broken", "words"), BROKEN)
-def test_it_is_caught(check, broken, words, catches):
+def test_check_fails_on_broken_component(check, broken, words, catches):
     catches(MergerConformance, check, broken, words)
 
 
-def test_every_check_catches_something(checks_of):
+def test_every_check_has_a_broken_component(checks_of):
     assert checks_of(MergerConformance, StageConformance) == {check for check, *_ in BROKEN}
 
 
-def test_an_honest_one_passes(checks_of, complaint):
+def test_checks_pass_on_correct_component(checks_of, failure):
     for check in checks_of(MergerConformance, Conformance):
-        assert complaint(MergerConformance, check, Honest) is None, check
+        assert failure(MergerConformance, check, Honest) is None, check
 
 
-def test_one_that_refuses_dark_counts_passes(complaint):
-    assert complaint(MergerConformance, "test_what_the_source_takes_out_of_sums_is_no_flux", RefusesDarkCounts) is None
+def test_merger_that_refuses_dark_counts_passes(failure):
+    assert failure(MergerConformance, "test_dark_counts_are_subtracted_or_source_is_refused", RefusesDarkCounts) is None
 
 
-def test_a_naive_average_passes_if_it_says_so(checks_of, complaint):
-    check = "test_it_compensates_along_a_known_motion"
+def test_naive_average_is_skipped_with_compensates_false(checks_of, failure):
+    check = "test_merge_compensates_known_motion"
     with pytest.raises(pytest.skip.Exception, match="compensates = False"):
-        complaint(MergerConformance, check, Naive, compensates=False)
+        failure(MergerConformance, check, Naive, compensates=False)

@@ -1,4 +1,4 @@
-"""The kit as pytest sees it: registered, silent, and of use to somebody who subclasses it."""
+"""The kit inside pytest: it is registered, and its subclasses are collected."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ class TestHalves(ResamplerConformance):
 
 
 @pytest.mark.filterwarnings("default::pytest.PytestAssertRewriteWarning")  # this pytest has imported the kit before
-def test_a_subclass_is_collected_and_says_what_is_wrong(pytester, monkeypatch):
+def test_subclass_is_collected_and_reports_failure(pytester, monkeypatch):
     pytester.syspathinsert()
     pytester.makepyfile(toy=TOY, test_toy=TESTS)
     result = pytester.runpytest_inprocess("-p", "no:cacheprovider")
     result.assert_outcomes(passed=15, failed=2)
     result.stdout.fnmatch_lines(
-        ["*AssertionError: a capture that is too short is an InputError; with 1 frames, groups() raised ValueError: a frame*"]
+        ["*AssertionError: groups() must raise an InputError if a capture is too short; with 1 frames it raised Value*"]
     )
 
 
-def test_pytest_starts_without_the_kit():
+def test_pytest_plugin_imports_pytest_only():
     code = (
         "import sys, pytest; before = set(sys.modules); import photonpano.testing.pytest_plugin; "
         "print(*sorted(set(sys.modules) - before))"
@@ -62,10 +62,10 @@ def test_pytest_starts_without_the_kit():
     assert done.stdout.split() == package
 
 
-def test_the_package_does_not_import_pytest():
+def test_package_does_not_import_pytest():
     code = "import sys, photonpano, photonpano.testing, photonpano.cli; sys.exit('pytest' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_pytest_knows_the_plugin(request):
+def test_pytest_plugin_is_registered(request):
     assert request.config.pluginmanager.has_plugin("photonpano")

@@ -76,42 +76,46 @@ class NothingForShort(Honest):
 
 BROKEN = [
     (
-        "test_groups_are_a_tuple_that_is_not_empty",
+        "test_groups_returns_non_empty_tuple",
         AGenerator,
-        "returns a tuple of Group; at level 1 of 2000 frames it is a gener",
+        "must return a tuple of Group; at level 1 of 2000 frames it returned a gener",
     ),
     (
-        "test_groups_come_in_the_order_of_their_reference_instants",
+        "test_groups_are_ordered_by_reference",
         Backwards,
         r"at level 1 of 2000 frames, 1949.5 is followed by",
     ),
-    ("test_groups_come_in_the_order_of_their_reference_instants", Twice, r"49.5 is followed by 49.5"),
-    ("test_groups_lie_inside_the_capture", Beyond, "a group reaches beyond the last frame: frames 1950 to 2049"),
-    ("test_the_reference_instant_lies_inside_the_span", SeenFromElsewhere, "it is 2005.0 of frames 1900 to 1999"),
+    ("test_groups_are_ordered_by_reference", Twice, r"49.5 is followed by 49.5"),
+    ("test_groups_lie_inside_capture", Beyond, "a group reaches beyond the last frame: frames 1950 to 2049"),
+    ("test_reference_lies_inside_span", SeenFromElsewhere, "it is 2005.0 for frames 1900 to 1999"),
     (
-        "test_spans_are_whole_python_numbers",
+        "test_spans_are_python_integers",
         NumbersOfNumpy,
-        "spans hold Python's int; at level 1 of 2000 frames there is int64",
+        "spans must consist of Python's int; at level 1 of 2000 frames there is int64",
     ),
-    ("test_the_same_question_has_the_same_answer", Forgetful, r"groups\(2000, 1\) must depend on nothing but its arguments"),
-    ("test_a_short_capture_gives_groups_or_an_input_error", ShortIsADefect, r"with 1 frames, groups\(\) raised ValueError"),
-    ("test_a_short_capture_gives_groups_or_an_input_error", NothingForShort, "with 1 frames there is no group"),
-    ("test_check_foresees_that_a_capture_is_too_short", Honest, "check.. says nothing, groups.. raises InputError: 1 frames"),
+    ("test_groups_depend_on_arguments_only", Forgetful, r"groups\(2000, 1\) must depend on its arguments"),
+    ("test_short_capture_gives_groups_or_input_error", ShortIsADefect, "with 1 frames it raised ValueError"),
+    ("test_short_capture_gives_groups_or_input_error", NothingForShort, "no group for 1 frames"),
+    (
+        "test_check_agrees_with_groups_about_short_captures",
+        Honest,
+        "check.. returns no problem, groups.. raises InputError: 1 frames",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("check", "broken", "words"), BROKEN)
-def test_it_is_caught(check, broken, words, catches):
+def test_check_fails_on_broken_component(check, broken, words, catches):
     catches(ResamplerConformance, check, broken, words)
 
 
-def test_every_check_catches_something(checks_of):
+def test_every_check_has_a_broken_component(checks_of):
     assert checks_of(ResamplerConformance, StageConformance) == {check for check, *_ in BROKEN}
 
 
-def test_an_honest_one_passes(checks_of, complaint):
+def test_checks_pass_on_correct_component(checks_of, failure):
     def foreseen(config, stream):
         return ["too short"] if stream.n_frames < 100 else []
 
     for check in checks_of(ResamplerConformance, Conformance):
-        assert complaint(ResamplerConformance, check, Honest, record={"check": foreseen}) is None, check
+        assert failure(ResamplerConformance, check, Honest, record={"check": foreseen}) is None, check

@@ -37,7 +37,7 @@ class NotBinary(Honest):
 
 
 class BadPixels(Honest):
-    """Its mask is true for pixels that must not be used."""
+    """Its mask is true for unusable pixels."""
 
     def __init__(self, context):
         super().__init__(context)
@@ -50,7 +50,7 @@ class NarrowCounts(Honest):
 
 
 class CountsOneMore(Honest):
-    """Takes a span for a closed one."""
+    """Includes the stop of a span."""
 
     def counts(self, span):
         return super().counts(FrameSpan(span.start, min(span.stop + 1, self.info.n_frames)))
@@ -159,54 +159,64 @@ def written(self, frames, folder):
 
 
 BROKEN = [
-    ("test_it_has_what_a_source_has", HasNoMask, "HasNoMask has no valid", {}),
-    ("test_info_tells_what_the_frames_are_like", PromisesMore, r"promises \(5, 18, 32\) .* returns \(5, 18, 27\)", {}),
-    ("test_info_tells_what_the_frames_are_like", NotBinary, "promises binary frames of 1 bits, so at most 1; there is a 3", {}),
-    ("test_valid_is_a_mask_of_a_frame", BadPixels, "false everywhere", {}),
-    ("test_counts_are_uint32_of_a_frame", NarrowCounts, "uint32, got uint16", {}),
+    ("test_source_has_required_attributes", HasNoMask, "HasNoMask has no valid", {}),
+    ("test_info_agrees_with_frames", PromisesMore, r"gives the shape \(5, 18, 32\) .* returns \(5, 18, 27\)", {}),
+    ("test_info_agrees_with_frames", NotBinary, "gives binary frames of 1 bits, so at most 1; frames.. returns a 3", {}),
+    ("test_valid_is_bool_mask_of_frame_shape", BadPixels, "false everywhere", {}),
+    ("test_counts_are_uint32_of_frame_shape", NarrowCounts, "uint32, got uint16", {}),
     (
-        "test_counts_are_the_sum_of_the_frames",
+        "test_counts_equal_sum_of_frames",
         CountsOneMore,
         r"for frames 0 to 0, \d+ pixels differ, first the one at row 0",
         {},
     ),
-    ("test_packed_frames_are_the_frames", PacksFromTheRight, r"packed.span. must be numpy.packbits.* \d+ pixels differ", {}),
-    ("test_packed_frames_are_the_frames", LendsPackedFrames, "after a caller wrote to what packed.. had returned", {}),
     (
-        "test_spans_neither_overlap_nor_leave_gaps",
+        "test_packed_equals_packbits_of_frames",
+        PacksFromTheRight,
+        r"packed.span. must be numpy.packbits.* \d+ pixels differ",
+        {},
+    ),
+    (
+        "test_packed_equals_packbits_of_frames",
+        LendsPackedFrames,
+        "after its caller changed the array that packed.. returned",
+        {},
+    ),
+    (
+        "test_counts_of_adjacent_spans_add_up",
         CountsOneMore,
         "counts of frames 0 to 36 and of frames 37 to 74 must add up",
         {},
     ),
-    ("test_a_frame_is_the_same_in_any_span", CountsFromTheEnd, "frame 0 of frames 0 to 74 is not the one alone", {}),
-    ("test_it_reads_the_frames_that_were_written", SwapsRows, "75 of 75 frames differ", {"write": written}),
+    ("test_frame_is_the_same_in_any_span", CountsFromTheEnd, "frame 0 of frames 0 to 74 differs from that frame alone", {}),
+    ("test_frames_equal_written_frames", SwapsRows, "75 of 75 frames differ", {"write": written}),
     (
-        "test_a_span_beyond_the_capture_is_an_input_error",
+        "test_span_beyond_capture_raises_input_error",
         GivesWhatThereIs,
         r"counts\(\) of frames 74 to 75 .* it returned a nd",
         {},
     ),
-    ("test_what_was_returned_does_not_change", LendsItsFrames, "after a caller wrote to what frames.. had returned", {}),
-    ("test_what_was_returned_does_not_change", ReusesItsBuffer, "counts.. overwrites what it returned", {}),
+    ("test_returned_arrays_belong_to_caller", LendsItsFrames, "after its caller changed the array that frames.. returned", {}),
+    ("test_returned_arrays_belong_to_caller", ReusesItsBuffer, "counts.. overwrites an array that it returned before", {}),
     (
-        "test_several_threads_read_what_one_does",
+        "test_threads_read_the_same_frames",
         SharesAPosition,
-        "reading in several threads at once must not raise|come out differently",
+        "reading in several threads at once must not raise|are read differently",
         {},
     ),
-    ("test_opened_again_it_gives_the_same_bytes", LeftToChance, "opened again, the source gives others", {}),
-    ("test_the_response_turns_flux_into_counts_and_back", AnswersDoubled, "response.flux must undo response.mean_count", {}),
-    ("test_the_response_turns_flux_into_counts_and_back", AnswersUnbounded, r"finite flux, got \[inf\]", {}),
-    ("test_with_gives_the_source_and_hides_no_error", HidesErrors, "__exit__ must not return True", {}),
+    ("test_reopened_source_gives_same_bytes", LeftToChance, "opened again, the source returns others", {}),
+    ("test_response_flux_inverts_mean_count", AnswersDoubled, "response.flux must invert response.mean_count", {}),
+    ("test_response_flux_inverts_mean_count", AnswersUnbounded, r"finite flux, got \[inf\]", {}),
+    ("test_with_block_returns_source_and_propagates_errors", HidesErrors, "__exit__ must not return True", {}),
     (
-        "test_check_finds_no_problem_with_the_config_under_test",
+        "test_check_accepts_config_under_test",
         Honest,
-        "can be opened, but check.. says: there is no file capture.npy",
+        "must accept the capture under test; it returned: there is no file capture.npy",
         {"record": {"check": finds_fault}},
     ),
-    ("test_check_finds_what_is_wrong", Honest, "check.. finds nothing wrong with {}", {"wrong": ({},)}),
+    ("test_check_rejects_wrong_configs", Honest, "check.. must reject {}; it returned no problem", {"wrong": ({},)}),
     (
-        "test_check_finds_what_is_wrong",
+        "test_check_rejects_wrong_configs",
         Honest,
         "opening a capture with {} must raise InputError; it returned a Honest",
         {"wrong": ({},), "record": {"check": finds_fault}},
@@ -215,16 +225,16 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("check", "broken", "words", "more"), BROKEN)
-def test_it_is_caught(check, broken, words, more, catches):
+def test_check_fails_on_broken_component(check, broken, words, more, catches):
     catches(SourceConformance, check, broken, words, **more)
 
 
-def test_every_check_catches_something(checks_of):
+def test_every_check_has_a_broken_component(checks_of):
     assert checks_of(SourceConformance, Conformance) == {check for check, *_ in BROKEN}
 
 
 @pytest.mark.parametrize(("honest", "bit_depth"), [(Honest, 1), (Packed, 1), (Honest, 10)])
-def test_an_honest_one_passes(honest, bit_depth, checks_of, complaint):
+def test_checks_pass_on_correct_component(honest, bit_depth, checks_of, failure):
     def build(context):
         source = honest(context)
         if bit_depth > 1:
@@ -234,4 +244,4 @@ def test_an_honest_one_passes(honest, bit_depth, checks_of, complaint):
 
     subject = type("Deep", (SourceConformance,), {"bit_depth": bit_depth, "write": written})()
     for check in checks_of(SourceConformance, Conformance):
-        assert complaint(type(subject), check, build) is None, check
+        assert failure(type(subject), check, build) is None, check
