@@ -115,10 +115,10 @@ class ResamplerConformance(StageConformance):
             problems = list(self.contribution.check(self.settings(), stream))
             try:
                 self.groups(n_frames, 1)
-                refused = None
+                outcome = "returns groups"
             except InputError as error:
-                refused = error
-            assert bool(problems) == (refused is not None), (
+                outcome = f"raises InputError: {error}"
+            assert bool(problems) == (outcome != "returns groups"), (
                 f"check() and groups() must agree about {n_frames} frames; check() returns "
-                f"{'; '.join(problems) or 'no problem'}, groups() {f'raises InputError: {refused}' if refused else 'returns groups'}"
+                f"{'; '.join(problems) or 'no problem'}, groups() {outcome}"
             )
