@@ -59,7 +59,7 @@ class PhotonMleMerger:
                         "chunk_frames",
                         round(source.info.n_frames / len(chunks), 1),
                         f"mean number of consecutive frames that move less than tolerance_px = {tolerance_px:g}; they are "
-                        " summed before they are warped",
+                        "summed before they are warped",
                     )
                 shared = self._shared = _Shared(source, trajectory, chunks, CountsCache(source, _CACHE_BYTES))
             return shared

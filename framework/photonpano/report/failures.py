@@ -1,4 +1,4 @@
-"""Pairs that were not located, grouped so that a hundred alike are one line."""
+"""Group the pairs that were not located by their reason."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from photonpano.record.schema import FailureRecord, LevelRecord
 
 MAX_EXAMPLES = 3
-"""So many pairs of a group are named."""
+"""Number of pairs of a group that are listed."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailureGroup:
-    """Pairs of one level that failed for the same reason, but for the numbers in it.
+    """Pairs of one level that failed for the same reason, apart from the numbers in it.
 
     Attributes:
         level: the level.
@@ -31,7 +31,7 @@ class FailureGroup:
 
     @property
     def alike(self) -> bool:
-        """Whether all pairs have the very same reason."""
+        """Whether all pairs have the same reason, numbers included."""
         return len({failure["reason"] for failure in self.failures}) == 1
 
     @property
@@ -41,7 +41,7 @@ class FailureGroup:
 
     @property
     def more(self) -> int:
-        """How many pairs are not among the examples."""
+        """Number of pairs that are not among the examples."""
         return len(self.failures) - len(self.examples)
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # importing matplotlib takes a second
 
 JPEG_QUALITY = 90
 MAX_INSTANTS = 1500
-"""The trajectory is drawn at so many instants at most, evenly spaced."""
+"""Number of instants at which a long trajectory is drawn, evenly spaced."""
 
 WIDTH_IN = 10.0
 MAX_MAP_HEIGHT_IN = 5.0
@@ -83,7 +83,7 @@ def loading_figures() -> Iterator[None]:
 
 
 def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
-    """Draw where the centre of the frame is, how fast it moves, and how far its corners may be off, over time."""
+    """Draw the position and the speed of the frame centre, and the expected corner error, over time."""
     from matplotlib.ticker import LogLocator
 
     instants = _instants(len(motion.homographies))
@@ -122,7 +122,7 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
 
 
 def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
-    """Draw the way of the frame centre over the panorama, with the outlines of the first, the reference and the last frame."""
+    """Draw the path of the frame centre over the panorama, with the outlines of the first, the reference and the last frame."""
     instants = _instants(len(motion.homographies))
     to_canvas = panorama.thumbnail.canvas @ motion.homographies
     path = apply(to_canvas[instants], _centre(motion.frame_shape))[:, 0]
@@ -142,7 +142,7 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
 
 
 def coverage_map(coverage: FluxImage) -> str:
-    """Draw in how many frames each pixel of the panorama was seen; what was not seen is grey."""
+    """Draw the number of frames that saw each pixel of the panorama; unseen pixels are grey."""
     height, width = coverage.shape
     with _map_figure(height, width, side_in=0.9) as (figure, axes):
         axes.set_facecolor(LINE)
@@ -180,7 +180,7 @@ def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) 
 
 
 def shrunk(image: NDArray[Any], max_pixels: int) -> NDArray[Any]:
-    """Average an image down until its longer side has at most `max_pixels`; smaller images stay as they are."""
+    """Reduce an image by averaging until its longer side has at most `max_pixels`; smaller images are not changed."""
     import cv2
 
     height, width = image.shape[:2]
@@ -245,7 +245,7 @@ def _figure(width_in: float, height_in: float) -> Iterator[Figure]:
 
 @contextmanager
 def _map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[Figure, Axes]]:
-    """Lend a figure in the proportions of a panorama, with room for its axes, and for something of `side_in` beside it."""
+    """Open a figure with the proportions of a panorama, with `side_in` inches beside it for a colour bar."""
     margin_in = 0.9 + side_in
     map_width = min(WIDTH_IN - margin_in, MAX_MAP_HEIGHT_IN * width / height)
     size_in = max(map_width, MIN_MAP_IN), max(map_width * height / width, MIN_MAP_IN)
@@ -263,7 +263,7 @@ def _map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[F
 
 
 def _svg(figure: Figure, name: str) -> str:
-    """Return the SVG element alone, with identifiers of its own and the colours of the page."""
+    """Return the SVG element, with unique identifiers and the colour variables of the page."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     svg = buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them."""
+"""Format numbers for people."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def count(number: int) -> str:
 
 
 def counted(number: int, singular: str, plural: str | None = None) -> str:
-    """Write a whole number and what it counts."""
+    """Write a whole number and its noun, in the singular or plural."""
     return f"{count(number)} {singular if number == 1 else plural or singular + 's'}"
 
 
@@ -43,7 +43,7 @@ def pixels(value: float | None) -> str:
 
 
 def share(value: float) -> str:
-    """Write a share as a percentage; only all is 100 %, and only nothing is 0 %."""
+    """Write a share as a percentage; 100 % and 0 % are exact."""
     percent = 100 * value
     if 99.5 <= percent < 100:
         return "over 99 %"

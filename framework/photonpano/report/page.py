@@ -1,4 +1,4 @@
-"""The page: what it says, and in which order."""
+"""Render the report of a run as an HTML page."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from photonpano.text import byte_size
 from photonpano.values import true_spans
 
 PICTURE_PIXELS = 1600
-"""The longer side of the panorama on the page; the files of the run folder have all pixels."""
+"""Longer side of the panorama on the page; the files of the run folder have all pixels."""
 
 MAX_SPANS = 12
-"""So many spans of frames are named."""
+"""Number of spans of frames that are listed."""
 
 
 def render_report(record: RunRecord, motion: FrameMotion | None, panorama: RenderedPanorama | None) -> str:

@@ -34,7 +34,7 @@ def lines(svg: str, colour: str) -> list[np.ndarray]:
     return [np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", path), dtype=float) for path in paths]
 
 
-def test_colours_are_left_to_the_page(record, motion, panorama):
+def test_figures_use_colour_variables_of_page(record, motion, panorama):
     svgs = [
         figures.path_over_time(motion, 96_800.0),
         figures.path_on_panorama(motion, panorama),
@@ -49,7 +49,7 @@ def test_colours_are_left_to_the_page(record, motion, panorama):
         assert "var(--" in svg
 
 
-def test_the_path_is_a_straight_line_at_a_constant_speed(small):
+def test_path_over_time_of_pan_is_straight_at_constant_speed(small):
     svg = figures.path_over_time(small, None)
     [x], [y], [speed] = (lines(svg, f"var(--series-{number})") for number in (1, 2, 3))
     slope = (x[-1, 1] - x[0, 1]) / (x[-1, 0] - x[0, 0])
@@ -57,32 +57,32 @@ def test_the_path_is_a_straight_line_at_a_constant_speed(small):
     assert np.ptp(speed[:, 1]) < 1e-3
 
 
-def test_long_captures_are_drawn_at_a_bounded_number_of_instants(motion):
+def test_path_over_time_bounds_number_of_points(motion):
     # Points that lie on the line between others would be left out of the drawing.
     with mpl.rc_context({"path.simplify": False}):
         svg = figures.path_over_time(motion, 96_800.0)
     assert figures.MAX_INSTANTS / 2 < len(lines(svg, "var(--series-1)")[0]) <= figures.MAX_INSTANTS
 
 
-def test_frames_that_were_not_located_are_shaded(small):
+def test_path_over_time_shades_frames_not_located(small):
     shaded = '<path d="[^"]*"[^>]*style="fill: var\\(--muted\\); opacity: 0.18'
     assert len(re.findall(shaded, figures.path_over_time(small, None))) == 3
     assert not re.findall(shaded, figures.path_over_time(replace(small, located=np.ones(200, bool)), None))
 
 
 @pytest.mark.parametrize(("rate", "label"), [(1000.0, "time (ms)"), (20.0, "time (s)")])
-def test_time_has_the_unit_that_fits(small, rate, label):
+def test_time_axis_chooses_unit(small, rate, label):
     assert label in figures.path_over_time(small, rate)
 
 
-def test_a_single_frame_can_be_drawn(small, panorama):
+def test_figures_draw_single_frame(small, panorama):
     single = replace(small, homographies=np.eye(3)[None], located=np.ones(1, bool), std_px=np.ones(1), reference=0)
     for svg in (figures.path_over_time(single, 100.0), figures.path_on_panorama(single, of_shape(panorama, (30, 90)))):
         ElementTree.fromstring(svg)
 
 
 @pytest.mark.parametrize("shape", [(20, 9000), (3000, 20), (1, 1)])
-def test_panoramas_of_any_proportions_can_be_drawn(small, panorama, shape):
+def test_maps_draw_any_aspect_ratio(small, panorama, shape):
     drawings = figures.path_on_panorama(small, of_shape(panorama, shape)), figures.coverage_map(np.zeros(shape, np.float32))
     for svg in drawings:
         _, _, width, height = map(float, re.search(r'viewBox="([^"]*)"', svg).group(1).split())
@@ -90,7 +90,7 @@ def test_panoramas_of_any_proportions_can_be_drawn(small, panorama, shape):
         assert 90 < height <= 430
 
 
-def test_bars_are_as_long_as_their_seconds(record):
+def test_stage_times_bars_match_seconds(record):
     levels, panorama = record["levels"], record["panorama"]
     svg = figures.stage_times(levels, panorama)
     bars = {}

@@ -22,12 +22,12 @@ from photonpano.text import byte_size
         (7380, "2 h 03 min"),
     ],
 )
-def test_durations(seconds, text):
+def test_duration_formats_with_unit_and_three_digits(seconds, text):
     assert numbers.duration(seconds) == text
 
 
 @pytest.mark.parametrize(("hertz", "text"), [(96_800, "96.8 kHz"), (500, "500 Hz"), (1.5e6, "1.5 MHz"), (29.97, "30 Hz")])
-def test_rates(hertz, text):
+def test_rate_formats_hz_khz_mhz(hertz, text):
     assert numbers.rate(hertz) == text
 
 
@@ -53,7 +53,7 @@ def test_shares(value, text):
     assert numbers.share(value) == text
 
 
-def test_counts_and_spans():
+def test_count_counted_and_span_format_whole_numbers():
     assert numbers.counted(1, "frame") == "1 frame"
     assert numbers.counted(12_000, "frame") == "12,000 frames"
     assert numbers.span(1000, 2000) == "1,000 to 1,999"
@@ -64,7 +64,7 @@ def failure(start: int, reason: str) -> dict:
     return {"moving": [start, start + 5], "fixed": [start + 5, start + 10], "reason": reason}
 
 
-def test_failures_are_grouped_by_level_and_reason_but_not_by_the_numbers_in_it():
+def test_failure_groups_ignore_numbers_in_reasons():
     levels = [
         {"level": 1, "failures": [failure(0, "too dark"), *(failure(k, f"only {k} of -3.5 agree") for k in range(5))]},
         {"level": 2, "failures": [failure(9, "too dark"), failure(19, "too dark")]},

@@ -42,7 +42,7 @@ def check_self_contained(page: str) -> None:
     assert targets <= set(names)
 
 
-def test_the_page_needs_nothing_else_and_is_the_same_each_time(record, motion, panorama):
+def test_page_is_self_contained_and_deterministic(record, motion, panorama):
     page = render_report(record, motion, panorama)
     assert page == render_report(record, motion, panorama)
     check_self_contained(page)
@@ -51,25 +51,25 @@ def test_the_page_needs_nothing_else_and_is_the_same_each_time(record, motion, p
     assert page.count("<svg") == 4
 
 
-def test_the_page_says_what_happened(record, motion, panorama, no_figures):
+def test_page_shows_facts_warnings_and_failures(record, motion, panorama, no_figures):
     text = text_of(render_report(record, motion, panorama))
     height, width = panorama.canvas.shape
     for sentence in (
         "photonpano 0.1.0 done corridor-pan",
         f"10,000 binary frames of 496 {TIMES} 254 px at 96.8 kHz, 103 ms. 14 March 2026, 15:09 UTC",
         "level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it",
-        f"The panorama, {width:,} {TIMES} {height} px at scale 1; 99 % of it was seen, "
-        "and 1.83 photons per pixel per frame are white.",
+        f"The panorama, {width:,} {TIMES} {height} px at scale 1; 99 % of it was seen; "
+        "white is 1.83 photons per pixel per frame.",
         "located, last level 157 of 157 groups",
         "change in the last level 0.063 px",
         "time 1 min 23 s",
         "peak memory 812 MiB",
-        "Chosen from what the capture shows group_size : 250 \N{EN DASH} at 0.15 px per frame groups of 250 "
+        "Chosen from the capture group_size : 250 \N{EN DASH} at 0.15 px per frame groups of 250 "
         "frames are blurred by 38 px",
-        "250 frames of 10,000 were not located: 0 to 124; 9,875 to 9,999 (counted from 0; the trajectory is",
+        "250 frames of 10,000 were not located: 0 to 124; 9,875 to 9,999 (counted from 0; their motion is",
         "the images overlap by 4% (at least 10% is needed)",
         "9,000 to 9,249 against 9,125 to 9,374",
-        "such as: only 7 of 31 matches agree with one homography (at least 20 are needed)",
+        "for example: only 7 of 31 matches agree with one homography (at least 20 are needed)",
         "and 6 more pairs; all are in run.json",
         "Seed 0.",
         "opencv-sift",
@@ -79,7 +79,7 @@ def test_the_page_says_what_happened(record, motion, panorama, no_figures):
         assert sentence in text
 
 
-def test_fallbacks_that_located_pairs_are_counted(record, motion, panorama, no_figures):
+def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, motion, panorama, no_figures):
     assert "located by" not in text_of(render_report(record, motion, panorama))
     for level, counts in zip(record["levels"], ((39, 0), (67, 1), (150, 6)), strict=True):
         level["located_by"] = dict(zip(("direct", "opencv-sift"), counts, strict=True))
@@ -89,7 +89,7 @@ def test_fallbacks_that_located_pairs_are_counted(record, motion, panorama, no_f
     assert "Level 3: 150 pairs located by direct , 6 pairs located by opencv-sift ." in text
 
 
-def test_each_level_is_a_row(record, motion, panorama, no_figures):
+def test_level_table_has_one_row_per_level(record, motion, panorama, no_figures):
     tree = ElementTree.fromstring(render_report(record, motion, panorama))
     [table] = [table for table in tree.iter("table") if table.get("class") == "figures"]
     rows = [["".join(cell.itertext()) for cell in row] for row in table.find("tbody")]
@@ -101,7 +101,7 @@ def test_each_level_is_a_row(record, motion, panorama, no_figures):
     ]
 
 
-def test_the_spec_on_the_page_is_the_spec(record, motion, panorama, no_figures):
+def test_page_shows_resolved_spec(record, motion, panorama, no_figures):
     tree = ElementTree.fromstring(render_report(record, motion, panorama))
     assert YAML(typ="safe").load("".join(tree.find(".//pre").itertext())) == record["spec"]
 
@@ -109,7 +109,7 @@ def test_the_spec_on_the_page_is_the_spec(record, motion, panorama, no_figures):
 HOSTILE = '</pre></style><script>alert("1")</script><img src="http://example.org/x.png"/>&amp;'
 
 
-def test_everything_from_outside_is_escaped(record, motion, panorama, no_figures):
+def test_page_escapes_all_input(record, motion, panorama, no_figures):
     record["spec_file"] = HOSTILE
     record["status"] = HOSTILE
     record["warnings"] = [HOSTILE]
@@ -124,20 +124,20 @@ def test_everything_from_outside_is_escaped(record, motion, panorama, no_figures
     assert text_of(page).count('<script>alert("1")</script>') == 9
 
 
-def test_all_frames_located(record, motion, panorama, no_figures):
+def test_page_without_gaps_says_all_frames_located(record, motion, panorama, no_figures):
     page = render_report(record, replace(motion, located=np.ones_like(motion.located)), panorama)
     assert "All frames were located." in text_of(page)
     assert "Shaded" not in page
 
 
-def test_many_gaps_are_counted_not_listed(record, motion, panorama, no_figures):
+def test_page_counts_gaps_beyond_the_first_dozen(record, motion, panorama, no_figures):
     located = np.arange(len(motion.located)) % 100 > 0
     text = text_of(render_report(record, replace(motion, located=located), panorama))
     assert "100 frames of 10,000 were not located: 0; 100; 200;" in text
     assert "1,000; 1,100 and 88 further spans" in text
 
 
-def test_a_capture_without_a_rate_has_no_time(record, motion, panorama):
+def test_page_omits_time_without_frame_rate(record, motion, panorama):
     record["source"]["frame_rate_hz"] = None
     page = render_report(record, motion, panorama)
     check_self_contained(page)
@@ -145,20 +145,20 @@ def test_a_capture_without_a_rate_has_no_time(record, motion, panorama):
     assert "time (" not in page
 
 
-def test_a_run_without_a_spec_file(record, motion, panorama, no_figures):
+def test_page_has_title_without_spec_file(record, motion, panorama, no_figures):
     record["spec_file"] = None
     text = text_of(render_report(record, motion, panorama))
     assert "A run without a spec file" in text
     assert "From " not in text
 
 
-def test_a_large_panorama_is_shown_smaller(record, motion, panorama, no_figures):
+def test_page_reduces_large_panorama(record, motion, panorama, no_figures):
     large = replace(panorama, picture=np.repeat(panorama.picture, 2, axis=1))
-    assert "Shown smaller than it is; panorama.png has all pixels." in text_of(render_report(record, motion, large))
-    assert "Shown smaller" not in render_report(record, motion, panorama)
+    assert "Reduced for this page; panorama.png has all pixels." in text_of(render_report(record, motion, large))
+    assert "Reduced for this page" not in render_report(record, motion, panorama)
 
 
-def test_a_failed_run_has_a_page_without_a_panorama(record):
+def test_page_of_failed_run_has_no_panorama(record):
     record.update(status="failed", panorama=None, levels=record["levels"][:2], warnings=["the graph fell apart"])
     page = render_report(record, None, None)
     check_self_contained(page)
@@ -169,21 +169,21 @@ def test_a_failed_run_has_a_page_without_a_panorama(record):
     assert page.count("<svg") == 1
 
 
-def test_a_run_that_failed_at_once_still_has_a_page(record):
+def test_page_of_run_that_failed_before_level_1(record):
     record.update(status="failed", panorama=None, levels=[], warnings=[])
     page = render_report(record, None, None)
     check_self_contained(page)
     assert "<svg" not in page
 
 
-def test_import_loads_nothing_that_only_the_page_needs():
+def test_import_of_report_is_light():
     heavy = ["jinja2", "matplotlib", "ruamel.yaml"]
     code = f"import sys, photonpano.report; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
 
-def test_figures_need_no_pyplot():
+def test_figures_do_not_import_pyplot():
     code = "import sys; from photonpano.report.figures import stage_times; stage_times([], None); print(sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "matplotlib.figure" in result.stdout
