@@ -1,4 +1,4 @@
-"""The documentation does what it says: its code runs, its specs are right, its commands print what it shows."""
+"""Run the documentation: its code, its specs, and its commands with the output shown."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Block:
     marker: str = ""
 
     def argument(self, name: str) -> str | None:
-        """Return what stands after a marker."""
+        """Return the text after a marker."""
         return self.marker.removeprefix(name).strip() if self.marker.startswith(name) else None
 
     def __str__(self) -> str:
@@ -78,7 +78,7 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 def commands_of(block: Block) -> Iterator[tuple[list[str], str]]:
-    """Yield the words of each command, and what it prints according to the page."""
+    """Yield the words of each command, and the output shown on the page."""
     for part in re.split(r"^\$ ", block.text.replace("\\\n", " "), flags=re.MULTILINE)[1:]:
         line, _, output = part.partition("\n")
         yield shlex.split(line, comments=True), output
@@ -101,7 +101,7 @@ def make_capture(small_capture) -> Callable[[str], None]:
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch) -> Path:
-    """A folder of its own, from which modules are imported and plugins discovered."""
+    """A new folder from which modules are imported and plugins discovered."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
@@ -109,7 +109,7 @@ def workplace(tmp_path, monkeypatch) -> Path:
 
 
 def forget_modules(folder: Path) -> None:
-    """Have the modules of a folder imported anew."""
+    """Forget the imported modules of a folder."""
     for name, module in list(sys.modules.items()):
         if str(getattr(module, "__file__", "")).startswith(str(folder)):
             del sys.modules[name]
@@ -117,7 +117,7 @@ def forget_modules(folder: Path) -> None:
 
 
 class Reader:
-    """Does what a reader of a page does, block by block."""
+    """Follows a page block by block, as a reader does."""
 
     def __init__(self, workplace: Path, names: dict[str, Any]) -> None:
         self.workplace = workplace
@@ -198,7 +198,7 @@ class Reader:
         assert same, f"{block}: {words} printed\n{printed}\nand the page shows\n{shown}"
 
     def install(self) -> None:
-        """Do what pip does of interest: leave the metadata of the project in this folder, beside its modules."""
+        """Write the metadata that pip would install, beside the modules of the project."""
         project = tomllib.loads((self.workplace / "pyproject.toml").read_text())["project"]
         info = self.workplace / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
         info.mkdir()
@@ -209,7 +209,7 @@ class Reader:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=ident)
-def test_a_reader_can_follow_the_page(page, workplace, make_capture):
+def test_code_and_commands_of_page_work(page, workplace, make_capture):
     reader = Reader(workplace, {"make_capture": make_capture})
     for block in blocks_of(page):
         try:
@@ -219,7 +219,7 @@ def test_a_reader_can_follow_the_page(page, workplace, make_capture):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=ident)
-def test_no_block_escapes_the_tests(page):
+def test_every_block_of_page_is_tested(page):
     fences = re.findall(r"^ *```", page.read_text(encoding="utf-8"), re.MULTILINE)
     shown = [block for block in blocks_of(page) if block.text in page.read_text(encoding="utf-8")]
     hidden = page.read_text(encoding="utf-8").count("<!-- test: setup")
@@ -228,7 +228,7 @@ def test_no_block_escapes_the_tests(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=ident)
-def test_links_and_pictures_exist(page):
+def test_links_and_pictures_of_page_exist(page):
     text = BLOCK.sub("", page.read_text(encoding="utf-8"))
     for target in re.findall(r"\]\(([^)\s]+)\)|(?:src|href)=\"([^\"]+)\"", text):
         path, _, anchor = "".join(target).partition("#")
@@ -246,8 +246,8 @@ def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def test_the_tutorial_of_a_plugin_ends_with_the_example():
-    """Blocks that are files of the example, in their last state, are those files; and none is missing but the README."""
+def test_plugin_tutorial_ends_with_example_files():
+    """The last version of each file block equals the file of the example; only the README has no block."""
     example = ROOT / "examples" / "third_party_plugin"
     written = {}
     for block in blocks_of(ROOT / "docs" / "tutorial" / "first-plugin.md"):
@@ -257,7 +257,7 @@ def test_the_tutorial_of_a_plugin_ends_with_the_example():
     assert written == {path.relative_to(example).as_posix(): path.read_text(encoding="utf-8") for path in kept}
 
 
-def test_every_page_can_be_reached_from_the_index():
+def test_index_links_every_page():
     index = ROOT / "docs" / "README.md"
     linked = {(index.parent / target).resolve() for target in re.findall(r"\]\(([^)#]+)", index.read_text(encoding="utf-8"))}
     assert set((ROOT / "docs").rglob("*.md")) - {index} <= linked
@@ -272,25 +272,25 @@ def make_reference() -> Any:
 
 
 @pytest.mark.parametrize("page", sorted(REFERENCE.glob("*.md")), ids=ident)
-def test_the_generated_tables_are_up_to_date(page, make_reference):
+def test_generated_tables_are_up_to_date(page, make_reference):
     text = page.read_text(encoding="utf-8")
     assert make_reference.updated(text) == text, "run: python docs/make_reference.py"
 
 
-def test_every_section_and_component_has_its_table():
+def test_spec_reference_has_table_for_every_component():
     page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
     wanted = [f"settings {name}" for name in ("levels", "graph", "render", "output", "run")]
     wanted += [f"{entry.kind} {entry.name}" for entry in discover().rows if entry.origin.plugin == "photonpano"]
     assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
 
 
-def test_every_correction_has_its_table():
+def test_spec_reference_has_table_for_every_correction():
     page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
     wanted = ["corrections", *(f"correction {name}" for name, model in CORRECTIONS.items() if model.model_fields)]
     assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
 
 
-def test_every_command_has_its_table():
+def test_cli_reference_has_table_for_every_command():
     page = (REFERENCE / "cli.md").read_text(encoding="utf-8")
     main: Any = typer.main.get_command(app)
     names = [name for name in main.commands if name != "plugins"]
@@ -298,19 +298,19 @@ def test_every_command_has_its_table():
     assert [name for name in names if f"<!-- generated: command {name} -->" not in page] == []
 
 
-def test_every_function_is_listed():
+def test_python_page_lists_every_function():
     page = (REFERENCE / "python.md").read_text(encoding="utf-8")
     functions = [name for name in photonpano.__all__ if inspect.isfunction(getattr(photonpano, name))]
     assert [name for name in functions if f"| `{name}(" not in page] == ["discover"]
 
 
-def test_every_hook_has_its_section():
+def test_plugin_reference_has_section_for_every_hook():
     page = (REFERENCE / "plugins.md").read_text(encoding="utf-8")
     hooks = [name for name in vars(hookspecs) if name.startswith("photonpano_")]
     assert [name for name in hooks if f"`{name}`\n" not in page or f"<!-- generated: hook {name} -->" not in page] == []
 
 
-def test_everything_in_a_run_folder_is_documented(small_run):
+def test_run_folder_page_documents_every_file_and_key(small_run):
     page = (REFERENCE / "run-folder.md").read_text(encoding="utf-8")
     record = small_run.record
     names = {file.name for file in small_run.directory.iterdir()}

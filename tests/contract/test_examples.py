@@ -1,4 +1,4 @@
-"""Every spec of examples/pipelines does what it is there for, on captures that are made small."""
+"""Run every spec of examples/pipelines on a small capture."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAPTURES = {
     "capture": SMALL_STREET | GROUPS,
     "demo-capture": SMALL_STREET | GROUPS | {"source.with.path": "{kind: pan, length_px: 60}"},
 }
-"""Specs to simulate, and what makes them small. Groups are checked, though a capture has none."""
+"""Specs to simulate, with overrides that make them small. The group size is checked, though it is not used."""
 RUNS: dict[str, dict[str, Any]] = {
     "scan": GROUPS,
     "naive-average": GROUPS,
@@ -56,16 +56,16 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.n_frames": 300, "source.with.scene.width": 640}
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
-"""Specs to run, and what makes them small."""
+"""Specs to run, with overrides that make them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
-"""Those whose levels have no more groups than the first."""
+"""Specs with the same number of groups at every level."""
 NEEDS = {"colmap": "pycolmap", "high-speed-video": "av", "kornia": "kornia"}
-"""Libraries that may be missing; the specs that need them are run where they are installed."""
+"""Optional libraries of specs, which run only if the library is installed."""
 
 
 STREET = {"kind": "street", "width": 1024, "height": 682}
 CAMERA = {"scene": STREET, "path": {"kind": "pan", "length_px": 120}, "n_frames": 60, "frame_shape": [128, 160]}
-"""What the example of a video was taken with."""
+"""The simulated camera of the example video."""
 
 
 def photonpano(*arguments: str | Path, **overrides: Any) -> str:
@@ -101,23 +101,23 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
     return folder
 
 
-def test_every_example_is_tested():
+def test_every_example_spec_is_in_this_file():
     assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS}
 
 
-def test_every_example_is_introduced():
+def test_examples_readme_links_every_spec():
     page = (EXAMPLES / "README.md").read_text(encoding="utf-8")
     assert [file.name for file in EXAMPLES.glob("*.yaml") if f"[{file.name}]({file.name})" not in page] == []
 
 
 @pytest.mark.parametrize("name", CAPTURES)
-def test_captures_can_be_simulated(name, examples, tmp_path):
+def test_example_captures_simulate(name, examples, tmp_path):
     photonpano("simulate", examples / f"{name}.yaml", "--output", tmp_path / "cube.npy", **CAPTURES[name])
     assert np.load(tmp_path / "cube.npy", mmap_mode="r").shape == (240, 128, 20)
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_specs_run(name, examples, tmp_path, write_video):
+def test_example_specs_run(name, examples, tmp_path, write_video):
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
     if name == "high-speed-video":
@@ -137,7 +137,7 @@ def test_specs_run(name, examples, tmp_path, write_video):
     assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
 
 
-def test_the_tutorial_uses_the_examples():
+def test_tutorial_specs_equal_example_specs():
     page = (EXAMPLES.parents[1] / "docs" / "tutorial" / "first-panorama.md").read_text(encoding="utf-8")
     yaml = YAML(typ="safe")
     for name in ("capture.yaml", "scan.yaml"):

@@ -1,4 +1,4 @@
-"""Whole runs, read back from their folders as users read them."""
+"""Run specs, and read results back from run folders."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Outcome:
 
 @pytest.fixture(scope="session")
 def outcome_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Plan], Outcome]:
-    """Run a plan into a folder of its own, without the report, which takes longer than all the rest of a small run."""
+    """Run a plan into a new folder, without the report, which takes longer than the rest of a small run."""
 
     def outcome_of(plan: Plan) -> Outcome:
         output = plan.output.model_copy(update={"directory": tmp_path_factory.mktemp("run")})

@@ -1,4 +1,4 @@
-"""A plugin that fails is named with its distribution and the stage, and leaves the run folder as it was."""
+"""A failing plugin is named with its distribution and the stage, and the run folder is not changed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from photonpano.specs import parse_spec
 
 
 class Fragile:
-    """Any component: its method fails."""
+    """Any component whose method raises."""
 
     def fails(self, *_: Any) -> Any:
         raise RuntimeError("the cable came loose")
@@ -51,7 +51,7 @@ class FindsNonsense(FailsToRegister):
 
 
 class FindsNothingMoved(FailsToRegister):
-    """What `except cv2.error: return np.eye(3)` gives: at once, or where the motion is known by now."""
+    """A locator that returns the identity, as after `except cv2.error: return np.eye(3)`: always, or from level 2 on."""
 
     def __init__(self, from_level: int, locator: Any = None) -> None:
         self.from_level, self.locator = from_level, locator
@@ -75,7 +75,7 @@ class GivesNoExposure:
 
 
 class FailsLater:
-    """An interpolator whose trajectory answers as often as it is asked while it is made, and then no more."""
+    """An interpolator whose trajectory fails after the number of calls that fitting makes."""
 
     def __init__(self, answer: Callable[[Any], Any], good_for: int = 1) -> None:
         self.answer, self.good_for = answer, good_for
@@ -89,7 +89,7 @@ class FailsLater:
 
 
 class FailsToRead:
-    """A source of which some spans cannot be read."""
+    """A source with spans that cannot be read."""
 
     def __init__(self, source: Any, fails: Callable[[FrameSpan], bool], answer: Callable[..., Any]) -> None:
         self.source, self.fails, self.answer = source, fails, answer
@@ -165,7 +165,7 @@ CASES: dict[str, tuple[str, type, Callable[..., Any], str]] = {
 
 
 def failure(spec: dict[str, Any], contribution: Any, folder: Path) -> str:
-    """Run a spec with a plugin that fails; return what is said, once the run folder has been seen to be as it was."""
+    """Run a spec with a failing plugin, require that the run folder is unchanged, and return the message."""
     entry = make_entry(contribution, Origin("strange-plugin", "1.2", "strange = strange.hooks"))
     catalog = Catalog((*discover().rows, entry))
     (folder / "panorama.png").write_text("of an earlier run")
@@ -176,7 +176,7 @@ def failure(spec: dict[str, Any], contribution: Any, folder: Path) -> str:
 
 
 @pytest.mark.parametrize(("section", "kind", "build", "message"), CASES.values(), ids=CASES)
-def test_it_is_named_and_the_run_folder_stays_as_it_was(
+def test_run_names_failing_plugin_and_keeps_run_folder(
     small_spec: dict[str, Any], tmp_path: Path, section: str, kind: Any, build: Callable[..., Any], message: str
 ) -> None:
     contribution = kind(name="fragile", summary="Fails", config=NoConfig, build=build)
@@ -198,10 +198,10 @@ def test_it_is_named_and_the_run_folder_stays_as_it_was(
     ],
     ids=["at first", "while merging", "while rendering", "shape"],
 )
-def test_a_source_is_named_whoever_reads_it(
+def test_failing_source_is_named_in_every_stage(
     small_spec: dict[str, Any], tmp_path: Path, fails: Callable[..., bool], answer: Callable[..., Any], message: str
 ) -> None:
-    """Not the merger, which only asked."""
+    """The message names the source, not the merger that called it."""
     installed = discover()
     opened = installed.find("source", "packed-npy").contribution
 
@@ -213,8 +213,8 @@ def test_a_source_is_named_whoever_reads_it(
     assert failure(spec, fragile, tmp_path) == f"source 'fragile' of strange-plugin 1.2 {message}"
 
 
-def test_a_locator_that_sees_nothing_move_although_it_does_is_named(small_spec: dict[str, Any], tmp_path: Path) -> None:
-    """Level 1 is fine, so that at level 2 the motion is known: the capture pans by 5 px from one group to the next."""
+def test_locator_that_returns_identity_for_moving_frames_is_named(small_spec: dict[str, Any], tmp_path: Path) -> None:
+    """Level 1 succeeds, so the motion is known at level 2: a pan of 5 px from one group to the next."""
     direct = discover().find("locator", "direct").contribution
 
     def build(config: Any, context: Any) -> Any:
@@ -230,8 +230,8 @@ def test_a_locator_that_sees_nothing_move_although_it_does_is_named(small_spec: 
     )
 
 
-def test_numbers_of_numpy_and_those_that_json_cannot_hold_are_recorded(small_spec: dict[str, Any], tmp_path: Path) -> None:
-    """A locator that loses pairs, and counted in the types of numpy."""
+def test_record_converts_numpy_and_non_finite_numbers(small_spec: dict[str, Any], tmp_path: Path) -> None:
+    """A locator that loses pairs, with evidence of numpy types."""
     direct = discover().find("locator", "direct").contribution
 
     class Counts:

@@ -1,4 +1,4 @@
-"""A locator that loses some pairs, and another one that they are offered to."""
+"""A locator loses some pairs, and its fallback locates them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ForgetfulConfig(Config):
 
 
 class Forgetful:
-    """SIFT, but for the pairs of some groups."""
+    """SIFT that loses the pairs of some groups."""
 
     def __init__(self, config: ForgetfulConfig, context: StageContext) -> None:
         self._config = config
@@ -57,7 +57,7 @@ def run(outcome_of: Callable) -> Callable[..., Any]:
     return run
 
 
-def test_the_run_is_as_good_as_its_fallback(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
+def test_run_with_failing_locator_matches_its_fallback(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
     forgetful = {"use": "forgetful", "with": {"every": 3}}
     with_sift = small_spec | {"locate": forgetful | {"fallback": "opencv-sift"}}
     rescued, again = (run(with_sift, catalog, threads) for threads in (3, 1))
@@ -83,9 +83,7 @@ def test_the_run_is_as_good_as_its_fallback(run: Callable, small_spec: dict[str,
     assert [each.contribution.name for each in recorded.levels[0].fallbacks] == ["opencv-sift"]
 
 
-def test_chain_is_its_first_locator_with_the_others_as_fallbacks(
-    run: Callable, small_spec: dict[str, Any], catalog: Catalog
-) -> None:
+def test_chain_of_backends_equals_locator_with_fallbacks(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
     forgetful = {"use": "forgetful", "with": {"every": 3}}
     chain = {"use": "chain-of-backends", "with": {"backends": [forgetful, "opencv-sift"]}}
     with_chain, with_fallback = (
@@ -97,8 +95,8 @@ def test_chain_is_its_first_locator_with_the_others_as_fallbacks(
     assert with_chain.record["spec"] == with_fallback.record["spec"]
 
 
-def test_what_nobody_locates_lists_what_each_said(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
-    """The first and the fifth of six groups are found by neither; the others hold together."""
+def test_failure_lists_reason_of_each_locator(run: Callable, small_spec: dict[str, Any], catalog: Catalog) -> None:
+    """Neither locator locates the first and the fifth of six groups; the other groups stay connected."""
     forgetful = {"use": "forgetful", "with": {"every": 4}}
     fallback = {"use": "forgetful", "with": {"every": 4, "group_size": 49}}
     record = run(small_spec | {"locate": forgetful | {"fallback": fallback}}, catalog).record

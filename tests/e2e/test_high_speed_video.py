@@ -1,4 +1,4 @@
-"""From a simulated high-speed camera, at 500 frames a second, to a panorama: 90 frames of 128x160 px, 2.7 px a frame."""
+"""Panoramas of a simulated high-speed camera: 90 frames of 128x160 px at 500 Hz, 2.7 px a frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CAMERA = {
 
 
 def camera(light: float = 1, read_noise: float = 20) -> dict[str, Any]:
-    """Return the section of a spec that simulates the camera, in so many times the light."""
+    """Return the source section of the simulated camera, with the light multiplied by a factor."""
     sensor = {"full_well": 10_000 * light, "read_noise": read_noise, "exposure": 0.5}
     return {"use": "camera-simulator", "with": CAMERA | {"flux": 1500 * light, "sensor": sensor}}
 
@@ -46,8 +46,8 @@ def scored(tmp_path: Path) -> Callable[..., tuple[Evaluation, dict[str, Any]]]:
     return scored
 
 
-def test_a_noisy_compressed_video_comes_close_to_a_clean_one(write_video: Callable, scored: Callable) -> None:
-    """0.05 and 0.02 px, 28.2 and 31.5 dB when this was written."""
+def test_noisy_compressed_video_is_nearly_as_accurate_as_clean_one(write_video: Callable, scored: Callable) -> None:
+    """Measured: 0.05 and 0.02 px, 28.2 and 31.5 dB."""
 
     def of_video(simulated: dict[str, Any], *how: str, **options: Any) -> tuple[Evaluation, dict[str, Any]]:
         with open_source(parse_spec({"version": 1, "source": simulated})) as opened:
@@ -78,13 +78,13 @@ def test_a_noisy_compressed_video_comes_close_to_a_clean_one(write_video: Callab
     ],
     ids=["single frames", "robust", "splat", "sift"],
 )
-def test_other_stages_take_grey_frames_too(scored: Callable, sections: dict[str, Any]) -> None:
-    """0.08 px for keypoints, and less for the others, when this was written."""
+def test_alternative_stages_accept_grey_frames(scored: Callable, sections: dict[str, Any]) -> None:
+    """Measured: 0.08 px for keypoints, and less for the others."""
     score, _ = scored(camera(), camera(), oracle=False, **sections)
     assert score.trajectory.mean_px < 0.15
 
 
-def test_explain_tells_what_a_capture_of_grey_frames_holds(tmp_path: Path) -> None:
+def test_explain_describes_capture_of_grey_frames(tmp_path: Path) -> None:
     spec = {"version": 1, "source": camera(), "resample": {"with": {"group_size": 4}}, "levels": 1}
     (tmp_path / "scan.yaml").write_text(json.dumps(spec))
     done = CliRunner().invoke(app, ["explain", str(tmp_path / "scan.yaml"), "--forecast"])

@@ -1,4 +1,4 @@
-"""Captures of which parts, or the whole, cannot be located: what is tolerated, what is said, and what to try."""
+"""Captures with exposures that cannot be located: tolerated gaps, messages, and suggestions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def run(outcome_of: Callable) -> Callable[..., Any]:
 
 
 def refusal(run: Callable, capture: Path, *overrides: str) -> list[str]:
-    """Return the lines of the error, with # for what the locators count and for the reasons of the first."""
+    """Return the lines of the error, with # for counts and for the reasons of the first locator."""
     with pytest.raises(LocationError) as caught:
         run(capture, *overrides)
     lines = str(caught.value).splitlines()
@@ -40,7 +40,7 @@ def pair(moving: str, fixed: str) -> str:
 
 @pytest.fixture(scope="module")
 def with_a_wall(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, int], Path]:
-    """Let something without texture pass before the camera, from one frame to another."""
+    """Cover the scene with a surface without texture, from one frame to another."""
 
     def with_a_wall(start: int, stop: int) -> Path:
         frames = np.load(small_capture)
@@ -53,7 +53,7 @@ def with_a_wall(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -
     return with_a_wall
 
 
-def test_a_single_lost_exposure_is_tolerated_and_told(run: Callable, with_a_wall: Callable) -> None:
+def test_single_lost_exposure_is_interpolated_with_warning(run: Callable, with_a_wall: Callable) -> None:
     outcome = run(with_a_wall(100, 150), "resample.with.group_size=50")
     (level,) = outcome.record["levels"]
     assert (level["groups"], level["located"]) == (6, 5)
@@ -66,8 +66,8 @@ def test_a_single_lost_exposure_is_tolerated_and_told(run: Callable, with_a_wall
     assert outcome.located[100:150].all()
 
 
-def test_a_longer_part_without_texture_is_named(run: Callable, with_a_wall: Callable) -> None:
-    """Of the two parts that it separates the smaller one is lost with it."""
+def test_long_span_without_texture_fails_with_its_frames(run: Callable, with_a_wall: Callable) -> None:
+    """The gap separates two parts; the smaller one is lost too."""
     lines = refusal(run, with_a_wall(50, 150), "resample.with.group_size=25")
     assert re.fullmatch(
         r"level 1: \d+ of \d+ pairs of exposures could not be located, so that frames 0 to 149 cannot be tied to the rest",
@@ -83,7 +83,7 @@ def test_a_longer_part_without_texture_is_named(run: Callable, with_a_wall: Call
     ]
 
 
-def test_the_largest_part_is_shown_if_the_spec_asks_for_it(run: Callable, with_a_wall: Callable) -> None:
+def test_disconnected_largest_renders_largest_part(run: Callable, with_a_wall: Callable) -> None:
     outcome = run(with_a_wall(50, 150), "resample.with.group_size=25", "graph.disconnected=largest")
     np.testing.assert_array_equal(np.flatnonzero(outcome.located), np.arange(150, 300))
     warnings = outcome.record["warnings"]
@@ -93,7 +93,7 @@ def test_the_largest_part_is_shown_if_the_spec_asks_for_it(run: Callable, with_a
     np.testing.assert_allclose(outcome.homographies[150], np.eye(3), atol=1e-12)
 
 
-def test_a_dark_capture_is_told_from_a_blurred_one(run: Callable, simulated: Callable) -> None:
+def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Callable) -> None:
     lines = refusal(run, simulated(flux=0.001), "resample.with.group_size=50")
     assert lines[:3] == [
         "level 1: none of the 14 pairs of exposures could be located",
@@ -116,8 +116,8 @@ def test_a_dark_capture_is_told_from_a_blurred_one(run: Callable, simulated: Cal
     ]
 
 
-def test_a_smear_is_not_taken_for_a_place(run: Callable, simulated: Callable) -> None:
-    """Groups blurred by 500 px on frames of 160 px: the few stripes of two of them can be laid onto each other."""
+def test_motion_blurred_exposures_are_not_located_by_chance(run: Callable, simulated: Callable) -> None:
+    """Groups are blurred by 500 px on frames of 160 px, so two of them show similar stripes."""
     fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 1})
     with pytest.raises(LocationError):
         run(fast, "resample.with.group_size=100")

@@ -1,4 +1,4 @@
-"""Installed plugins that watch runs: they are told of runs that end well or not, and harm none."""
+"""Installed observers see successful and failed runs, and cannot change them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def photonpano_run_finished(record):
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
-    """Install a distribution of version 1.0 with one module: a folder on `sys.path` with a real `.dist-info`."""
+    """Install a distribution of version 1.0 with one module, as a folder on `sys.path` with a `.dist-info`."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def install(name: str, code: str) -> None:
@@ -57,7 +57,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 @pytest.fixture
 def logger(install: Callable[[str, str], None]) -> None:
-    """The plugin of the page on following runs."""
+    """The plugin of docs/how-to/follow-runs.md."""
     (code,) = re.findall(
         r"<!-- file: photonpano_progress.py -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
     )
@@ -77,7 +77,7 @@ def lines(name: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.usefixtures("logger")
-def test_a_run_that_fails_is_told_as_well(run: Callable[..., Result]) -> None:
+def test_observers_see_failed_run(run: Callable[..., Result]) -> None:
     result = run("--set", "locate={use: direct, with: {min_agreement: 1}}")
     assert result.exit_code == 1
     first, *_, last = lines("scan")
@@ -87,7 +87,7 @@ def test_a_run_that_fails_is_told_as_well(run: Callable[..., Result]) -> None:
 
 
 @pytest.mark.usefixtures("logger")
-def test_what_one_observer_does_wrong_is_a_warning_and_changes_nothing(
+def test_failing_observer_is_a_warning_and_changes_no_result(
     run: Callable[..., Result], install: Callable[[str, str], None]
 ) -> None:
     install("clumsy", CLUMSY)

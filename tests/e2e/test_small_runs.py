@@ -22,10 +22,10 @@ from photonpano.specs import Plan, parse_spec
 
 SHAPE = (128, 160)
 INSIDE = slice(25, 275)
-"""The frames that every level locates: at the first, the ends lie beyond the middle of a group."""
+"""Frames that every level locates; level 1 does not reach the ends of the capture."""
 
 
-def test_a_panorama_larger_than_the_memory_is_written_in_parts(small_spec: dict[str, Any], tmp_path: Path) -> None:
+def test_panorama_larger_than_memory_is_written_in_parts(small_spec: dict[str, Any], tmp_path: Path) -> None:
     plan = parse_spec(
         small_spec | {"levels": 1, "output": {"directory": str(tmp_path)}},
         overrides=("render.scale=9", "run.memory=64 MiB"),
@@ -79,47 +79,47 @@ def scored(small_run: RunResult, small_capture: Path) -> Evaluation:
     return photonpano.evaluate(small_run.directory, truth_path(small_capture))
 
 
-def test_three_levels_find_the_motion(scored: Evaluation, three_levels: np.ndarray, error_px: Callable) -> None:
-    """0.16 px when this was written; the ends, of which a single group tells, are off by more."""
+def test_three_levels_estimate_motion_accurately(scored: Evaluation, three_levels: np.ndarray, error_px: Callable) -> None:
+    """Measured: 0.16 px; the ends, with a single group, have larger errors."""
     assert error_px(three_levels) < 0.3
     assert scored.trajectory.located_share == 1
     assert scored.trajectory.mean_px < 1
 
 
-def test_the_panorama_comes_close_to_the_one_along_the_true_motion(scored: Evaluation) -> None:
-    """Within 2.1 dB when this was written."""
+def test_panorama_is_close_to_oracle(scored: Evaluation) -> None:
+    """Measured: within 2.1 dB."""
     assert scored.oracle is not None
     assert scored.oracle.psnr_db > 25
     assert scored.oracle.psnr_db - scored.panorama.psnr_db < 3
 
 
-def test_each_level_improves_on_the_one_before(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
-    """1.2, 0.24 and 0.16 px when this was written."""
+def test_each_level_reduces_the_error(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
+    """Measured: 1.2, 0.24 and 0.16 px."""
     errors = [error_px(run(levels=1).homographies), error_px(run(levels=2).homographies), error_px(three_levels)]
     assert errors[1] < 0.5 * errors[0]
     assert errors[2] < 0.9 * errors[1]
 
 
-def test_a_constant_number_of_groups_is_clearly_worse(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
-    """0.5 px when this was written."""
+def test_constant_groups_are_less_accurate(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
+    """Measured: 0.5 px."""
     ablation = run("resample.use=constant-groups")
     assert error_px(ablation.homographies) > 1.8 * error_px(three_levels)
 
 
-def test_a_naive_average_is_clearly_worse(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
-    """1.9 px when this was written: more levels do not help."""
+def test_naive_average_is_less_accurate(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
+    """Measured: 1.9 px; more levels do not help."""
     naive = run("merge.with.compensate=false", levels=2)
     assert error_px(naive.homographies) > 4 * error_px(three_levels)
 
 
-def test_a_first_level_of_half_the_size_shows_the_way_to_the_second(run: Callable, error_px: Callable) -> None:
+def test_half_size_first_level_suffices_for_second(run: Callable, error_px: Callable) -> None:
     coarse, fine = run(levels=[{"scale": 0.5}]), run(levels=[{"scale": 0.5}, {}])
     assert error_px(coarse.homographies) < 2.5
     assert error_px(fine.homographies) < 0.4
     assert [level["scale"] for level in fine.record["levels"]] == [0.5, 1.0]
 
 
-def test_the_panorama_has_the_scale_of_the_spec(run: Callable) -> None:
+def test_panorama_has_scale_of_spec(run: Callable) -> None:
     once, twice = run(levels=1), run("render.scale=2", levels=1)
     assert twice.flux.shape == (2 * once.flux.shape[0], 2 * once.flux.shape[1])
     np.testing.assert_allclose(twice.canvas, rescaling(2) @ once.canvas, atol=1e-9)
@@ -128,9 +128,7 @@ def test_the_panorama_has_the_scale_of_the_spec(run: Callable) -> None:
 
 
 @pytest.mark.parametrize(("reference", "frame"), [("first", 0), ("last", 299), (77, 77)])
-def test_the_panorama_lies_in_the_plane_of_the_frame_that_the_spec_names(
-    run: Callable, reference: str | int, frame: int
-) -> None:
+def test_panorama_lies_in_plane_of_reference_frame(run: Callable, reference: str | int, frame: int) -> None:
     outcome = run(f"render.reference={reference}", levels=1)
     assert outcome.trajectory["reference"] == frame
     np.testing.assert_allclose(outcome.homographies[frame], np.eye(3), atol=1e-12)
@@ -139,21 +137,21 @@ def test_the_panorama_lies_in_the_plane_of_the_frame_that_the_spec_names(
     np.testing.assert_array_equal(canvas, translation(round(canvas[0, 2]), round(canvas[1, 2])))
 
 
-def test_any_number_of_threads_gives_the_same_bytes(run: Callable) -> None:
-    """Four groups, then nine: the order in which threads finish must not show."""
+def test_trajectory_bytes_do_not_depend_on_threads(run: Callable) -> None:
+    """Levels of four and nine groups: the order in which threads finish must not matter."""
     runs = [run(f"run.threads={threads}", "resample.with.group_size=75", levels=2) for threads in (1, 2, 3)]
     assert len({(each.directory / "trajectory.npz").read_bytes() for each in runs}) == 1
 
 
-def test_a_recorded_spec_repeats_the_run(run: Callable, outcome_of: Callable) -> None:
+def test_recorded_spec_repeats_run(run: Callable, outcome_of: Callable) -> None:
     first = run("run.seed=3", levels=1)
     again = outcome_of(parse_spec(json.loads(json.dumps(first.record["spec"]))))
     np.testing.assert_array_equal(again.homographies, first.homographies)
     np.testing.assert_array_equal(again.flux, first.flux)
 
 
-def test_masked_hot_pixels_leave_no_trace(simulated: Callable, outcome_of: Callable) -> None:
-    """One in a hundred pixels is lit in every frame; masked, it shows what other frames saw there."""
+def test_masked_hot_pixels_do_not_show_in_panorama(simulated: Callable, outcome_of: Callable) -> None:
+    """1 % of the pixels are lit in every frame; if they are masked, other frames fill their places."""
     sensor = {"hot_fraction": 0.01, "hot_rate": [5, 6]}
     capture = simulated(path={"kind": "pan", "length_px": 40}, n_frames=120, sensor=sensor)
     with np.load(truth_path(capture)) as archive:

@@ -1,4 +1,4 @@
-"""A plugin by somebody else, built and installed as strangers do it, beside a photonpano that is there already."""
+"""Build a third-party plugin, and install it beside an installed photonpano."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ class Environment:
         return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
 
     def photonpano(self, *arguments: str | Path) -> CompletedProcess[str]:
-        """Run the command line of the photonpano that it sees."""
+        """Run photonpano of this environment."""
         return self.run("-c", CLI, *arguments)
 
 
 def done(process: CompletedProcess[str]) -> str:
-    """Return what a process printed, and require that it did not fail."""
+    """Require that a process succeeded, and return its output."""
     assert process.returncode == 0, process.stdout + process.stderr
     return process.stdout
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build from a copy, so that nothing is left behind, and by the hatchling that is installed, so that none is fetched."""
+    """Build from a copy, to leave no files behind, with the installed hatchling, to download nothing."""
     folder = tmp_path_factory.mktemp("wheel")
     source = shutil.copytree(EXAMPLE, folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
     build = [*PIP, "wheel", "--no-index", "--no-build-isolation", "--no-deps", "--wheel-dir", folder, source]
@@ -61,7 +61,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
-    """A fresh environment that sees the packages of this one, whether this is a virtual one or not, and has the wheel."""
+    """A new virtual environment with the packages of the current one and the wheel."""
     folder = tmp_path_factory.mktemp("stranger")
     home = folder / "venv"
     venv.create(home, symlinks=True)
@@ -79,17 +79,17 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Enviro
     return environment
 
 
-def test_the_wheel_holds_the_package_alone(wheel: Path) -> None:
+def test_wheel_contains_package_only(wheel: Path) -> None:
     names = {name.partition("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert names == {"photonpano_example", "photonpano_example-0.1.0.dist-info"}
 
 
-def test_it_is_imported_from_where_it_was_installed(environment: Environment) -> None:
+def test_installed_plugin_is_imported_from_environment(environment: Environment) -> None:
     module = Path(done(environment.run("-c", "import photonpano_example; print(photonpano_example.__file__)")).strip())
     assert module.is_relative_to(environment.folder / "venv")
 
 
-def test_it_is_listed_with_its_distribution_and_version(environment: Environment) -> None:
+def test_plugins_list_shows_distribution_and_version(environment: Environment) -> None:
     listed = done(environment.photonpano("plugins", "list"))
     rows = [line.split()[:4] for line in listed.splitlines() if "photonpano-example" in line]
     assert rows == [
@@ -98,13 +98,13 @@ def test_it_is_listed_with_its_distribution_and_version(environment: Environment
     ]
 
 
-def test_its_own_tests_pass(environment: Environment) -> None:
+def test_example_plugin_passes_its_own_tests(environment: Environment) -> None:
     printed = done(environment.run("-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests"))
     assert " passed" in printed
     assert "failed" not in printed
 
 
-def test_a_pipeline_runs_with_it(environment: Environment, small_capture: Path) -> None:
+def test_pipeline_runs_with_installed_plugin(environment: Environment, small_capture: Path) -> None:
     changes = {"source.with.path": small_capture, "resample.with.group_size": 50, "levels": 2}
     options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
     done(environment.photonpano("run", "scan.yaml", *options))
@@ -117,13 +117,13 @@ def test_a_pipeline_runs_with_it(environment: Environment, small_capture: Path) 
     ]
 
 
-def test_a_misspelt_name_is_answered_with_the_one_of_the_plugin(environment: Environment) -> None:
+def test_misspelt_name_suggests_component_of_plugin(environment: Environment) -> None:
     checked = environment.photonpano("check", "scan.yaml", "--set", "locate.use=profile-shfit")
     assert checked.returncode == 2
     assert "locate.use: there is no locator 'profile-shfit'; did you mean 'profile-shift'?" in checked.stderr
 
 
-def test_without_the_plugin_its_names_are_errors_that_say_what_there_is(small_capture: Path, tmp_path: Path) -> None:
+def test_names_of_missing_plugin_are_errors_with_suggestions(small_capture: Path, tmp_path: Path) -> None:
     shutil.copy(EXAMPLE / "scan.yaml", tmp_path)
     checked = CliRunner().invoke(app, ["check", str(tmp_path / "scan.yaml"), "--set", f"source.with.path={small_capture}"])
     assert checked.exit_code == 2
@@ -135,7 +135,7 @@ def test_without_the_plugin_its_names_are_errors_that_say_what_there_is(small_ca
     assert last == "error: the spec has 2 problems"
 
 
-def test_the_source_distribution_of_photonpano_holds_nothing_of_it(tmp_path: Path) -> None:
+def test_source_distribution_excludes_example_plugin(tmp_path: Path) -> None:
     build = [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path]
     done(subprocess.run(build, cwd=ROOT, capture_output=True, text=True, check=False))
     (archive,) = tmp_path.glob("*.tar.gz")

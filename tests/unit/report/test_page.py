@@ -64,8 +64,7 @@ def test_page_shows_facts_warnings_and_failures(record, motion, panorama, no_fig
         "change in the last level 0.063 px",
         "time 1 min 23 s",
         "peak memory 812 MiB",
-        "Chosen from the capture group_size : 250 \N{EN DASH} at 0.15 px per frame groups of 250 "
-        "frames are blurred by 38 px",
+        "Chosen from the capture group_size : 250 \N{EN DASH} at 0.15 px per frame groups of 250 frames are blurred by 38 px",
         "250 frames of 10,000 were not located: 0 to 124; 9,875 to 9,999 (counted from 0; their motion is",
         "the images overlap by 4% (at least 10% is needed)",
         "9,000 to 9,249 against 9,125 to 9,374",

@@ -28,7 +28,7 @@ def document(catalog, **sections):
         ({"use": "chain-of-backends", "with": None}, {"use": "direct", "fallback": "opencv-sift"}),
     ],
 )
-def test_a_chain_is_its_first_locator_with_the_others_as_fallbacks(written, meant, catalog):
+def test_chain_of_backends_equals_locator_with_fallbacks(written, meant, catalog):
     assert document(catalog, locate=written) == document(catalog, locate=meant)
     level = {"locate": CLEAR}
     assert document(catalog, locate=CLEAR, levels=[level | {"locate": written}]) == document(
