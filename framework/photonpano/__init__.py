@@ -11,17 +11,10 @@ from photonpano.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from photonpano.api.capture_info import CaptureInfo, info
-    from photonpano.api.captures import (
-        DarkMeasurement,
-        Preview,
-        WrittenCapture,
-        capture_plan,
-        convert,
-        dark,
-        preview,
-        simulate,
-    )
+    from photonpano.api.captures import WrittenCapture, capture_plan, convert, simulate
+    from photonpano.api.dark_counts import DarkMeasurement, dark
     from photonpano.api.explanation import explain, forecast
+    from photonpano.api.pictures import Preview, preview
     from photonpano.api.runs import evaluate, warm_up
     from photonpano.contributions import (
         Config,
@@ -157,5 +150,6 @@ __all__ = [
 
 if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
     _LIGHT = ("errors", "values", "protocols", "contributions", "hookspecs", "registry", "specs")
-    _HEAVY = ("pipeline.components", "pipeline.run", "api.captures", "api.capture_info", "api.explanation", "api.runs")
+    _API = ("captures", "dark_counts", "pictures", "capture_info", "explanation", "runs")
+    _HEAVY = ("pipeline.components", "pipeline.run", *(f"api.{each}" for each in _API), "pipeline.forecast")
     __getattr__, __dir__ = imported_on_use(__name__, __all__, (*_LIGHT, *_HEAVY))

@@ -1,1 +1,1 @@
-"""Locator `direct`: alignment of brightness at the limit of photon noise."""
+"""The plugin with photonpano's own locator: direct alignment of photon counts."""

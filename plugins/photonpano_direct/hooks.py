@@ -1,4 +1,4 @@
-"""Hooks of the plugin."""
+"""What this plugin contributes."""
 
 from __future__ import annotations
 

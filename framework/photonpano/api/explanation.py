@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import PhotonpanoError
 from photonpano.motion.pairs import pairs_of
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
-from photonpano.pipeline.forecast import Forecast
-from photonpano.pipeline.forecast import forecast as forecast_on
 from photonpano.protocols import Source
 from photonpano.registry import KINDS, Catalog, discover
 from photonpano.registry.description import flow
-from photonpano.report.numbers import counted, duration
 from photonpano.specs import Plan
 from photonpano.specs.written import joined
 from photonpano.text import byte_size
+
+if TYPE_CHECKING:
+    from photonpano.pipeline.forecast import Forecast  # imports numba, which only a forecast needs
 
 _DESCRIBED_LEVELS = 3
 """How many levels are described when the number of levels is open."""
@@ -29,8 +29,10 @@ def forecast(plan: Plan) -> Forecast:
     Raises:
         PhotonpanoError: the trial failed, as the run may.
     """
+    from photonpano.pipeline.forecast import forecast as forecast_from
+
     with open_source(plan) as source:
-        return forecast_on(plan, source)
+        return forecast_from(plan, source)
 
 
 def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None = None) -> str:
@@ -75,8 +77,11 @@ def _levels(plan: Plan, source: Source) -> Iterator[str]:
 
 
 def _forecast_lines(plan: Plan, source: Source) -> list[str]:
+    from photonpano.pipeline.forecast import forecast as forecast_from
+    from photonpano.report.numbers import counted, duration
+
     try:
-        found = forecast_on(plan, source)
+        found = forecast_from(plan, source)
     except PhotonpanoError as error:
         return ["the trial in the middle of the capture failed, as the run may:", *str(error).splitlines()]
     each = ", ".join(f"{name}: {duration(seconds)}" for name, seconds in found.seconds.items())

@@ -8,7 +8,7 @@ import typer
 from photonpano.cli.options import CapturePath, Corrections, Keys, SourceName
 
 if TYPE_CHECKING:
-    from photonpano.api.captures import DarkMeasurement
+    from photonpano.api.dark_counts import DarkMeasurement
 
 
 def dark(
@@ -38,7 +38,7 @@ def dark(
 
     Example: photonpano dark covered.npy --output dark.npz
     """
-    from photonpano.api.captures import dark as measure_dark
+    from photonpano.api.dark_counts import dark as measure_dark
     from photonpano.cli.errors import warn
     from photonpano.cli.options import capture_plan
     from photonpano.cli.progress import progress_for_stderr

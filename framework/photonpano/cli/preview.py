@@ -56,7 +56,7 @@ def preview(
 
     Example: photonpano preview cube.npy --output look.mp4 --group-size 500
     """
-    from photonpano.api.captures import preview as preview_capture
+    from photonpano.api.pictures import preview as preview_capture
     from photonpano.cli.options import capture_plan
     from photonpano.cli.progress import progress_for_stderr
 

@@ -1,4 +1,4 @@
-"""Conformance of the locator."""
+"""The locator of this plugin keeps what every locator promises."""
 
 from __future__ import annotations
 

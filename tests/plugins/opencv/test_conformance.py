@@ -1,4 +1,4 @@
-"""Conformance of the locators."""
+"""The locators of this plugin keep what every locator promises."""
 
 from __future__ import annotations
 

@@ -1,0 +1,83 @@
+"""Write pictures of a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonpano.captures.picture_files import Picture, require_writable, write_pictures
+from photonpano.captures.preview import Look, pictures, preview_spans, white_flux
+from photonpano.context import Progress, Quiet
+from photonpano.pipeline.components import build_source
+from photonpano.specs import Plan
+from photonpano.threads import one_thread_inside, thread_count
+from photonpano.values import StreamInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """Pictures of a capture, written by `preview`.
+
+    Attributes:
+        path: the folder or film.
+        n_pictures: how many pictures it holds.
+        group_size: frames of each picture.
+        white_flux: the flux that is white, photons per pixel per frame.
+        info: the size and rate of the capture.
+    """
+
+    path: Path
+    n_pictures: int
+    group_size: int
+    white_flux: float
+    info: StreamInfo
+
+
+def preview(
+    plan: Plan,
+    output: Path | str,
+    group_size: int = 256,
+    step: int | None = None,
+    *,
+    quantile: float = 0.995,
+    white: float | None = None,
+    srgb: bool = True,
+    label: bool = True,
+    fps: float = 24,
+    progress: Progress | None = None,
+) -> Preview:
+    """Merge frames into pictures without motion, to look at a capture.
+
+    Args:
+        plan: of the capture; its corrections are applied.
+        output: a new folder for PNGs, or a file: .mp4 or .webp.
+        group_size: frames of a picture.
+        step: frames from the start of one picture to the next; by default `group_size`.
+        quantile: the share of the pixels that is darker than white.
+        white: the flux that is white, photons per pixel per frame; in place of `quantile`.
+        srgb: whether levels follow the sRGB curve, or are proportional to the flux.
+        label: whether frames and time are written below each picture.
+        fps: pictures a second of a film.
+        progress: receives the stage; quiet by default.
+
+    Raises:
+        OutputError: the pictures cannot be written, or a library that writes them is missing.
+    """
+    output = Path(output)
+    with build_source(plan) as source, one_thread_inside():
+        threads = thread_count(plan.run.threads)
+        spans = preview_spans(source.info, group_size, step or group_size)
+        require_writable(output, len(spans))
+        look = Look(white_flux(source, spans, quantile, threads) if white is None else white, srgb, label)
+        digits = len(str(source.info.n_frames))
+        names = [f"frame_{span.start:0{digits}}" for span in spans]
+        with (progress or Quiet()).stage(f"writing {output.name}", len(spans), "pictures") as advance:
+            write_pictures(output, _counted(pictures(source, spans, look, threads), advance), names, fps)
+        return Preview(output, len(spans), len(spans[0]), look.white_flux, source.info)
+
+
+def _counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
+    for picture in made:
+        yield picture
+        advance(1)

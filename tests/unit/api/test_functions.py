@@ -1,0 +1,69 @@
+"""Commands as functions: what the tests of the command line do not show."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+import photonpano
+from photonpano import Plan, capture_plan, convert, explain, info, parse_spec, simulate
+from photonpano.cli.app import app
+
+
+@pytest.fixture
+def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Plan:
+    """A packed capture in the current folder: 40 binary frames of 8 x 13 px."""
+    monkeypatch.chdir(tmp_path)
+    np.save("cube.npy", np.packbits(np.random.default_rng(0).random((40, 8, 13)) < 0.3, axis=-1))
+    return capture_plan("cube.npy", {"width": 13, "frame_rate_hz": 100})
+
+
+def test_every_public_name_is_importable() -> None:
+    assert [name for name in photonpano.__all__ if getattr(photonpano, name) is None] == []
+
+
+@pytest.mark.parametrize("name", ["preview", "dark", "evaluate", "convert", "simulate"])
+def test_function_has_defaults_of_command(name: str) -> None:
+    command: Any = typer.main.get_command(app).commands[name]
+    options = {each.name: each.default for each in command.params if each.default is not None}
+    parameters = inspect.signature(getattr(photonpano, name)).parameters
+    defaults = {key: each.default for key, each in parameters.items() if each.default not in (None, each.empty)}
+    assert {key: options[key] for key in defaults} == defaults
+
+
+def test_capture_plan_takes_keys_and_corrections_as_data(capture: Plan) -> None:
+    plan = capture_plan("cube.npy", {"width": 13}, source="packed-npy", corrections=["rot90", {"crop": {"rows": [2, None]}}])
+    assert plan.source.config.width == 13
+    assert plan.document["corrections"] == ["rot90", {"crop": {"rows": [2, None], "columns": [None, None]}}]
+
+
+def test_convert_returns_spec_section_that_reads_the_file(capture: Plan) -> None:
+    written = convert(capture, "copy.npy")
+    assert (written.path, written.truth, written.n_masked) == (Path("copy.npy"), None, 0)
+    assert str(written.info) == "40 binary frames of 8x13 at 100 Hz"
+    plan = parse_spec({"version": 1, "source": written.source})
+    assert (plan.source.config.width, plan.source.config.frame_rate_hz) == (13, 100)
+
+
+def test_simulate_returns_truth_of_simulated_capture(capture: Plan) -> None:
+    keys = {"n_frames": 4, "frame_shape": [8, 16], "path": {"kind": "pan", "length_px": 1}}
+    plan = parse_spec({"version": 1, "source": {"use": "simulator", "with": keys}})
+    assert simulate(plan, "simulated.npy").truth == Path("simulated.truth.npz")
+    assert simulate(capture, "recorded.npy").truth is None
+
+
+def test_info_finds_group_size_without_that_of_the_plan(capture: Plan) -> None:
+    plan = parse_spec({**capture.document, "resample": {"with": {"group_size": 39}}})
+    assert info(plan).group_size == info(capture).group_size == 16
+
+
+def test_explain_of_plan_from_python_is_a_spec(capture: Plan) -> None:
+    plan = parse_spec({**capture.document, "resample": {"with": {"group_size": 8}}})
+    text = explain(plan)
+    assert text.startswith("# the spec as it will run, on 40 binary frames of 8x13 at 100 Hz\n")
+    assert parse_spec(text).document == plan.document
