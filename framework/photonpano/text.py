@@ -1,4 +1,4 @@
-"""What to offer to somebody who mistyped a name."""
+"""Words for messages: lists, numbers, sizes, and suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ if TYPE_CHECKING:
 
 
 _MOST = 3
+"""The largest number of names that are suggested."""
 _SAME_WORD = 0.8
-"""How similar two words are that differ by a slip."""
+"""The similarity of two words from which one counts as a misspelling of the other."""
 
 
 def listed(words: Iterable[str], last: str = "and") -> str:
@@ -38,10 +39,10 @@ def byte_size(n_bytes: int) -> str:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Complete "there is no such name": the nearest of the known names, else all of them.
+    """Return the nearest of the known names, else all of them, to complete the message for an unknown name.
 
-    Case, and the choice between hyphen and underscore, do not count as a difference. One word of a name is near to it: `orb` to
-    `opencv-orb`.
+    Case, and the choice between hyphen and underscore, do not count as differences. A name is near if one of its words is:
+    `opencv-orb` to `orb`.
 
     Returns:
         `did you mean 'x'?` or `known: x, y and z`; empty if nothing is known.
@@ -54,7 +55,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 
 def _with_word(word: str, shapes: Iterable[str]) -> list[str]:
-    """Return names of which one word is much like this one."""
+    """Return the names that have a word which this one may be a misspelling of."""
     return [each for each in shapes if difflib.get_close_matches(word, each.split("-"), 1, _SAME_WORD)][:_MOST]
 
 

@@ -116,8 +116,8 @@ def _summary(entry: "Entry", catalog: "Catalog") -> str:
     """Return the summary of a component, after the reason why it cannot be used, if there is one."""
     if entry.unavailable:
         return f"[not installed: {' '.join(each.install for each in entry.missing)}] {entry.contribution.summary}"
-    same = [each for each in catalog.rows if (each.kind, each.name) == (entry.kind, entry.name)]
-    return f"{'[name taken twice] ' if len(same) > 1 else ''}{entry.contribution.summary}"
+    taken_twice = len(catalog.entries(entry.kind, entry.name)) > 1
+    return f"{'[name taken twice] ' if taken_twice else ''}{entry.contribution.summary}"
 
 
 def _data(rows: list["Entry"], catalog: "Catalog") -> dict[str, Any]:
@@ -135,32 +135,30 @@ def _facts(entry: "Entry") -> dict[str, Any]:
 
 
 def _details(entry: "Entry") -> dict[str, Any]:
-    from photonpano.registry import describe
+    from photonpano.registry.description import config_rows, snippet
 
-    description = describe(entry.contribution)
     return _facts(entry) | {
         "api_version": entry.contribution.api_version,
         "requires": [asdict(each) for each in entry.contribution.requires],
-        "keys": [asdict(row) for row in description.rows],
-        "snippet": description.snippet,
+        "keys": [asdict(row) for row in config_rows(entry.contribution.config)],
+        "snippet": snippet(entry.contribution),
     }
 
 
 def _page(entry: "Entry") -> str:
     from photonpano.cli.tables import columns
     from photonpano.contributions import install_command
-    from photonpano.registry import describe
+    from photonpano.registry.description import config_rows, snippet
 
-    description = describe(entry.contribution)
     facts = [["kind", entry.kind], ["plugin", str(entry.origin)]]
     if modules := ", ".join(each.module for each in entry.contribution.requires):
         state = f"(not installed): {install_command(entry.missing)}" if entry.missing else "(installed)"
         facts.append(["needs", f"{modules} {state}"])
     table = [
         [row.key, row.type, "required" if row.default is None else row.default, row.bounds, row.description]
-        for row in description.rows
+        for row in config_rows(entry.contribution.config)
     ]
-    parts = [f"{entry.name}: {description.summary}", columns(facts)]
+    parts = [f"{entry.name}: {entry.contribution.summary}", columns(facts)]
     if table:
         parts.append(columns([["KEY", "TYPE", "DEFAULT", "BOUNDS", "MEANING"], *table]))
-    return "\n\n".join([*parts, description.snippet.rstrip()])
+    return "\n\n".join([*parts, snippet(entry.contribution).rstrip()])

@@ -149,6 +149,10 @@ class Catalog:
         """Return the names on offer for a kind, such as "locator", in alphabetical order."""
         return tuple(sorted({entry.name for entry in self.rows if entry.kind == kind}))
 
+    def entries(self, kind: str, name: object) -> list[Entry]:
+        """Return the components of a name: one, none, or several if several plugins offer it."""
+        return [entry for entry in self.rows if (entry.kind, entry.name) == (kind, name)]
+
     def find(self, kind: str, name: str) -> Entry:
         """Look a component up, whether or not its libraries are installed: see `Entry.unavailable`.
 
@@ -160,7 +164,7 @@ class Catalog:
             PluginError: no plugin offers the name (the message has the nearest names, and the plugins that are broken or
                 disabled), or several do.
         """
-        found = [entry for entry in self.rows if (entry.kind, entry.name) == (kind, name)]
+        found = self.entries(kind, name)
         if not found:
             raise PluginError(self.unknown(kind, name))
         if len(found) > 1:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
+import os
+import re
 from importlib.metadata import EntryPoint, entry_points
 
 from photonpano.errors import PluginError
 from photonpano.hookspecs import PROJECT
 from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer, Origin, make_entry, ordered
-from photonpano.registry.disabling import DisabledNames
 from photonpano.registry.plugins import contributions_of, observation_of
+from photonpano.text import listed, suggestion
 
 logger = logging.getLogger(__name__)
+
+DISABLE = "PHOTONPANO_DISABLE_PLUGINS"
+"""An environment variable: names of distributions or entry points, separated by commas."""
 
 
 def discover() -> Catalog:
@@ -25,11 +30,14 @@ def discover() -> Catalog:
     broken: list[BrokenPlugin] = []
     disabled: list[DisabledPlugin] = []
     observers: list[Observer] = []
-    names = DisabledNames()
+    words = [word.strip() for word in os.environ.get(DISABLE, "").split(",")]
+    disabling = {_canonical(word): word for word in words if word}
+    names: set[str] = set()
     for entry_point in entry_points(group=PROJECT):
         origin = _origin(entry_point)
-        if by := names.disabled_by(entry_point.name, origin.plugin):
-            disabled.append(DisabledPlugin(origin, by))
+        names |= {entry_point.name, origin.plugin}
+        if by := disabling.get(_canonical(entry_point.name)) or disabling.get(_canonical(origin.plugin)):
+            disabled.append(DisabledPlugin(origin, f"{DISABLE}={by}"))
             continue
         try:
             loaded = entry_point.load()
@@ -39,14 +47,27 @@ def discover() -> Catalog:
                 observers.append(Observer(origin, hook))
         except (Exception, SystemExit) as error:  # whatever the plugin's import does, it is a row
             broken.append(BrokenPlugin(origin, _in_a_line(error)))
-    if unknown := names.unknown():
-        logger.warning(unknown)
+    _warn_of_unknown([word for key, word in disabling.items() if key not in set(map(_canonical, names))], names)
     return Catalog(
         ordered(rows),
         tuple(sorted(broken, key=str)),
         tuple(sorted(disabled, key=str)),
         tuple(sorted(observers, key=lambda observer: observer.origin)),
     )
+
+
+def _canonical(name: str) -> str:
+    """Return a name as those of packages are compared: without regard to case, and to the choice of `-`, `_` and `.`."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _warn_of_unknown(words: list[str], names: set[str]) -> None:
+    """Log the words that should disable a plugin and are no plugin's name."""
+    if not words:
+        return
+    hint = suggestion(words[0], names) if len(words) == 1 else f"known: {listed(sorted(names))}"
+    are = "is no installed plugin" if len(words) == 1 else "are no installed plugins"
+    logger.warning("%s names %s, which %s; %s", DISABLE, listed(map(repr, words)), are, hint)
 
 
 def _in_a_line(error: BaseException) -> str:

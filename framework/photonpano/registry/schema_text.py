@@ -1,15 +1,14 @@
-"""Say in words what a config expects, from its JSON Schema."""
+"""Put the JSON Schema of a config into words."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic import BaseModel, ByteSize, TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 
-from photonpano.text import listed
+from photonpano.text import byte_size, listed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,8 +18,10 @@ if TYPE_CHECKING:
 Schema: TypeAlias = "Mapping[str, Any]"
 """A JSON Schema, or a part of one."""
 
-DEPTH = 4
-"""A schema may contain itself; below this depth it is not put into words."""
+_DEPTH = 4
+"""The depth below which a schema, which may contain itself, is not put into words."""
+_NOUNS = ("integer", "number", "mapping", "path", "size", "list", "value", "text")
+"""What a value may be, apart from one of several words."""
 
 
 class TolerantJsonSchema(GenerateJsonSchema):
@@ -54,7 +55,7 @@ def resolved(schema: Schema, root: Schema) -> Schema:
 
 
 def alternatives(schema: Schema, root: Schema) -> list[Schema]:
-    """Return what a union consists of; anything else consists of itself."""
+    """Return the members of a union; anything else is its only member."""
     schema = resolved(schema, root)
     options = schema.get("anyOf") or schema.get("oneOf")
     return [each for option in options for each in alternatives(option, root)] if options else [schema]
@@ -89,82 +90,60 @@ def subschema(schema: Schema, key: str | int, root: Schema) -> Schema:
     return {}
 
 
-def keys_of(schema: Schema, root: Schema) -> list[str]:
-    """Return the keys that a mapping may have."""
-    return [key for option in alternatives(schema, root) for key in option.get("properties", ())]
-
-
 def expectation(schema: Schema, root: Schema) -> str:
-    """Say what is expected, as in "an integer of at least 1" or "first, last or a number from 0 to 1"."""
-    return listed((str(option) for option in _options(schema, root)), "or")
+    """Return what is expected, as in "an integer of at least 1" or "first, last or a number from 0 to 1"."""
+    return listed((_with_bounds(noun, bounds) for noun, bounds in _options(schema, root)), "or")
 
 
 def type_words(schema: Schema, root: Schema) -> str:
-    """Say the type alone, as in "integer" or "first, last or number"."""
-    return listed((option.noun for option in _options(schema, root)), "or")
+    """Return the type alone, as in "integer" or "first, last or number"."""
+    return listed((noun for noun, _ in _options(schema, root)), "or")
 
 
 def bounds_words(schema: Schema, root: Schema) -> str:
-    """Say the bounds alone, as in "at least 1"; empty if there are none."""
-    bounds = [option.bounds for option in _options(schema, root) if option.bounds]
-    return listed(bounds, "or") if bounds else ""
+    """Return the bounds alone, as in "at least 1"; empty if there are none."""
+    return listed((bounds for _, bounds in _options(schema, root) if bounds), "or")
 
 
-@dataclass(frozen=True, slots=True)
-class _Option:
-    """One of the things that a value may be."""
-
-    noun: str
-    bounds: str = ""
-    article: str = ""
-    plural: str = ""
-
-    def __str__(self) -> str:
-        bounds = f"of {self.bounds}" if self.bounds.startswith("at ") else self.bounds
-        return " ".join(part for part in (self.article, self.noun, bounds) if part)
+def _with_bounds(noun: str, bounds: str) -> str:
+    kind = noun.partition(" ")[0]
+    article = "an " if kind == "integer" else "a " if kind in _NOUNS and kind != "text" else ""
+    return f"{article}{noun}{' of' if bounds.startswith('at ') else ''}{' ' if bounds else ''}{bounds}"
 
 
-def _options(schema: Schema, root: Schema, depth: int = 0) -> list[_Option]:
+def _options(schema: Schema, root: Schema, depth: int = 0) -> list[tuple[str, str]]:
+    """Return noun and bounds of each of the things that a value may be."""
     schema = resolved(schema, root)
     union = schema.get("anyOf") or schema.get("oneOf")
-    if depth == DEPTH:
-        return [_Option("value", article="a", plural="values")]
+    kind = schema.get("type")
+    if depth == _DEPTH:
+        return [("value", "")]
     if union and union == _byte_size():
-        return [_Option("size", _byte_bounds(schema), "a", "sizes")]
+        return [("size", _byte_bounds(schema))]
     if union:
         return list(dict.fromkeys(option for each in union for option in _options(each, root, depth + 1)))
     if "enum" in schema or "const" in schema:
-        return [_Option(word(value)) for value in schema.get("enum", [schema.get("const")])]
-    match schema.get("type"):
-        case "integer":
-            return [_Option("integer", _range(schema), "an", "integers")]
-        case "number":
-            return [_Option("number", _range(schema), "a", "numbers")]
-        case "boolean":
-            return [_Option("true or false")]
-        case "null":
-            return [_Option("null")]
-        case "object":
-            return [_Option("mapping", article="a", plural="mappings")]
-        case "string" if str(schema.get("format", "")).endswith("path"):
-            return [_Option("path", article="a", plural="paths")]
-        case "string":
-            return [_Option("text", _text_bounds(schema), plural="texts")]
-        case "array":
-            return [_list(schema, root, depth)]
-    return [_Option("value", article="a", plural="values")]
+        return [(word(value), "") for value in schema.get("enum", [schema.get("const")])]
+    if kind in ("integer", "number"):
+        return [(kind, _range(schema))]
+    if kind == "string":
+        is_path = str(schema.get("format", "")).endswith("path")
+        return [("path", "") if is_path else ("text", _text_bounds(schema))]
+    if kind == "array":
+        return [_list(schema, root, depth)]
+    return [({"boolean": "true or false", "null": "null", "object": "mapping"}.get(str(kind), "value"), "")]
 
 
-def _list(schema: Schema, root: Schema, depth: int) -> _Option:
+def _list(schema: Schema, root: Schema, depth: int) -> tuple[str, str]:
     kinds = [schema["items"]] if "items" in schema else schema.get("prefixItems", [])
     inner = {option for kind in kinds for option in _options(kind, root, depth + 1)}
-    only = inner.pop() if len(inner) == 1 else _Option("")
+    noun, bounds = inner.pop() if len(inner) == 1 else ("", "")
+    kind, each = noun.partition(" ")[0], f"each {bounds}" if bounds else ""
+    plural = f"{kind}s" if kind in _NOUNS else ""
     least, most = schema.get("minItems"), schema.get("maxItems")
-    each = f"each {only.bounds}" if only.bounds else ""
     if least is not None and least == most:
-        return _Option(f"list of {least} {only.plural or 'items'}", each, "a", "lists")
-    bounds = ", ".join(filter(None, (_count(least, most, "item"), each)))
-    return _Option(f"list of {only.plural}" if only.plural else "list", bounds, "a", "lists")
+        return f"list of {least} {plural or 'items'}", each
+    return f"list of {plural}" if plural else "list", ", ".join(filter(None, (_count(least, most, "item"), each)))
 
 
 def _range(schema: Schema) -> str:
@@ -189,9 +168,8 @@ def _text_bounds(schema: Schema) -> str:
 def _count(least: int | None, most: int | None, noun: str) -> str:
     if least and most is not None:
         return f"with {least} to {most} {noun}s"
-    if least:
-        return f"with at least {least} {noun}{'' if least == 1 else 's'}"
-    return "" if most is None else f"with at most {most} {noun}{'' if most == 1 else 's'}"
+    bound, limit = ("at least", least) if least else ("at most", most)
+    return "" if limit is None else f"with {bound} {limit} {noun}{'' if limit == 1 else 's'}"
 
 
 @cache
@@ -201,10 +179,8 @@ def _byte_size() -> list[Any]:
 
 
 def _byte_bounds(schema: Schema) -> str:
-    example = "such as 2 GiB"
-    if "ge" not in schema:
-        return example
-    return f"at least {ByteSize(schema['ge']).human_readable(separator=' ').replace('.0 ', ' ')}, {example}"
+    least = f"at least {byte_size(schema['ge'])}, " if "ge" in schema else ""
+    return f"{least}such as 2 GiB"
 
 
 def word(value: object) -> str:

@@ -10,32 +10,8 @@ from photonpano.errors import PluginError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
-    from photonpano.registry import Catalog
     from photonpano.specs.written import WrittenSpec
-    from photonpano.values import Decision
-
-
-@dataclass(frozen=True, slots=True)
-class Use:
-    """A section that uses an alias, and what is needed to rewrite it.
-
-    Attributes:
-        section: the keys of the section, `use` among them.
-        where: the path of the section.
-        spec: the spec; problems are added to it, and the places of values that move are entered in it.
-        catalog: what can be chosen.
-        directory: what relative paths count from.
-        decisions: what the alias has chosen, and why, is added here.
-    """
-
-    section: dict[str, Any]
-    where: str
-    spec: WrittenSpec
-    catalog: Catalog
-    directory: Path
-    decisions: list[Decision]
 
 
 def _unbuilt(*_: object) -> NoReturn:
@@ -47,10 +23,11 @@ class Alias:
     """A name that stands for other components, so that nothing is built of it.
 
     Attributes:
-        expand: rewrites a section into one that uses other components; None if it has problems.
+        expand: rewrites a section: takes the section, its path and the spec, and returns a section that uses other components,
+            or None if there are problems. It adds the problems to the spec, and enters the places of values that move.
     """
 
-    expand: Callable[[Use], dict[str, Any] | None]
+    expand: Callable[[dict[str, Any], str, WrittenSpec], dict[str, Any] | None]
     build: Callable[[Any, Any], Any] = _unbuilt
 
 
@@ -61,4 +38,4 @@ class SourceAlias(Alias, SourceContribution):
 
 @dataclass(frozen=True, kw_only=True)
 class LocatorAlias(Alias, LocatorContribution):
-    """Stands for a locator and its fallbacks."""
+    """Stands for a locator and its fallbacks; its config lists locators under `backends`."""

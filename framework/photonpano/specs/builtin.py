@@ -13,11 +13,11 @@ from pydantic import ConfigDict, Field
 from photonpano.contributions import Config, Recognised, SourceContribution, SpecPath
 from photonpano.hookspecs import hookimpl
 from photonpano.reading import missing_file
-from photonpano.specs.aliases import LocatorAlias, SourceAlias, Use
+from photonpano.specs.aliases import LocatorAlias, SourceAlias
 from photonpano.specs.checks import complaints
 from photonpano.specs.plan import Choice
 from photonpano.specs.validation import validate
-from photonpano.specs.written import Place, WrittenSpec, from_python
+from photonpano.specs.written import WrittenSpec, from_python
 from photonpano.text import listed
 from photonpano.values import Decision
 
@@ -73,44 +73,44 @@ def photonpano_locators() -> Iterator[LocatorAlias]:
     )
 
 
-def recognised_source(use: Use) -> dict[str, Any] | None:
+def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) -> dict[str, Any] | None:
     """Rewrite a section that uses `auto` into one that uses the source that recognises the capture.
 
     The keys that the source recognised are laid under those that are written beside the path.
     """
-    written, where, spec = use.section.get("with"), f"{use.where}.with", use.spec
+    written, keys = section.get("with"), f"{where}.with"
     own = {key: written[key] for key in AutoConfig.model_fields if key in written} if isinstance(written, dict) else written
-    config = validate(AutoConfig, own, where, spec, use.directory)
+    config = validate(AutoConfig, own, keys, spec)
     if config is None:
         return None
     assert isinstance(written, dict)
     path = config.path
     if not path.exists():
-        spec.wrong(f"{where}.path", missing_file(path, "file or folder"))
+        spec.wrong(f"{keys}.path", missing_file(path, "file or folder"))
         return None
-    recognised, failures = _ask_sources(use.catalog, path)
+    recognised, failures = _ask_sources(spec.catalog, path)
     if len(recognised) != 1:
         several = [f"{entry.name} ({answer.because})" for entry, answer in recognised]
         if several:
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
             # The path is named once; each line has its last part.
-            near = [line.replace(str(path), path.name) for line in _near_misses(use, written, path)]
-            lines = [*(near or _known_endings(use.catalog)), *failures]
+            near = [line.replace(str(path), path.name) for line in _near_misses(spec, written, path)]
+            lines = [*(near or _known_endings(spec.catalog)), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
-        spec.wrong(f"{where}.path", message)
+        spec.wrong(f"{keys}.path", message)
         return None
     for failure in failures:
         logger.warning(failure)
     ((entry, answer),) = recognised
-    found = from_python(answer.keys, spec.place(f"{where}.path"))
+    found = from_python(answer.keys, spec.place(f"{keys}.path"))
     spec.problems += found.problems
-    here = {f"{where}.{key}": replace(spec.place(f"{where}.path"), where=f"{where}.{key}") for key in found.data}
+    here = {f"{keys}.{key}": replace(spec.place(f"{keys}.path"), where=f"{keys}.{key}") for key in found.data}
     spec.places = here | spec.places
     spec.remark = f" ({path.name} is taken for {entry.name}: {answer.because})"
-    use.decisions.append(Decision(use.where, entry.name, f"{path.name} is taken for it: {answer.because}"))
+    spec.decisions.append(Decision(where, entry.name, f"{path.name} is taken for it: {answer.because}"))
     others = {key: value for key, value in written.items() if key not in AutoConfig.model_fields}
-    return use.section | {"use": entry.name, "with": found.data | others}
+    return section | {"use": entry.name, "with": found.data | others}
 
 
 def _ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
@@ -133,17 +133,17 @@ def _ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recogn
     return recognised, failures
 
 
-def _near_misses(use: Use, written: dict[str, Any], path: Path) -> Iterator[str]:
+def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Path) -> Iterator[str]:
     """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept."""
     endings = {each.suffix.lower() for each in ([path] if path.is_file() else islice(path.rglob("*"), _SEARCHED))}
-    for entry in use.catalog.rows:
+    for entry in spec.catalog.rows:
         contribution = entry.contribution
         if not isinstance(contribution, SourceContribution) or isinstance(contribution, SourceAlias):
             continue
         if contribution.suffixes and not endings & {*contribution.suffixes}:
             continue
         try:
-            config = validate(contribution.config, written, "", WrittenSpec(None, {"": Place()}, []), use.directory)
+            config = validate(contribution.config, written, "", replace(spec, problems=[]))
         except Exception:  # what is wrong with the config is reported once the source is named
             config = None
         if config is not None:
@@ -170,12 +170,12 @@ def _contents(path: Path) -> str:
     return f"a folder of {listed(names)}" if names else "an empty folder"
 
 
-def first_with_fallbacks(use: Use) -> dict[str, Any] | None:
+def first_with_fallbacks(section: dict[str, Any], where: str, spec: WrittenSpec) -> dict[str, Any] | None:
     """Rewrite a section that uses `chain-of-backends` into one that uses the first, and has the others as its fallbacks."""
-    keys, where, spec = use.section.get("with"), use.where, use.spec
-    if use.section.get("fallback"):
+    keys = section.get("with")
+    if section.get("fallback"):
         spec.wrong_key(f"{where}.fallback", "a chain has its fallbacks among its backends")
-    validate(ChainConfig, keys, f"{where}.with", spec, use.directory)
+    validate(ChainConfig, keys, f"{where}.with", spec)
     backends = keys.get("backends") if isinstance(keys, dict) else None
     items = f"{where}.with.backends"
     if backends is None:

@@ -17,19 +17,18 @@ if TYPE_CHECKING:
     from photonpano.corrections import Correction
 
 
-def resolved_corrections(data: Any, spec: WrittenSpec, directory: Path) -> tuple[Correction, ...]:
+def resolved_corrections(data: Any, spec: WrittenSpec) -> tuple[Correction, ...]:
     """Resolve the section `corrections`.
 
     Args:
         data: a list; None counts as an empty one.
         spec: problems are added here, each at its place.
-        directory: what relative paths count from.
     """
     items = [] if data is None else data
     if not isinstance(items, list):
         spec.wrong("corrections", f"expected a list of corrections, got {given(data)}")
         return ()
-    found = (_resolved(item, f"corrections.{index}", spec, directory) for index, item in enumerate(items))
+    found = (_resolved(item, f"corrections.{index}", spec) for index, item in enumerate(items))
     return tuple(correction for correction in found if correction is not None)
 
 
@@ -39,7 +38,7 @@ def written_corrections(corrections: Iterable[Correction]) -> list[Any]:
     return [{name: keys} if keys else name for name, keys in settings]
 
 
-def _resolved(item: Any, where: str, spec: WrittenSpec, directory: Path) -> Correction | None:
+def _resolved(item: Any, where: str, spec: WrittenSpec) -> Correction | None:
     if isinstance(item, str):
         name, settings, at = item, None, where
     elif isinstance(item, dict) and len(item) == 1:
@@ -53,7 +52,7 @@ def _resolved(item: Any, where: str, spec: WrittenSpec, directory: Path) -> Corr
     if name not in CORRECTIONS:
         spec.wrong_key(at, f"there is no correction {name!r}; {suggestion(name, CORRECTIONS)}")
         return None
-    correction = validate(CORRECTIONS[name], settings, f"{where}.{name}", spec, directory)
+    correction = validate(CORRECTIONS[name], settings, f"{where}.{name}", spec)
     for key, file in correction or ():
         if isinstance(file, Path) and not file.exists():
             spec.wrong(f"{where}.{name}.{key}", missing_file(file))

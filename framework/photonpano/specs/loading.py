@@ -108,7 +108,8 @@ def _load(
     for override in overrides:
         _apply_override(written, override)
     _set_output(written, None if output is None else Path(output).absolute(), Path("runs", name))
-    return resolve(written, directory, discover() if catalog is None else catalog)
+    written.directory, written.catalog = directory, discover() if catalog is None else catalog
+    return resolve(written)
 
 
 def _apply_override(spec: WrittenSpec, text: str) -> None:
@@ -125,7 +126,7 @@ def _apply_override(spec: WrittenSpec, text: str) -> None:
         return
     place = Place(path.strip(), override=text)
     n_problems = len(spec.problems)
-    value = read_yaml(yaml, place, spec.problems) or WrittenSpec(None, {place.where: place}, [])
+    value = read_yaml(yaml, place, spec.problems) or WrittenSpec(None, {place.where: place})
     if len(spec.problems) == n_problems:
         _set(spec, spec.data, "", keys, value, place)
 

@@ -7,24 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import PluginError, SpecError
 from photonpano.registry.kinds import KINDS
-from photonpano.specs.aliases import Alias, Use
+from photonpano.specs.aliases import Alias
 from photonpano.specs.checks import STAGES, complaints
 from photonpano.specs.corrections import resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
-from photonpano.specs.validation import ModelT, validate
+from photonpano.specs.validation import validate
 from photonpano.specs.written import WrittenSpec, given
 from photonpano.text import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from pydantic import BaseModel
 
     from photonpano.errors import Problem
-    from photonpano.registry import Catalog, Entry, Kind
-    from photonpano.values import Decision
+    from photonpano.registry import Entry, Kind
 
 VERSION = 1
 LEVELS = 3
@@ -64,19 +62,17 @@ class _Stage:
     fallbacks: tuple[Choice, ...] = ()
 
 
-def resolve(spec: WrittenSpec, directory: Path, catalog: Catalog) -> Plan:
+def resolve(spec: WrittenSpec) -> Plan:
     """Make the plan of a spec.
 
     Args:
         spec: the spec, with the problems that reading it has found.
-        directory: what relative paths count from.
-        catalog: what can be chosen.
 
     Raises:
         SpecError: with all problems, in the order of the file.
     """
     problems, spec.problems = spec.problems, []
-    plan = _Resolver(spec, directory, catalog).plan()
+    plan = _Resolver(spec).plan()
     unreadable = tuple(f"{where}." for where in spec.unreadable)
     problems += [problem for problem in spec.problems if not f"{problem.where}.".startswith(unreadable)]
     if plan is None or problems:
@@ -92,11 +88,9 @@ def _order(problem: Problem) -> tuple[bool, int, int]:
 class _Resolver:
     """Resolves one spec; every method reports the problems that it finds and goes on."""
 
-    def __init__(self, spec: WrittenSpec, directory: Path, catalog: Catalog) -> None:
+    def __init__(self, spec: WrittenSpec) -> None:
         self.spec = spec
-        self.directory = directory
-        self.catalog = catalog
-        self.decisions: list[Decision] = []
+        self.catalog = spec.catalog
 
     def plan(self) -> Plan | None:
         """Resolve everything; None if there are problems."""
@@ -115,11 +109,11 @@ class _Resolver:
             spec.wrong_key("source", complaint)
         spec.remark = ""
         spec.places = {name: spec.place(name) for name in STAGES} | spec.places
-        corrections = resolved_corrections(root.get("corrections"), spec, self.directory)
+        corrections = resolved_corrections(root.get("corrections"), spec)
         stages = {name: self.stage(name, root.get(name), name) for name in STAGES}
         written = self.levels(root.get("levels"))
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
-        settings: dict[str, Any] = {name: self.validated(model, root.get(name), name) for name, model in SETTINGS.items()}
+        settings: dict[str, Any] = {name: validate(model, root.get(name), name, spec) for name, model in SETTINGS.items()}
         if source is None or spec.problems:
             return None
         until_converged = root.get("levels") == UNTIL_CONVERGED
@@ -142,7 +136,7 @@ class _Resolver:
             places=spec.places,
             file=spec.place("").file,
             observers=self.catalog.observers,
-            decisions=tuple(self.decisions),
+            decisions=tuple(spec.decisions),
         )
 
     def sections_of(self, root: dict[str, Any]) -> dict[str, list[str]]:
@@ -183,8 +177,7 @@ class _Resolver:
         known = ("use", "with", "fallback") if name == "locate" else ("use", "with")
         spec.check_keys(content, where, known, below=self.keys_of(kind, section.get("use")))
         if alias := self.alias(kind, section.get("use")):
-            use = Use(section, where, spec, self.catalog, self.directory, self.decisions)
-            expanded = alias.expand(use)
+            expanded = alias.expand(section, where, spec)
             if expanded is None or self.is_alias(kind, expanded, where):
                 return _Stage()
             section = expanded
@@ -256,7 +249,7 @@ class _Resolver:
         if entry is None:
             return None
         try:
-            config = self.validated(entry.contribution.config, section.get("with"), f"{where}.with")
+            config = validate(entry.contribution.config, section.get("with"), f"{where}.with", self.spec)
             if config is not None:
                 config.model_dump(mode="json")  # a run records it
         except Exception as error:
@@ -286,13 +279,12 @@ class _Resolver:
 
     def keys_of(self, kind: Kind, name: object) -> Iterable[str]:
         """Return the keys of the component with this name; none if there is no such component."""
-        rows = self.catalog.rows
-        return next((each.contribution.config.model_fields for each in rows if (each.kind, each.name) == (kind.name, name)), ())
+        return next((each.contribution.config.model_fields for each in self.catalog.entries(kind.name, name)), ())
 
     def alias(self, kind: Kind, name: object) -> Alias | None:
         """Return the alias with this name, None if there is none."""
-        aliases = (each.contribution for each in self.catalog.rows if (each.kind, each.name) == (kind.name, name))
-        return next((each for each in aliases if isinstance(each, Alias)), None)
+        offered = (entry.contribution for entry in self.catalog.entries(kind.name, name))
+        return next((each for each in offered if isinstance(each, Alias)), None)
 
     def is_alias(self, kind: Kind, section: dict[str, Any], where: str) -> bool:
         """Return whether a section names an alias, and report it: what an alias stands for is no alias itself."""
@@ -320,7 +312,7 @@ class _Resolver:
             return None
         self.spec.check_keys(content, where, (*LevelSettings.model_fields, *STAGES))
         own = {key: value for key, value in content.items() if key in LevelSettings.model_fields}
-        settings = self.validated(LevelSettings, own, where)
+        settings = validate(LevelSettings, own, where, self.spec)
         selected = dict(stages)
         for name in STAGES:
             if name in content:
@@ -331,10 +323,6 @@ class _Resolver:
         if settings is None or None in choices.values():
             return None
         return LevelPlan(**choices, fallbacks=selected["locate"].fallbacks, scale=settings.scale)
-
-    def validated(self, model: type[ModelT], data: Any, where: str) -> ModelT | None:
-        """Validate a section; None if it has problems."""
-        return validate(model, data, where, self.spec, self.directory)
 
 
 def _name(section: str, data: Any) -> object:

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from photonpano.registry.schema_text import alternative, config_schema, discriminator, expectation, keys_of, subschema
+from photonpano.registry.schema_text import alternative, alternatives, config_schema, discriminator, expectation, subschema
 from photonpano.specs.written import WrittenSpec, given, joined
 from photonpano.text import listed
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pydantic_core import ErrorDetails
 
     from photonpano.registry.schema_text import Schema
@@ -32,7 +30,7 @@ EXPECTED = {
 NUMBER = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*")
 
 
-def validate(model: type[ModelT], data: Any, where: str, spec: WrittenSpec, directory: Path) -> ModelT | None:
+def validate(model: type[ModelT], data: Any, where: str, spec: WrittenSpec) -> ModelT | None:
     """Validate a section; types are those of YAML, so text is no number and a number no switch.
 
     Args:
@@ -40,7 +38,6 @@ def validate(model: type[ModelT], data: Any, where: str, spec: WrittenSpec, dire
         data: a mapping; None counts as an empty one.
         where: the path of the section.
         spec: problems are added here.
-        directory: what relative paths count from.
 
     Returns:
         None if something is wrong.
@@ -49,7 +46,7 @@ def validate(model: type[ModelT], data: Any, where: str, spec: WrittenSpec, dire
     if section is None:
         return None
     try:
-        return model.model_validate_json(json.dumps(section), strict=True, context={"directory": directory})
+        return model.model_validate_json(json.dumps(section), strict=True, context={"directory": spec.directory})
     except ValidationError as error:
         schema, n_problems = config_schema(model), len(spec.problems)
         for each in error.errors(include_url=False):
@@ -73,7 +70,8 @@ def _report(error: ErrorDetails, value: Any, where: str, root: Schema, spec: Wri
     if kind == "missing" and isinstance(last, str):
         spec.wrong_key(joined(where, last), f"required: {expectation(subschema(schema, last, root), root)}")
     elif kind == "extra_forbidden":
-        spec.wrong_key(joined(where, last), spec.unknown_key(str(last), where, keys_of(schema, root)))
+        known = [key for option in alternatives(schema, root) for key in option.get("properties", ())]
+        spec.wrong_key(joined(where, last), spec.unknown_key(str(last), where, known))
     elif kind == "union_tag_not_found" and tag_key:
         spec.wrong_key(joined(where, tag_key), f"required: {listed(tags, 'or')}")
     elif kind == "union_tag_invalid" and tag_key:

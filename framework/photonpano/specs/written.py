@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem
+from photonpano.registry.catalog import Catalog
 from photonpano.text import listed, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from photonpano.values import Decision
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +55,18 @@ class WrittenSpec:
         unreadable: the paths of values that could not be read; no further problem with them is reported.
         sections_of: the sections in which a key may stand, such as `resample.with` for `group_size`.
         remark: added to the message of every problem.
+        directory: what relative paths count from.
+        catalog: what can be chosen.
+        decisions: what the spec leaves open and reading it has decided.
     """
 
     data: Any
     places: dict[str, Place]
-    problems: list[Problem]
+    problems: list[Problem] = field(default_factory=list)
+    directory: Path = Path()
+    catalog: Catalog = field(default_factory=Catalog)
     unreadable: set[str] = field(default_factory=set)
+    decisions: list[Decision] = field(default_factory=list)
     sections_of: dict[str, list[str]] = field(default_factory=dict)
     remark: str = ""
 
@@ -150,7 +159,7 @@ def given(data: object) -> str:
 
 def from_python(data: object, place: Place) -> WrittenSpec:
     """Read a spec from Python data; anything but plain data becomes a problem and None."""
-    spec = WrittenSpec(None, {"": place}, [])
+    spec = WrittenSpec(None, {"": place})
     spec.data = _plain(data, "", spec)
     return spec
 

@@ -311,7 +311,7 @@ def test_plugins_show_prints_keys_and_valid_snippet(finished: Path, invoke: Call
         "channel",
     ]
     assert "required" in table
-    plan = parse_spec("version: 1\n" + snippet.replace('"<a path>"', "cube.npy"), directory=finished)
+    plan = parse_spec("version: 1\n" + snippet.replace('"<path>"', "cube.npy"), directory=finished)
     assert plan.source.contribution.name == "packed-npy"
 
 

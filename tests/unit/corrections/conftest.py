@@ -36,7 +36,8 @@ def corrections(tmp_path: Path) -> Callable[..., tuple[Correction, ...]]:
 
     def corrections(*written: Any) -> tuple[Correction, ...]:
         spec = from_python({"corrections": list(written)}, Place())
-        found = resolved_corrections(spec.data["corrections"], spec, tmp_path)
+        spec.directory = tmp_path
+        found = resolved_corrections(spec.data["corrections"], spec)
         assert spec.problems == []
         return found
 

@@ -10,7 +10,7 @@ from pydantic import ByteSize, Field, JsonValue
 from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, SpecPath
-from photonpano.registry import ConfigRow, describe
+from photonpano.registry.description import ConfigRow, config_rows, snippet
 from photonpano.registry.schema_text import bounds_words, config_schema, expectation, type_words
 
 
@@ -60,9 +60,7 @@ LOCATOR = LocatorContribution(
 
 
 def test_rows_say_type_default_and_bounds():
-    described = describe(LOCATOR)
-    assert (described.kind, described.name, described.summary) == ("locator", "my-locator", "Finds nothing")
-    assert described.rows == (
+    assert config_rows(LocatorConfig) == (
         ConfigRow("weights", "path", None, "", "a local file"),
         ConfigRow("ratio", "number", "0.8", "above 0 and below 1", "nearest to second match"),
         ConfigRow("method", "ransac or magsac", "magsac", "", "how outliers are found"),
@@ -80,25 +78,21 @@ def test_rows_say_type_default_and_bounds():
 
 
 def test_snippet_is_yaml_with_the_defaults():
-    snippet = describe(LOCATOR).snippet
-    assert snippet == dedent("""\
+    written = snippet(LOCATOR)
+    assert written == dedent("""\
         locate:
           use: my-locator
           with:
-            weights: "<a path>"  # a local file
+            weights: "<path>"  # a local file
             ratio: 0.8  # nearest to second match
             method: magsac  # how outliers are found
             start: auto  # first frame: auto # or a number
-            inner:
-              depth: 1
-            search:  # where to look
-              kind: near
-              seed: 0
-              radius_px: 7  # of the search
+            inner: {depth: 1}
+            search: {kind: near, seed: 0, radius_px: 7}  # where to look
             label: null  # a text for records
             masks: ["yes", "a b"]  # files
         """)
-    section = YAML(typ="safe", pure=True).load(snippet)["locate"]
+    section = YAML(typ="safe", pure=True).load(written)["locate"]
     assert section.pop("use") == "my-locator"
     assert LocatorConfig(**section["with"] | {"weights": "w"}) == LocatorConfig(weights=Path("w"))
 
@@ -108,8 +102,8 @@ class Empty(Config):
 
 
 def test_component_without_keys():
-    described = describe(LocatorContribution(name="bare", summary="A toy", config=Empty, build=unbuilt))
-    assert (described.rows, described.snippet) == ((), "locate:\n  use: bare\n")
+    bare = LocatorContribution(name="bare", summary="A toy", config=Empty, build=unbuilt)
+    assert (config_rows(Empty), snippet(bare)) == ((), "locate:\n  use: bare\n")
 
 
 def wording(annotation: Any, words=expectation):
@@ -175,17 +169,18 @@ class Elaborate(Config):
 
 
 def test_defaults_that_are_computed_or_mappings_among_alternatives():
-    described = describe(LocatorContribution(name="bare", summary="A toy", config=Elaborate, build=unbuilt))
-    assert [(row.key, row.default) for row in described.rows][:3] == [
+    rows = config_rows(Elaborate)
+    assert [(row.key, row.default) for row in rows][:3] == [
         ("when", "computed"),
         ("inner", "{depth: 3}"),
         ("inner.depth", "1"),
     ]
-    assert described.rows[3:5] == (
+    assert rows[3:5] == (
         ConfigRow("many", "mapping", "{depth: 1}", "", ""),
         ConfigRow("many.depth", "integer", "1", "", "(Inner)"),
     )
-    section = YAML(typ="safe", pure=True).load(described.snippet)["locate"]["with"]
+    bare = LocatorContribution(name="bare", summary="A toy", config=Elaborate, build=unbuilt)
+    section = YAML(typ="safe", pure=True).load(snippet(bare))["locate"]["with"]
     assert section == {"inner": {"depth": 3}, "many": {"depth": 1}}
 
 
@@ -194,9 +189,7 @@ class Nest(Config):
 
 
 def test_configs_that_contain_themselves():
-    tree, nest = (
-        describe(LocatorContribution(name="self", summary="A toy", config=each, build=unbuilt)).rows for each in (Tree, Nest)
-    )
+    tree, nest = config_rows(Tree), config_rows(Nest)
     assert tree == (ConfigRow("children", "list of mappings", "[]", "", ""),)
     assert nest[1] == ConfigRow("inner.inner", "mapping or null", "null", "", "")
     assert len(nest) == 4
