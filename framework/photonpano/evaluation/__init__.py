@@ -1,4 +1,4 @@
-"""Scores of trajectories and panoramas against a known truth."""
+"""Scores of trajectories and panoramas against the truth of simulated captures."""
 
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux

@@ -1,4 +1,4 @@
-"""Cramer-Rao bounds: how well photons allow to locate an image at all."""
+"""Cramer-Rao bounds on the error of image registration from photons."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ from photonpano.geometry import corners, jacobian
 from photonpano.values import FluxImage, Homography, Response
 
 _NOISELESS = 1e9
-"""Frames after which photons are as good as the scene itself."""
+"""Number of frames for which photon noise is negligible."""
 
 
 def pair_bound_px(flux: FluxImage, response: Response, first_frames: ArrayLike, second_frames: ArrayLike) -> float:
-    """Return the least expected error of any unbiased registration of two exposures of one scene that nobody knows.
+    """Return the Cramer-Rao bound of registration of two exposures of an unknown scene.
 
-    On the scale on which noise is uniform the two differ by Gaussian noise of known variance, pixel by pixel, so that the
-    information on the eight parameters of a homography is the sum over pixels of
+    On the scale on which noise is uniform, the difference of the exposures is Gaussian noise of known variance in each pixel. So
+    the information on the eight parameters of a homography is the sum over pixels of
 
         (gradient . motion)^T (gradient . motion) / (variance of the first + variance of the second)
 
     Args:
-        flux: (H, W) the true flux as one of them sees it, in photons per pixel per frame.
+        flux: (H, W) true flux in one of the exposures, photons per pixel per frame.
         response: the camera's response.
-        first_frames: in how many frames the first exposure saw each pixel: a number, or (H, W); 0 where it did not.
-        second_frames: the same for the second exposure, seen from the first.
+        first_frames: number of frames in which the first exposure saw a pixel: one for all, or (H, W).
+        second_frames: the same for the second exposure, on the grid of the first.
 
     Returns:
-        The root mean square distance of a corner of the frame from where it should be, in px.
+        Root mean square error of a corner of the frame, in px: no unbiased estimate has a smaller one.
     """
     return _corner_std_px(flux, response, _variance(first_frames, response) + _variance(second_frames, response))
 
 
 def exposure_bound_px(flux: FluxImage, response: Response, frames: ArrayLike) -> float:
-    """Return the same for one exposure of a scene that is known without noise: what no locator can exceed.
+    """Return the Cramer-Rao bound of registration of one exposure with a known scene, in px: see `pair_bound_px`.
 
     Args:
-        flux: (H, W) the true flux as the exposure sees it, in photons per pixel per frame.
+        flux: (H, W) true flux in the exposure, photons per pixel per frame.
         response: the camera's response.
-        frames: in how many frames the exposure saw each pixel: a number, or (H, W); 0 where it did not.
+        frames: number of frames in which the exposure saw a pixel: one for all, or (H, W).
     """
     return _corner_std_px(flux, response, _variance(frames, response))
 
@@ -50,13 +50,13 @@ def _variance(frames: ArrayLike, response: Response) -> np.ndarray:
 
 
 def _corner_std_px(flux: FluxImage, response: Response, variance: np.ndarray) -> float:
-    along_y, along_x = np.gradient(np.asarray(response.stabilised(flux, _NOISELESS), dtype=np.float64))
+    gradient_y, gradient_x = np.gradient(np.asarray(response.stabilised(flux, _NOISELESS), dtype=np.float64))
     height, width = flux.shape
     y, x = np.mgrid[:height, :width]
-    still: Homography = np.eye(3)
+    identity: Homography = np.eye(3)
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
-    # In terms of the corners, so that all eight unknowns are pixels.
-    of_corners = jacobian(still, pixels) @ np.linalg.inv(jacobian(still, corners(flux.shape)).reshape(8, 8))
-    slopes = along_x.ravel()[:, None] * of_corners[:, 0] + along_y.ravel()[:, None] * of_corners[:, 1]
-    information = (slopes / np.broadcast_to(variance, flux.shape).reshape(-1, 1)).T @ slopes
+    # Parametrised by the corners, so that all eight unknowns are in px.
+    of_corners = jacobian(identity, pixels) @ np.linalg.inv(jacobian(identity, corners(flux.shape)).reshape(8, 8))
+    derivatives = gradient_x.ravel()[:, None] * of_corners[:, 0] + gradient_y.ravel()[:, None] * of_corners[:, 1]
+    information = (derivatives / np.broadcast_to(variance, flux.shape).reshape(-1, 1)).T @ derivatives
     return float(np.sqrt(np.trace(np.linalg.inv(information)) / 4))

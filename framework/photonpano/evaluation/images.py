@@ -13,26 +13,26 @@ from photonpano.photometry import linear_to_srgb
 from photonpano.values import BoolArray, FluxImage, Homography
 
 WHITE_QUANTILE = 0.999
-"""The quantile of the true scene that becomes white: the brightest pixel alone may be a lamp that darkens all others."""
+"""Quantile of the true scene that becomes white. The maximum may be a lamp, which would darken everything else."""
 
 MIN_COVERAGE = 0.05
-"""A pixel is compared if it was seen in at least this share of the median coverage of the pixels that were seen."""
+"""Pixels are compared if their coverage is at least this share of the median coverage of the seen pixels."""
 
 _SSIM_SIGMA = 1.5
 _SSIM_RADIUS = 5
 _ROWS = 256
-"""The true scene is sampled so many rows at a time, which bounds the memory of the coordinates."""
+"""Rows of the true scene that are sampled at a time, which bounds the memory of the coordinates."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageScore:
-    """How like the truth an image is, in sRGB from 0 to 1, over the pixels that are compared.
+    """Similarity of an image to the truth, in sRGB from 0 to 1, over the compared pixels.
 
     Attributes:
         psnr_db: peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images.
         ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window
             is compared; NaN if there is none.
-        compared_share: share of the pixels of the image that are compared, 0 to 1.
+        compared_share: share of the compared pixels, 0 to 1.
     """
 
     psnr_db: float
@@ -41,10 +41,10 @@ class ImageScore:
 
 
 def covered(weight: FluxImage) -> BoolArray:
-    """Tell which pixels were seen in enough frames to be compared: see `MIN_COVERAGE`.
+    """Return which pixels were seen in enough frames to be compared: see `MIN_COVERAGE`.
 
     Args:
-        weight: (H, W), how many frames each pixel was seen in.
+        weight: (H, W), number of frames in which each pixel was seen.
     """
     seen = weight > 0
     if not seen.any():
@@ -53,7 +53,7 @@ def covered(weight: FluxImage) -> BoolArray:
 
 
 def white_flux(scene: FluxImage) -> float:
-    """Return the flux that becomes white when images are compared: see `WHITE_QUANTILE`.
+    """Return the flux that becomes white in a comparison: see `WHITE_QUANTILE`.
 
     Args:
         scene: (H, W), true flux; NaN where unknown.
@@ -68,7 +68,7 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
         panorama: (H, W), flux.
         truth: (H, W), true flux on the same pixels.
         compared: (H, W), the pixels to compare; those where either image is not finite are left out.
-        white: the flux that becomes 1 in sRGB, such as `white_flux` of the true scene. What is brighter is clipped to it.
+        white: the flux that becomes 1 in sRGB, such as `white_flux` of the true scene. Brighter pixels are clipped to it.
 
     Raises:
         ValueError: no pixel is compared, or white is not positive.
@@ -83,7 +83,7 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
         raise ValueError("no pixel is compared")
     first, second = (np.where(compared, linear_to_srgb(image / white), np.float32(0)) for image in (panorama, truth))
     squared = np.square(first[compared] - second[compared], dtype=np.float64).mean()
-    # Filled pixels would enter the windows at the border of what is compared, and beyond the border of the image is nothing.
+    # Windows that contain pixels that are not compared, or pixels beyond the border of the image, are left out.
     window = np.ones((2 * _SSIM_RADIUS + 1,) * 2, dtype=np.uint8)
     whole = cv2.erode(compared.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)).astype(bool)
     ssim = np.nan
@@ -99,7 +99,7 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
 
 
 def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> FluxImage:
-    """Return the true scene on the canvas of a panorama, interpolated linearly; NaN outside the scene.
+    """Return the true scene on the canvas of a panorama, interpolated bilinearly; NaN outside of the scene.
 
     Args:
         scene: (H, W), true flux on the true plane.

@@ -1,4 +1,4 @@
-"""What is scored: the files of a run folder, and the truth that the simulator stored beside its capture."""
+"""Read what evaluation compares: the files of a run folder, and the truth of a simulated capture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What a simulated capture really shows.
+    """True motion and scene of a simulated capture.
 
     Attributes:
         homographies: (T, 3, 3), frame pixels to pixels of the scene.
@@ -33,14 +33,14 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunTrajectory:
-    """What `trajectory.npz` of a run folder holds.
+    """Content of `trajectory.npz` in a run folder.
 
     Attributes:
         homographies: (T, 3, 3), frame pixels to reference pixels.
         canvas: (3, 3), reference pixels to panorama pixels.
         frame_shape: (height, width) of a frame.
         located: (T,), False where a frame lies outside what was located.
-        std_px: (T,) the expected corner error.
+        std_px: (T,) expected corner error.
     """
 
     homographies: FloatArray
@@ -57,7 +57,7 @@ def load_truth(path: Path) -> Truth:
         path: an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`.
 
     Raises:
-        InputError: the file is missing, is no such archive, lacks an array, or holds something else under its name.
+        InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
     """
     arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), ("scene",))
     scene = arrays.get("scene")
@@ -74,13 +74,13 @@ def load_run_trajectory(folder: Path) -> RunTrajectory:
     """Read the trajectory of a run folder.
 
     Raises:
-        InputError: the folder has none, or the file is damaged.
+        InputError: the file is missing or damaged.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
     path = folder / "trajectory.npz"
     if not path.exists():
-        raise InputError(f"{folder} has no trajectory.npz, so no run finished in it; give the run folder of one that did")
+        raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
     arrays = _read_archive(path, "the trajectory of a run", ("homographies", "canvas", "frame_shape", "located", "std_px"), ())
     homographies = _homographies(path, arrays)
     canvas, located, std_px = arrays["canvas"], arrays["located"], arrays["std_px"]
@@ -114,7 +114,7 @@ def _read_tiff(path: Path) -> FluxImage:
     import tifffile
 
     if not path.exists():
-        raise InputError(f"{path} is missing; run the spec again, the folder is incomplete")
+        raise InputError(f"{path} is missing, so the run folder is incomplete; run the spec again")
     try:
         return np.asarray(tifffile.imread(path), dtype=np.float32)
     except (tifffile.TiffFileError, ValueError, OSError) as error:
@@ -128,12 +128,12 @@ def _read_archive(path: Path, content: str, required: tuple[str, ...], optional:
     if missing:
         held = ", ".join(name or "an array without a name" for name in arrays) or "nothing"
         raise InputError(
-            f"{path} lacks {' and '.join(missing)}; {content} holds {', '.join((*required, *optional))}, "
-            f"and this file holds {held}"
+            f"{path} lacks {' and '.join(missing)}; {content} contains {', '.join((*required, *optional))}; "
+            f"this file contains {held}"
         )
     for name in (*required, *optional):
         if name in arrays and arrays[name].dtype.kind not in "biuf":
-            raise InputError(f"{path}: {name} does not hold numbers")
+            raise InputError(f"{path}: {name} must contain numbers")
     return arrays
 
 

@@ -18,7 +18,7 @@ from photonpano.values import Panorama
 
 
 class Renderer(Protocol):
-    """Renders the capture of a run along another motion, as the run rendered its own."""
+    """Renders the capture of a run along another motion, with the settings of the run."""
 
     def __call__(self, trajectory: Trajectory, canvas: Canvas) -> Panorama:
         """Return flux and weight on the canvas."""
@@ -27,14 +27,14 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """What a run scores.
+    """Scores of a run.
 
     Attributes:
         trajectory: corner errors.
-        honest_share: share of the located frames whose corner error is at most three times what the run expected, `std_px`.
+        honest_share: share of the located frames whose corner error is at most three times the expected one, `std_px`.
         panorama: the panorama against the true scene; None if the truth has no scene.
-        oracle: the panorama along the true motion, over the same pixels; None if it was not asked for.
-        white_flux: the flux that is white when images are compared, in photons per pixel per frame; None without a scene.
+        oracle: the panorama along the true motion, over the same pixels; None if it was not requested.
+        white_flux: flux that is white in the comparison, photons per pixel per frame; None without a scene.
     """
 
     trajectory: TrajectoryScore
@@ -45,7 +45,7 @@ class Evaluation:
 
     @property
     def below_oracle_db(self) -> float | None:
-        """By how much the PSNR falls short of the oracle's, which is what the errors of the motion cost."""
+        """Difference of the PSNR to that of the oracle, in dB: the loss due to errors of the motion."""
         if self.panorama is None or self.oracle is None:
             return None
         return self.oracle.psnr_db - self.panorama.psnr_db
@@ -55,12 +55,12 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     """Score a run against the truth of its capture.
 
     Args:
-        run_folder: what `photonpano run` wrote.
+        run_folder: folder that `photonpano run` wrote.
         truth_path: the `truth.npz` that `photonpano simulate` stored beside the capture.
-        render: renders the oracle, the panorama along the true motion; without it there is none.
+        render: renders the oracle, the panorama along the true motion; without it there is no oracle.
 
     Raises:
-        InputError: a file is missing or damaged, or the run and the truth are not of the same capture.
+        InputError: a file is missing or damaged, or run and truth belong to different captures.
     """
     folder, truth_path = Path(run_folder), Path(truth_path)
     run = load_run_trajectory(folder)
@@ -73,7 +73,7 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
 
     white = white_flux(truth.scene)
     if not white > 0:
-        raise InputError(f"{truth_path}: the scene is dark, so there is nothing to compare the panorama with")
+        raise InputError(f"{truth_path}: the scene is dark, so that the panorama cannot be compared with it")
     flux, weight = load_panorama(folder)
     canvas = Canvas(flux.shape[0], flux.shape[1], run.canvas)
     true_image = true_panorama(truth.scene, canvas, motion.alignment)
@@ -99,13 +99,13 @@ def _check_same_capture(folder: Path, run: RunTrajectory, truth_path: Path, trut
     if frames != true_frames:
         raise InputError(
             f"{truth_path} is the truth of {true_frames} frames, but the run in {folder} has {frames}; "
-            "they are not of the same capture"
+            "they belong to different captures"
         )
     if run.frame_shape != truth.frame_shape:
         (height, width), (true_height, true_width) = run.frame_shape, truth.frame_shape
         raise InputError(
             f"{truth_path} is the truth of frames of {true_height}x{true_width}, but the run in {folder} has frames of "
-            f"{height}x{width}; they are not of the same capture"
+            f"{height}x{width}; they belong to different captures"
         )
     if not run.located.any():
-        raise InputError(f"{folder}: the run located no frame, so there is nothing to score")
+        raise InputError(f"{folder}: the run located no frame, so that it has no score")

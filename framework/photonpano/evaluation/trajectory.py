@@ -15,18 +15,18 @@ from photonpano.values import BoolArray, FloatArray, Homography
 class TrajectoryScore:
     """Corner errors of a trajectory after the best alignment of the two planes.
 
-    The error of a frame is the mean over its four corners of the distance, in pixels of the frame, between where the
-    corner is and where the estimate says it is. The figures are over the frames that the run located.
+    The error of a frame is the mean, over its four corners, of the distance between the true and the estimated position, in
+    pixels of the frame. Statistics are over the located frames.
 
     Attributes:
-        errors_px: (T,) the error of every frame, located or not.
-        located: (T,) the frames that count.
+        errors_px: (T,) error of every frame, located or not.
+        located: (T,) true for located frames.
         alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
         mean_px: mean error.
         median_px: median error.
-        p95_px: 95 % of the frames have at most this error.
-        max_px: error of the worst frame.
-        located_share: share of the frames that count, 0 to 1.
+        p95_px: 95 % quantile of the errors.
+        max_px: largest error.
+        located_share: share of the located frames, 0 to 1.
     """
 
     errors_px: FloatArray
@@ -51,10 +51,10 @@ def corner_errors(
         estimated: (T, 3, 3), frame pixels to pixels of the estimated reference plane.
         true: (T, 3, 3), frame pixels to pixels of the true plane.
         frame_shape: (height, width) of a frame.
-        located: (T,) the frames that count, and to which the planes are aligned; all by default.
+        located: (T,) the frames to compare, and to which the planes are aligned; all by default.
 
     Raises:
-        ValueError: the trajectories differ in length, or no frame counts.
+        ValueError: the trajectories differ in length, or no frame is located.
     """
     counted = np.ones(len(true), dtype=bool) if located is None else np.asarray(located, dtype=bool)
     if not len(estimated) == len(true) == len(counted):
@@ -62,21 +62,21 @@ def corner_errors(
     alignment = align_planes(estimated[counted], true[counted], frame_shape)
     in_frame = np.linalg.inv(true) @ (alignment @ estimated)
     errors = corner_displacements(in_frame, np.eye(3), frame_shape).mean(axis=-1)
-    counting = errors[counted]
+    compared = errors[counted]
     return TrajectoryScore(
         errors_px=errors,
         located=counted,
         alignment=alignment,
-        mean_px=float(counting.mean()),
-        median_px=float(np.median(counting)),
-        p95_px=float(np.quantile(counting, 0.95)),
-        max_px=float(counting.max()),
+        mean_px=float(compared.mean()),
+        median_px=float(np.median(compared)),
+        p95_px=float(np.quantile(compared, 0.95)),
+        max_px=float(compared.max()),
         located_share=float(counted.mean()),
     )
 
 
 class FrameTrajectory:
-    """A trajectory that is known at every frame; between frames its parameters are linear, beyond the ends they hold.
+    """A trajectory given at every frame: linear between frames, constant beyond the first and last.
 
     Args:
         homographies: (T, 3, 3) float64, frame pixels to reference pixels, h33 = 1.

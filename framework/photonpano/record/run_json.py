@@ -101,7 +101,7 @@ def read_record(run_folder: Path) -> RunRecord:
     """
     file = run_folder / "run.json"
     if not file.is_file():
-        raise InputError(f"{run_folder} has no run.json, so no run finished in it; give the run folder of one that did")
+        raise InputError(f"{run_folder} has no run.json, so no run has finished in it; give the folder of a finished run")
     try:
         record: RunRecord = json.loads(file.read_text(encoding="utf-8"))
         record["spec"]  # what everything else can be made from

@@ -18,7 +18,7 @@ def frame_shape() -> tuple[int, int]:
 
 
 def panning_camera(n_frames: int) -> np.ndarray:
-    """Return the homographies of a camera that turns and nods: frame pixels to pixels of a scene, at its true scale."""
+    """Return the homographies of a camera that pans and tilts: frame pixels to pixels of a scene, at its true scale."""
     height, width = FRAME_SHAPE
     camera = np.array([[300.0, 0, (width - 1) / 2], [0, 300.0, (height - 1) / 2], [0, 0, 1]])
     time = np.linspace(-1, 1, n_frames) if n_frames > 1 else np.zeros(1)

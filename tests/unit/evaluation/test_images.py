@@ -21,7 +21,7 @@ def encoded() -> np.ndarray:
     return 0.5 + 0.25 * np.sin(x / 5) * np.cos(y / 4)
 
 
-def test_an_image_is_like_itself(encoded):
+def test_image_score_of_equal_images_is_perfect(encoded):
     score = image_score(flux_of(encoded), flux_of(encoded), np.ones(encoded.shape, bool), WHITE)
     assert score.psnr_db == np.inf
     assert score.ssim == pytest.approx(1)
@@ -29,14 +29,14 @@ def test_an_image_is_like_itself(encoded):
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.05])
-def test_noise_scores_its_known_ratio(encoded, sigma):
+def test_image_score_psnr_is_that_of_added_noise(encoded, sigma):
     noise = np.random.default_rng(0).normal(0, sigma, encoded.shape)
     score = image_score(flux_of(encoded + noise), flux_of(encoded), np.ones(encoded.shape, bool), WHITE)
     # 19,200 independent differences know the variance to 1 %, which is 0.045 dB.
     assert score.psnr_db == pytest.approx(-20 * np.log10(sigma), abs=0.15)
 
 
-def test_similarity_of_a_flat_image_with_noise_is_the_formula():
+def test_image_score_ssim_of_flat_noisy_image_follows_formula():
     sigma = 0.05
     flat = np.full((200, 200), 0.5)
     noise = np.random.default_rng(0).normal(0, sigma, flat.shape)
@@ -49,7 +49,7 @@ def test_similarity_of_a_flat_image_with_noise_is_the_formula():
     assert score.ssim == pytest.approx(c2 / (c2 + v) * (1 + (v / (c2 + v)) ** 2 * 2 * w2), rel=0.01)
 
 
-def test_only_what_is_compared_counts(encoded):
+def test_image_score_ignores_pixels_that_are_not_compared(encoded):
     compared = np.zeros(encoded.shape, bool)
     compared[20:100, 30:130] = True
     panorama = flux_of(np.where(compared, encoded, 0.9))
@@ -59,7 +59,7 @@ def test_only_what_is_compared_counts(encoded):
     assert score.compared_share == pytest.approx(80 * 100 / encoded.size)
 
 
-def test_unknown_pixels_of_either_image_are_left_out(encoded):
+def test_image_score_ignores_nan_of_either_image(encoded):
     panorama, truth = flux_of(encoded), flux_of(encoded)
     panorama[:30] = np.nan
     truth[:, -40:] = np.nan
@@ -68,7 +68,7 @@ def test_unknown_pixels_of_either_image_are_left_out(encoded):
     assert score.compared_share == pytest.approx(90 * 120 / encoded.size)
 
 
-def test_structural_similarity_needs_a_whole_window(encoded):
+def test_image_score_ssim_is_nan_without_whole_window(encoded):
     compared = np.zeros(encoded.shape, bool)
     compared[40:50, :] = True
     score = image_score(flux_of(encoded), flux_of(encoded), compared, WHITE)
@@ -76,12 +76,12 @@ def test_structural_similarity_needs_a_whole_window(encoded):
     assert score.psnr_db == np.inf
 
 
-def test_an_image_smaller_than_a_window_has_no_similarity():
+def test_image_score_ssim_is_nan_for_image_smaller_than_window():
     tiny = flux_of(np.full((8, 9), 0.5))
     assert np.isnan(image_score(tiny, tiny, np.ones((8, 9), bool), WHITE).ssim)
 
 
-def test_brighter_than_white_is_white(encoded):
+def test_image_score_clips_at_white(encoded):
     truth = flux_of(encoded)
     truth[50:60, 50:60] = WHITE
     panorama = truth.copy()
@@ -89,27 +89,27 @@ def test_brighter_than_white_is_white(encoded):
     assert image_score(panorama, truth, np.ones(encoded.shape, bool), WHITE).psnr_db == np.inf
 
 
-def test_nothing_to_compare_is_refused(encoded):
+def test_image_score_refuses_empty_comparison(encoded):
     with pytest.raises(ValueError, match="no pixel is compared"):
         image_score(flux_of(encoded), flux_of(encoded), np.zeros(encoded.shape, bool), WHITE)
     with pytest.raises(ValueError, match="white must be a positive flux"):
         image_score(flux_of(encoded), flux_of(encoded), np.ones(encoded.shape, bool), 0)
 
 
-def test_pixels_that_were_hardly_seen_are_not_covered():
+def test_covered_is_false_for_hardly_seen_pixels():
     weight = np.full((10, 10), 400, dtype=np.float32)
     weight[0], weight[1], weight[2] = 0, 19, 20
     np.testing.assert_array_equal(covered(weight).all(axis=1), [False, False, *[True] * 8])
     assert not covered(np.zeros((3, 3), dtype=np.float32)).any()
 
 
-def test_white_ignores_a_lamp():
+def test_white_flux_ignores_a_lamp():
     scene = np.linspace(0, 1, 10_000, dtype=np.float32).reshape(100, 100)
     scene[0, :5] = 1000
     assert white_flux(scene) == pytest.approx(0.999, abs=2e-3)
 
 
-def test_the_true_panorama_is_the_scene_seen_through_canvas_and_alignment():
+def test_true_panorama_samples_scene_through_canvas_and_alignment():
     x, y = np.meshgrid(np.arange(50, dtype=np.float32), np.arange(40, dtype=np.float32))
     scene = 2 * x + 3 * y  # linear interpolation is exact on a plane
     reference_to_scene = translation(5.5, 4)

@@ -17,75 +17,75 @@ def failure(capture) -> str:
     return str(caught.value).replace(str(capture.truth), "truth.npz").replace(str(capture.folder), "RUN")
 
 
-def test_no_folder(capture):
+def test_evaluate_refuses_missing_folder(capture):
     capture.folder = capture.folder / "nowhere"
     assert failure(capture) == "RUN is not a folder; give the run folder that `photonpano run` wrote"
 
 
-def test_a_folder_without_a_trajectory(capture):
+def test_evaluate_refuses_folder_without_trajectory(capture):
     (capture.folder / "trajectory.npz").unlink()
-    assert failure(capture) == "RUN has no trajectory.npz, so no run finished in it; give the run folder of one that did"
+    assert failure(capture) == "RUN has no trajectory.npz, so no run has finished in it; give the folder of a finished run"
 
 
-def test_no_truth(capture):
+def test_evaluate_refuses_missing_truth(capture):
     capture.truth.unlink()
     assert failure(capture) == "there is no file truth.npz; check the path"
 
 
-def test_another_number_of_frames(capture):
+def test_evaluate_refuses_truth_with_other_number_of_frames(capture):
     capture.true["homographies"] = capture.true["homographies"][:100]
     capture.write()
     assert failure(capture) == (
-        "truth.npz is the truth of 100 frames, but the run in RUN has 120; they are not of the same capture"
+        "truth.npz is the truth of 100 frames, but the run in RUN has 120; they belong to different captures"
     )
 
 
-def test_another_frame_shape(capture):
+def test_evaluate_refuses_truth_with_other_frame_shape(capture):
     capture.true["frame_shape"] = np.array([90, 60])
     capture.write()
     assert failure(capture) == (
-        "truth.npz is the truth of frames of 90x60, but the run in RUN has frames of 60x90; they are not of the same capture"
+        "truth.npz is the truth of frames of 90x60, but the run in RUN has frames of 60x90; they belong to different captures"
     )
 
 
-def test_missing_arrays(capture):
+def test_load_truth_names_missing_arrays(capture):
     del capture.true["homographies"]
     capture.write()
     assert failure(capture) == (
-        "truth.npz lacks homographies; a truth as `photonpano simulate` writes it holds homographies, frame_shape, scene, "
-        "and this file holds frame_shape, scene"
+        "truth.npz lacks homographies; a truth as `photonpano simulate` writes it contains homographies, frame_shape, scene; "
+        "this file contains frame_shape, scene"
     )
 
 
-def test_an_array_of_pickled_objects(capture):
+def test_load_truth_refuses_pickled_objects(capture):
     capture.true["homographies"] = np.array([{"a": 1}], dtype=object)
     capture.write()
     assert failure(capture) == "truth.npz is damaged: homographies cannot be read as an array of plain numbers; write it again"
 
 
-def test_a_pickle(capture):
+def test_load_truth_refuses_pickle(capture):
     capture.truth.write_bytes(pickle.dumps({"homographies": 1}))
     assert failure(capture) == NO_ARCHIVE
 
 
-def test_an_archive_that_is_cut_off(capture):
+def test_load_truth_refuses_truncated_archive(capture):
     capture.truth.write_bytes(capture.truth.read_bytes()[:-200])
     assert failure(capture) == NO_ARCHIVE
 
 
-def test_an_archive_with_a_wrong_byte(capture):
+def test_load_truth_refuses_archive_with_wrong_byte(capture):
     content = bytearray(capture.truth.read_bytes())
     content[1000] ^= 0xFF
     capture.truth.write_bytes(content)
     assert failure(capture) == "truth.npz is damaged: homographies cannot be read as an array of plain numbers; write it again"
 
 
-def test_a_single_array_instead_of_an_archive(capture):
+def test_load_truth_refuses_single_array(capture):
     with capture.truth.open("wb") as file:
         np.save(file, capture.true["homographies"])
     assert failure(capture) == (
-        "truth.npz lacks homographies and frame_shape; a truth as `photonpano simulate` writes it holds homographies, "
-        "frame_shape, scene, and this file holds an array without a name"
+        "truth.npz lacks homographies and frame_shape; a truth as `photonpano simulate` writes it contains homographies, "
+        "frame_shape, scene; this file contains an array without a name"
     )
 
 
@@ -98,11 +98,11 @@ def test_a_single_array_instead_of_an_archive(capture):
         ("frame_shape", np.array([60, 90, 1]), "frame_shape must be two positive integers (height, width), got [60, 90, 1]"),
         ("frame_shape", np.array([60, 0]), "frame_shape must be two positive integers (height, width), got [60, 0]"),
         ("scene", np.zeros((4, 4, 3)), "scene must be an image (height, width), got the shape (4, 4, 3)"),
-        ("scene", np.array(["a"]), "scene does not hold numbers"),
-        ("scene", np.zeros((4, 4)), "the scene is dark, so there is nothing to compare the panorama with"),
+        ("scene", np.array(["a"]), "scene must contain numbers"),
+        ("scene", np.zeros((4, 4)), "the scene is dark, so that the panorama cannot be compared with it"),
     ],
 )
-def test_arrays_that_are_not_what_they_should_be(capture, name, value, message):
+def test_load_truth_refuses_arrays_of_wrong_shape_or_value(capture, name, value, message):
     capture.true[name] = value
     capture.write()
     assert failure(capture) == f"truth.npz: {message}"
@@ -115,29 +115,29 @@ def test_arrays_that_are_not_what_they_should_be(capture, name, value, message):
         ("located", np.ones(7, bool), "located must have a flag for each of 120 frames, got (7,)"),
     ],
 )
-def test_a_damaged_run(capture, name, value, message):
+def test_load_run_trajectory_refuses_arrays_of_wrong_shape(capture, name, value, message):
     capture.trajectory[name] = value
     capture.write()
     assert failure(capture) == f"RUN/trajectory.npz: {message}"
 
 
-def test_a_run_that_located_nothing(capture):
+def test_evaluate_refuses_run_without_located_frame(capture):
     capture.trajectory["located"] = np.zeros(120, bool)
     capture.write()
-    assert failure(capture) == "RUN: the run located no frame, so there is nothing to score"
+    assert failure(capture) == "RUN: the run located no frame, so that it has no score"
 
 
-def test_a_missing_panorama(capture):
+def test_load_panorama_refuses_missing_file(capture):
     (capture.folder / "coverage.tiff").unlink()
-    assert failure(capture) == "RUN/coverage.tiff is missing; run the spec again, the folder is incomplete"
+    assert failure(capture) == "RUN/coverage.tiff is missing, so the run folder is incomplete; run the spec again"
 
 
-def test_a_panorama_that_is_no_tiff(capture):
+def test_load_panorama_refuses_file_that_is_no_tiff(capture):
     (capture.folder / "panorama.tiff").write_bytes(b"not an image")
     assert failure(capture).startswith("RUN/panorama.tiff cannot be read as a TIFF image: ")
 
 
-def test_coverage_of_another_size(capture):
+def test_load_panorama_refuses_coverage_of_other_size(capture):
     capture.weight = capture.weight[:-1]
     capture.write()
     height, width = capture.flux.shape
@@ -147,13 +147,13 @@ def test_coverage_of_another_size(capture):
     )
 
 
-def test_a_panorama_without_a_seen_pixel(capture):
+def test_evaluate_refuses_panorama_without_seen_pixel(capture):
     capture.weight[:] = 0
     capture.write()
     assert failure(capture) == "RUN: the panorama and the true scene have no pixel in common"
 
 
-def test_a_truth_is_read_as_it_was_written(capture):
+def test_load_truth_returns_written_arrays(capture):
     truth = load_truth(capture.truth)
     np.testing.assert_array_equal(truth.homographies, capture.true["homographies"])
     np.testing.assert_array_equal(truth.scene, capture.true["scene"])

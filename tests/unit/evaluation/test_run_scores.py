@@ -11,7 +11,7 @@ from photonpano.evaluation import evaluate
 from photonpano.geometry import normalised, translation
 
 
-def test_a_perfect_run_is_perfect_in_any_gauge_and_at_any_scale(capture):
+def test_evaluate_scores_perfect_run_in_any_gauge_and_scale(capture):
     score = evaluate(capture.folder, capture.truth)
     assert score.trajectory.max_px < 1e-6
     assert score.trajectory.located_share == 1
@@ -24,7 +24,7 @@ def test_a_perfect_run_is_perfect_in_any_gauge_and_at_any_scale(capture):
     assert score.below_oracle_db is None
 
 
-def test_a_truth_without_a_scene_scores_the_motion_only(capture):
+def test_evaluate_scores_motion_only_without_scene(capture):
     del capture.true["scene"]
     capture.write()
     (capture.folder / "panorama.tiff").unlink()
@@ -34,7 +34,7 @@ def test_a_truth_without_a_scene_scores_the_motion_only(capture):
     assert score.below_oracle_db is None
 
 
-def test_frames_that_were_not_located_are_left_out(capture):
+def test_evaluate_ignores_frames_that_were_not_located(capture):
     estimated = capture.trajectory["homographies"]
     estimated[:12] = normalised(estimated[:12] @ translation(30, 0))
     capture.trajectory["located"][:12] = False
@@ -44,7 +44,7 @@ def test_frames_that_were_not_located_are_left_out(capture):
     assert score.trajectory.located_share == 0.9
 
 
-def test_the_oracle_follows_the_true_motion_on_the_same_canvas_and_pixels(capture):
+def test_evaluate_renders_oracle_along_true_motion_on_same_canvas(capture):
     asked = []
     clean, shape = capture.flux, capture.flux.shape
     noise = np.random.default_rng(0).normal(0, 0.02, shape).astype(np.float32)
@@ -66,7 +66,7 @@ def test_the_oracle_follows_the_true_motion_on_the_same_canvas_and_pixels(captur
     assert score.panorama.compared_share == score.oracle.compared_share < 0.5
 
 
-def test_the_import_loads_no_heavy_library():
+def test_evaluation_imports_no_heavy_library():
     heavy = ["cv2", "matplotlib", "scipy", "skimage", "tifffile"]
     code = f"import sys, photonpano.evaluation; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

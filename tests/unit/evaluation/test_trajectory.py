@@ -27,7 +27,7 @@ def gauges(draw: st.DrawFn) -> np.ndarray:
 
 @settings(max_examples=25, deadline=None)
 @given(gauge=gauges())
-def test_the_alignment_finds_any_change_of_plane(gauge, true_motion, frame_shape):
+def test_align_planes_finds_any_change_of_plane(gauge, true_motion, frame_shape):
     found = align_planes(normalised(gauge @ true_motion), true_motion, frame_shape)
     points = apply(true_motion[::40], corners(frame_shape))
     np.testing.assert_allclose(apply(found @ gauge, points), points, atol=1e-6)
@@ -35,14 +35,14 @@ def test_the_alignment_finds_any_change_of_plane(gauge, true_motion, frame_shape
 
 @settings(max_examples=25, deadline=None)
 @given(gauge=gauges())
-def test_errors_do_not_depend_on_the_plane(gauge, true_motion, frame_shape):
+def test_corner_errors_do_not_depend_on_estimated_plane(gauge, true_motion, frame_shape):
     estimated = jittered(true_motion, 0.5)
     here = corner_errors(estimated, true_motion, frame_shape)
     there = corner_errors(normalised(gauge @ estimated), true_motion, frame_shape)
     np.testing.assert_allclose(there.errors_px, here.errors_px, atol=1e-4)
 
 
-def test_errors_do_not_depend_on_the_plane_of_the_truth(true_motion, frame_shape):
+def test_corner_errors_do_not_depend_on_true_plane(true_motion, frame_shape):
     estimated = jittered(true_motion, 0.5)
     scene = rescaling(3.0) @ translation(20, -90)
     here = corner_errors(estimated, true_motion, frame_shape)
@@ -50,7 +50,7 @@ def test_errors_do_not_depend_on_the_plane_of_the_truth(true_motion, frame_shape
     np.testing.assert_allclose(there.errors_px, here.errors_px, atol=1e-4)
 
 
-def test_random_shifts_score_their_expected_length(true_motion, frame_shape):
+def test_corner_errors_of_random_shifts_follow_rayleigh_distribution(true_motion, frame_shape):
     true = np.tile(true_motion, (20, 1, 1))
     score = corner_errors(jittered(true, 0.4), true, frame_shape)
     # The length of a normal vector in the plane follows Rayleigh's law.
@@ -60,7 +60,7 @@ def test_random_shifts_score_their_expected_length(true_motion, frame_shape):
     assert score.max_px == score.errors_px.max()
 
 
-def test_one_wrong_frame_is_the_worst_by_its_shift(true_motion, frame_shape):
+def test_corner_errors_find_one_wrong_frame(true_motion, frame_shape):
     estimated = true_motion.copy()
     estimated[37] = normalised(true_motion[37] @ translation(3, 4))
     score = corner_errors(estimated, true_motion, frame_shape)
@@ -69,7 +69,7 @@ def test_one_wrong_frame_is_the_worst_by_its_shift(true_motion, frame_shape):
     assert score.median_px < 0.2
 
 
-def test_frames_that_are_not_located_do_not_count(true_motion, frame_shape):
+def test_corner_errors_ignore_frames_that_are_not_located(true_motion, frame_shape):
     estimated = true_motion.copy()
     estimated[:30] = normalised(true_motion[:30] @ translation(40, 0))
     located = np.arange(len(true_motion)) >= 30
@@ -79,12 +79,12 @@ def test_frames_that_are_not_located_do_not_count(true_motion, frame_shape):
     np.testing.assert_allclose(score.errors_px[:30], 40, atol=1e-5)
 
 
-def test_a_single_frame_is_aligned_exactly(true_motion, frame_shape):
+def test_corner_errors_of_single_frame_are_0(true_motion, frame_shape):
     score = corner_errors(np.eye(3)[None], true_motion[:1], frame_shape)
     assert score.max_px < 1e-9
 
 
-def test_the_alignment_does_not_follow_a_few_lost_frames_to_infinity(true_motion, frame_shape):
+def test_align_planes_is_finite_with_frame_at_the_horizon(true_motion, frame_shape):
     estimated = true_motion.copy()
     estimated[5] = from_parameters([0, 0, 0, 0, 0, 0, -1 / 40, 0])  # its horizon crosses the frame
     score = corner_errors(estimated, true_motion, frame_shape)
@@ -92,7 +92,7 @@ def test_the_alignment_does_not_follow_a_few_lost_frames_to_infinity(true_motion
     assert int(np.argmax(score.errors_px)) == 5
 
 
-def test_many_frames_are_scored_as_the_few_they_were_made_from(true_motion, frame_shape):
+def test_corner_errors_do_not_depend_on_number_of_frames(true_motion, frame_shape):
     estimated = jittered(true_motion, 0.5)
     few = corner_errors(estimated, true_motion, frame_shape)
     many = corner_errors(np.repeat(estimated, 50, axis=0), np.repeat(true_motion, 50, axis=0), frame_shape)
@@ -100,22 +100,22 @@ def test_many_frames_are_scored_as_the_few_they_were_made_from(true_motion, fram
 
 
 @pytest.mark.parametrize(("estimated", "true"), [(3, 4), (0, 0)])
-def test_trajectories_of_other_lengths_are_refused(estimated, true, true_motion, frame_shape):
+def test_corner_errors_refuse_trajectories_of_different_length(estimated, true, true_motion, frame_shape):
     with pytest.raises(ValueError, match=f"{estimated} "):
         corner_errors(true_motion[:estimated], true_motion[:true], frame_shape)
 
 
-def test_a_frame_trajectory_goes_through_its_frames_and_is_linear_between(true_motion):
+def test_frame_trajectory_interpolates_linearly(true_motion):
     trajectory = FrameTrajectory(true_motion)
     np.testing.assert_array_equal(trajectory.at(np.arange(120)), true_motion)
     np.testing.assert_allclose(trajectory.at([10.25])[0], 0.75 * true_motion[10] + 0.25 * true_motion[11], rtol=1e-12)
     np.testing.assert_array_equal(trajectory.at([-3.0, 500.0]), true_motion[[0, -1]])
 
 
-def test_a_frame_trajectory_of_one_frame_holds_it(true_motion):
+def test_frame_trajectory_of_one_frame_is_constant(true_motion):
     np.testing.assert_array_equal(FrameTrajectory(true_motion[:1]).at([0, 0.5, 1]), true_motion[[0, 0, 0]])
 
 
-def test_the_alignment_maps_the_estimated_plane_to_the_true_one(true_motion, frame_shape):
+def test_align_planes_maps_estimated_plane_to_true_plane(true_motion, frame_shape):
     gauge = translation(7, -3)
     np.testing.assert_allclose(align_planes(gauge @ true_motion, true_motion, frame_shape), inverse(gauge), atol=1e-7)
