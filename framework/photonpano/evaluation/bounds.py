@@ -15,8 +15,8 @@ _NOISELESS = 1e9
 def pair_bound_px(flux: FluxImage, response: Response, first_frames: ArrayLike, second_frames: ArrayLike) -> float:
     """Return the Cramer-Rao bound of registration of two exposures of an unknown scene.
 
-    On the scale on which noise is uniform, the difference of the exposures is Gaussian noise of known variance in each pixel. So
-    the information on the eight parameters of a homography is the sum over pixels of
+    On the scale on which noise is uniform, the difference of the exposures is Gaussian noise of known variance in each pixel.
+    So the information on the eight parameters of a homography is the sum over pixels of
 
         (gradient . motion)^T (gradient . motion) / (variance of the first + variance of the second)
 
