@@ -134,14 +134,14 @@ CASES = {
     "all zero": Case(
         saved(0 * PACKED),
         1,
-        "error: DIR/spec.yaml:2:1: source: no pixel is lit in any of 40 frames looked at all over the capture; "
+        "error: DIR/spec.yaml:2:1: source: no pixel is lit in any of 40 frames sampled all over the capture; "
         "check that the file is the right one, and that the lens was open\n",
     ),
     "all one": Case(
         saved(0 * PACKED + 255),
         1,
-        "error: DIR/spec.yaml:2:1: source: every pixel is lit in all of 40 frames looked at all over the capture, "
-        "so that no flux can be told; "
+        "error: DIR/spec.yaml:2:1: source: every pixel is lit in all of 40 frames sampled all over the capture, "
+        "so the flux cannot be estimated; "
         "check the layout of the file, or expose less\n",
     ),
     "a file in the way": Case(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonpano.captures.picture_files import Picture, require_writable, write_pictures
-from photonpano.captures.preview import Look, pictures, preview_spans, white_flux
+from photonpano.captures.preview import Style, pictures, preview_spans, white_flux
 from photonpano.context import Progress, Quiet
 from photonpano.pipeline.components import build_source
 from photonpano.specs import Plan
@@ -69,12 +69,12 @@ def preview(
         threads = thread_count(plan.run.threads)
         spans = preview_spans(source.info, group_size, step or group_size)
         require_writable(output, len(spans))
-        look = Look(white_flux(source, spans, quantile, threads) if white is None else white, srgb, label)
+        style = Style(white_flux(source, spans, quantile, threads) if white is None else white, srgb, label)
         digits = len(str(source.info.n_frames))
         names = [f"frame_{span.start:0{digits}}" for span in spans]
         with (progress or Quiet()).stage(f"writing {output.name}", len(spans), "pictures") as advance:
-            write_pictures(output, _counted(pictures(source, spans, look, threads), advance), names, fps)
-        return Preview(output, len(spans), len(spans[0]), look.white_flux, source.info)
+            write_pictures(output, _counted(pictures(source, spans, style, threads), advance), names, fps)
+        return Preview(output, len(spans), len(spans[0]), style.white_flux, source.info)
 
 
 def _counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:

@@ -1,4 +1,4 @@
-"""Many pictures as a folder of PNGs, an MP4 or an animated WebP: whole, or absent."""
+"""Write pictures as a folder of PNGs, an MP4 or an animated WebP, whole or not at all."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from photonpano.errors import OutputError
 Picture = NDArray[np.uint8]
 
 MOST_WEBP = 500
-"""An animated WebP is made in memory, and has no more pictures than this."""
+"""Pictures of an animated WebP, which is made in memory."""
 _WEBP_QUALITY, _CRF = 90, "18"
-"""Of lossy compression: hardly to be seen."""
+"""Quality of lossy compression, whose errors are hardly visible."""
 
 
 def require_writable(path: Path, n_pictures: int) -> None:
-    """Refuse what `write_pictures` could not write, before the pictures are made.
+    """Refuse a name that `write_pictures` cannot write, before the pictures are made.
 
     Raises:
-        OutputError: the name tells no format, the format holds fewer pictures, or it needs a library that is not installed.
+        OutputError: no format has this suffix, the format holds fewer pictures, or its library is not installed.
     """
     if path.suffix not in ("", ".mp4", ".webp"):
         raise OutputError(f"cannot write {path}: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp")
@@ -45,10 +45,10 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
     """Write pictures of one size.
 
     Args:
-        path: a folder, which is not there or empty, for PNGs; a file that ends in .mp4 or .webp for a film.
+        path: a new or empty folder for PNGs; a file that ends in .mp4 or .webp for a film.
         pictures: (H, W) uint8 each.
         names: of the PNGs, without suffix, as many as there are pictures.
-        fps: pictures a second of a film.
+        fps: pictures per second of a film.
 
     Raises:
         OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.
@@ -72,7 +72,7 @@ def _png(picture: Picture) -> bytes:
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
-    """Write H.264, whose colours are shared by two by two pixels: an odd row or column at the end is doubled."""
+    """Write H.264, whose sides must be even: an odd row or column at the end is doubled."""
     import av
 
     frames = (np.pad(picture, [(0, side % 2) for side in picture.shape], mode="edge") for picture in pictures)

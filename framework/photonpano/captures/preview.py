@@ -1,4 +1,4 @@
-"""Virtual exposures of a capture as pictures, before any motion is known."""
+"""Make pictures of a capture: each the flux of some frames, summed without any motion."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from photonpano.protocols import Source
 from photonpano.threads import in_order
 from photonpano.values import FluxImage, FrameSpan, StreamInfo
 
-_PROBES = 16
-"""White is chosen from so many exposures all over the capture."""
+_WHITE_EXPOSURES = 16
+"""The white flux is a quantile of 16 exposures all over the capture."""
 _FONT, _FONT_SCALE, _LINE_PX, _MARGIN_PX = cv2.FONT_HERSHEY_PLAIN, 0.8, 14, 3
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """How exposures become pictures.
+class Style:
+    """The rendering style of pictures.
 
     Attributes:
         white_flux: the flux that is white, the same in all pictures.
-        srgb: whether levels follow the sRGB curve, or are in proportion to the flux.
+        srgb: whether levels follow the sRGB curve; otherwise they are proportional to the flux.
         label: whether frames and time are written below each picture.
     """
 
@@ -36,38 +36,38 @@ class Look:
 
 
 def preview_spans(info: StreamInfo, group_size: int, step: int) -> list[FrameSpan]:
-    """Return the frames of each exposure: as many as fit; all frames of a capture that is shorter than one."""
+    """Return the frames of each exposure: those within the capture, or all of a capture that is shorter than one."""
     if info.n_frames < group_size:
         return [info.span]
     return [FrameSpan(start, start + group_size) for start in range(0, info.n_frames - group_size + 1, step)]
 
 
 def white_flux(source: Source, spans: Sequence[FrameSpan], quantile: float, threads: int = 1) -> float:
-    """Return the flux below which this share of the pixels lies, in some of the exposures; 1 where all is dark."""
-    chosen = sorted({round(place) for place in np.linspace(0, len(spans) - 1, _PROBES)})
+    """Return a quantile of the flux of the pixels, over 16 of the exposures; 1 if all are dark."""
+    chosen = sorted({round(place) for place in np.linspace(0, len(spans) - 1, _WHITE_EXPOSURES)})
     exposures = in_order(lambda place: _exposure(source, spans[place]), chosen, threads)
     return float(np.nanquantile(np.stack(list(exposures)), quantile)) or 1.0
 
 
-def pictures(source: Source, spans: Sequence[FrameSpan], look: Look, threads: int = 1) -> Iterator[NDArray[np.uint8]]:
-    """Yield the picture of each exposure, in order: (H, W) uint8, with a strip below it if it has a label."""
+def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: int = 1) -> Iterator[NDArray[np.uint8]]:
+    """Yield the picture of each exposure, in order: (H, W) uint8, and a strip below it for the label."""
 
     def picture(span: FrameSpan) -> NDArray[np.uint8]:
-        image = tone_mapped(_exposure(source, span), look.white_flux, srgb=look.srgb)
-        return np.vstack([image, _label(span, source.info)]) if look.label else image
+        image = tone_mapped(_exposure(source, span), style.white_flux, srgb=style.srgb)
+        return np.vstack([image, _label(span, source.info)]) if style.label else image
 
     return in_order(picture, spans, threads)
 
 
 def _exposure(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the flux of frames that are summed as they lie: (H, W), NaN where a pixel must not be used."""
+    """Return the flux of the sum of some frames: (H, W), NaN where a pixel is masked."""
     still = Chunk(span, np.eye(3))
     flux, _ = accumulate(source, [still], np.eye(3), source.info.frame_shape).estimate(source.response)
     return flux
 
 
 def _label(span: FrameSpan, info: StreamInfo) -> NDArray[np.uint8]:
-    """Return a strip as wide as a frame with the frames of an exposure, and the time of its middle."""
+    """Return a strip as wide as a frame that names the frames of an exposure and the time of its middle."""
     rate = info.frame_rate_hz
     text = str(span) if rate is None else f"{span}  {1000 * span.centre / rate:.3f} ms"
     (width, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)

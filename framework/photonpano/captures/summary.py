@@ -1,4 +1,4 @@
-"""Look at a capture before any motion is known: how bright it is, and how fast its image moves."""
+"""Summarise a capture before any motion is known: its flux, and how fast its image moves."""
 
 from __future__ import annotations
 
@@ -10,103 +10,108 @@ import cv2
 import numpy as np
 
 from photonpano.errors import InputError
+from photonpano.locating import shift_by_phase
 from photonpano.protocols import LinearlyCorrectedSource, Source
-from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
+from photonpano.values import CaptureSummary, FluxImage, FrameSpan
 
 _PLACES = 12
+"""The speed is measured at 12 places, evenly spaced over the capture."""
 _SPANS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-"""Frames that are summed. What crosses the image in the shortest is too fast to be located by anything."""
+"""Lengths of the spans that are summed, in frames, from the shortest to the longest that is tried."""
 _SHORTEST = {"binary": 4, "intensity": 1}
-"""Fewer binary frames than this are noise, whose shifts may agree by chance."""
-_SHARE = 6
-"""No span is longer than this part of the capture."""
-_SIDE = 64
-"""Pixels are added up until the shorter side has about so many: fewer have less noise, and tell shifts less exactly."""
-_EXACT = 2.0
-"""A shift by so many of these larger pixels is told exactly enough."""
-_DETAIL = 1.5
-"""Standard deviation of the Gaussian that the peak of a phase correlation becomes, in larger pixels."""
-_ALIKE = 1.5
-"""Shifts that differ by less than this, in larger pixels, agree. Those between images of noise alone lie anywhere, so that two
-agree by chance once in some hundreds of times, and three hardly ever."""
-
-
+"""The shortest span, in frames: sums of fewer binary frames are mostly noise."""
+_SPANS_IN_CAPTURE = 6
+"""A span is at most a sixth of the capture."""
+_SIDE_PX = 64
+"""Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable."""
+_LARGE_SHIFT_PX = 2.0
+"""Stop lengthening the span once the shift is at least 2 binned pixels."""
+_PEAK_PX = 1.5
+"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_TOLERANCE_PX = 1.5
+"""The three shifts of a place agree within 1.5 binned pixels. Shifts of pure noise agree by chance at fewer than 1 in 100
+places."""
 _CHECKED_PLACES, _CHECKED_FRAMES = 16, 16
-"""Frames are checked at 16 places, 16 at each."""
+"""To find a capture without light, or a saturated one, 16 frames at each of 16 places are summed."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Speed:
-    """What one place tells: the speed in px a frame, and by sums of how many frames."""
+    """The speed at one place, in px per frame, and the length of the spans that it was measured with, in frames."""
 
     px: float
     frames: int
 
 
 def summarise(source: Source, threads: int = 1) -> CaptureSummary:
-    """Measure the flux and the speed at places spread over the capture.
+    """Measure flux and speed at 12 places of a capture.
 
-    At each place three spans side by side are summed, and the shifts between their images are found by phase correlation.
-    Spans grow until the shifts agree, and are long enough to be exact: in the dark short spans tell nothing, and in long ones
-    fast motion is a blur.
+    At each place the frames of three consecutive spans are summed, and phase correlation gives the shifts between the three
+    sums. The spans are lengthened until the shifts agree and are large enough to be exact: short spans are too noisy in the
+    dark, and long spans blur a fast motion.
 
     Args:
         source: the capture.
-        threads: how many places are looked at once; the result does not depend on it.
+        threads: how many places are measured at once; the result does not depend on it.
     """
     n_frames = source.info.n_frames
-    lengths = [length for length in _SPANS if _SHORTEST[source.info.kind] <= length <= n_frames // _SHARE]
+    lengths = [length for length in _SPANS if _SHORTEST[source.info.kind] <= length <= n_frames // _SPANS_IN_CAPTURE]
     if not lengths:
         flux = _mean_flux(source, [_mean_count(source, source.info.span)], n_frames)
-        return CaptureSummary(flux, None, f"{n_frames} frames are too few to tell a motion")
+        return CaptureSummary(flux, None, f"{n_frames} frames are too few to estimate a motion")
     centres = ((np.arange(_PLACES) + 0.5) / _PLACES * n_frames).tolist()
-    with ThreadPoolExecutor(threads, thread_name_prefix="probe") as pool:
-        places = list(pool.map(lambda centre: _look(source, centre, lengths), centres))
+    with ThreadPoolExecutor(threads, thread_name_prefix="summary") as pool:
+        places = list(pool.map(lambda centre: _measure(source, centre, lengths), centres))
     flux = float(np.mean([flux for flux, _ in places]))
-    told = sorted((speed for _, speed in places if speed is not None), key=lambda speed: -speed.px)
-    if len(told) < 2:  # one may agree by chance
-        return CaptureSummary(flux, None, f"no motion can be told at any of {_PLACES} places")
-    how = f"the second fastest of {len(told)} places, from sums of {told[1].frames} frames"
-    return CaptureSummary(flux, told[1].px, how)
+    speeds = sorted((speed for _, speed in places if speed is not None), key=lambda speed: -speed.px)
+    if len(speeds) < 2:  # one may agree by chance
+        return CaptureSummary(flux, None, f"no motion was found at any of {_PLACES} places")
+    how = f"the second fastest of {len(speeds)} places, from sums of {speeds[1].frames} frames"
+    return CaptureSummary(flux, speeds[1].px, how)
 
 
-def _look(source: Source, centre: float, lengths: Sequence[int]) -> tuple[float, _Speed | None]:
-    """Return the mean flux around an instant, and how fast the image moves there, if that can be told."""
+def _measure(source: Source, centre: float, lengths: Sequence[int]) -> tuple[float, _Speed | None]:
+    """Return the mean flux around an instant, and the speed there if it was found."""
     n_frames = source.info.n_frames
-    factor = _factor(source)
+    binning = _binning(source)
     speed = None
     for length in lengths:
         start = int(np.clip(centre - 1.5 * length, 0, n_frames - 3 * length))
         spans = (FrameSpan(first, first + length) for first in range(start, start + 3 * length, length))
         means = [_mean_count(source, span) for span in spans]
-        shift = _common_shift([_image(source, mean, length) for mean in means])
+        shift = _common_shift([_stabilised(source, mean, length) for mean in means])
         if shift is not None:
-            speed = _Speed(shift * factor / length, length)
-            if shift >= _EXACT:
+            speed = _Speed(shift * binning / length, length)
+            if shift >= _LARGE_SHIFT_PX:
                 break
     return _mean_flux(source, means, 3 * length), speed
 
 
 def _common_shift(images: Sequence[FluxImage]) -> float | None:
-    """Return by how much each of three images is shifted against the one before, in its pixels; None if they do not agree."""
+    """Return the shift from each of three images to the next, in their pixels; None if the shifts do not agree."""
     if not all(np.ptp(image) for image in images):
         return None
-    first, second, both = (_shift(images[k], images[j]) for k, j in ((0, 1), (1, 2), (0, 2)))
-    if max(np.linalg.norm(second - first), np.linalg.norm(both - first - second)) > _ALIKE:
+    height, width = images[0].shape
+    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    pairs = ((images[0], images[1]), (images[1], images[2]), (images[0], images[2]))
+    first, second, both = (shift_by_phase(a * window, b * window, _PEAK_PX, gaussian_peak=False) for a, b in pairs)
+    if first is None or second is None or both is None:
+        return None
+    if max(np.linalg.norm(second - first), np.linalg.norm(both - first - second)) > _TOLERANCE_PX:
         return None
     return float(np.linalg.norm(both)) / 2
 
 
-def _factor(source: Source) -> int:
-    """Return the side of a larger pixel, in px."""
-    return max(1, min(source.info.frame_shape) // _SIDE)
+def _binning(source: Source) -> int:
+    """Return the side of a binned pixel, in px."""
+    return max(1, min(source.info.frame_shape) // _SIDE_PX)
 
 
 def _mean_count(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the mean count of a frame of the span in larger pixels; NaN where no pixel is valid."""
-    factor = _factor(source)
-    height, width = (side // factor * factor for side in source.info.frame_shape)
-    size = (width // factor, height // factor)
+    """Return the mean count per frame of a span in binned pixels; NaN where no pixel is valid."""
+    binning = _binning(source)
+    height, width = (side // binning * binning for side in source.info.frame_shape)
+    size = (width // binning, height // binning)
     valid = source.valid[:height, :width].astype(np.float32)
     counts = source.counts(span)
     lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
@@ -118,68 +123,43 @@ def _mean_count(source: Source, span: FrameSpan) -> FluxImage:
 
 
 def _mean_flux(source: Source, means: Sequence[FluxImage], n_frames: int) -> float:
-    """Return the flux, averaged over the pixels, of images that were summed from so many frames together."""
-    flux = source.response.flux(np.mean(means, axis=0), float(n_frames * _factor(source) ** 2))
+    """Return the flux, averaged over the pixels, of mean counts that `n_frames` frames were summed for."""
+    flux = source.response.flux(np.mean(means, axis=0), float(n_frames * _binning(source) ** 2))
     return float(np.nanmean(flux))
 
 
-def _image(source: Source, mean_count: FluxImage, n_frames: int) -> FluxImage:
-    """Return an image on the scale on which its noise is uniform, around 0."""
-    frames = float(n_frames * _factor(source) ** 2)
+def _stabilised(source: Source, mean_count: FluxImage, n_frames: int) -> FluxImage:
+    """Return an image on the scale on which its noise is uniform, with mean 0; 0 where no pixel is valid."""
+    frames = float(n_frames * _binning(source) ** 2)
     image = source.response.stabilised(source.response.flux(mean_count, frames), frames)
     return np.nan_to_num(image - np.nanmean(image))
 
 
-def _shift(first: FluxImage, second: FluxImage) -> FloatArray:
-    """Return by how much the second image is shifted, (y, x) in its pixels, by phase correlation (Kuglin and Hines 1975).
-
-    The fine details count less, since in the dark they are noise.
-    """
-    height, width = first.shape
-    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
-    moved, fixed = (np.fft.rfft2(image * window) for image in (second, first))
-    power = moved * fixed.conj()
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
-    power *= np.exp(-2 * (np.pi * _DETAIL * frequency) ** 2) / np.maximum(np.abs(power), np.finfo(np.float32).tiny)
-    surface = np.fft.irfft2(power, first.shape)
-    peak = np.array(np.unravel_index(np.argmax(surface), surface.shape))
-    size = np.array(surface.shape)
-    shift = np.empty(2)
-    for axis, step in enumerate(np.eye(2, dtype=int)):
-        before, at, after = (surface[tuple((peak + k * step) % size)] for k in (-1, 0, 1))
-        curvature = before - 2 * at + after
-        shift[axis] = peak[axis] + ((before - after) / (2 * curvature) if curvature < 0 else 0)
-    return np.asarray((shift + size / 2) % size - size / 2)
-
-
 def require_photons(source: Source) -> None:
-    """Look at a few frames all over the capture, and refuse one that is all dark or all lit.
+    """Sum 256 frames all over the capture, and refuse a capture that is all dark or all lit.
 
     Raises:
         InputError: no pixel, or every pixel, is lit in all of them; of grey levels, all are black, or saturated.
     """
     valid, spans = source.valid, source.info.spread(_CHECKED_PLACES, _CHECKED_FRAMES)
-    seen = sum(map(len, spans))
-    mean_count = sum(source.counts(span)[valid] for span in spans) / np.float32(seen)
+    n_frames = sum(map(len, spans))
+    mean_count = sum(source.counts(span)[valid] for span in spans) / np.float32(n_frames)
     none, most = source.response.mean_count(np.array([0, np.inf], np.float32)).tolist()
     binary = source.info.kind == "binary"
     if mean_count.max() <= none:
         raise InputError(
-            f"no pixel is {'lit' if binary else 'brighter than black'} in any of {seen} frames looked at all over the capture; "
-            "check that the file is the right one, and that the lens was open"
+            f"no pixel is {'lit' if binary else 'brighter than black'} in any of {n_frames} frames sampled all over the "
+            "capture; check that the file is the right one, and that the lens was open"
         )
     if mean_count.min() >= most:
         raise InputError(
-            f"every pixel is {'lit' if binary else 'saturated'} in all of {seen} frames looked at all over the capture, "
-            "so that no flux can be told; check the layout of the file, or expose less"
+            f"every pixel is {'lit' if binary else 'saturated'} in all of {n_frames} frames sampled all over the capture, "
+            "so the flux cannot be estimated; check the layout of the file, or expose less"
         )
 
 
 def saturated_share(source: Source) -> float:
-    """Return how many of the pixels that may be used are at their highest value in all of some hundred frames.
-
-    Their flux is unknown.
-    """
+    """Return the fraction of the valid pixels that have their highest value in all of 256 frames: their flux is unknown."""
     highest = source.response.mean_count(np.array([np.inf], np.float32)).item()
     spans = source.info.spread(_CHECKED_PLACES, _CHECKED_FRAMES)
     full = np.logical_and.reduce([source.counts(span) >= highest * len(span) for span in spans])

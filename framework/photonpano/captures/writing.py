@@ -1,21 +1,29 @@
-"""Captures on disk: any binary source as a packed .npy file, with its truth beside it."""
+"""Write a binary source as a packed .npy file, with its truth beside it."""
 
 from __future__ import annotations
 
 import fcntl
+import io
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.atomic import atomic_path, require_space, resumable_path
-from photonpano.captures.packed_frames import PackedFrames
-from photonpano.errors import InputError, OutputError
-from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, Source
+from photonpano.errors import InputError, OutputError, PluginError
+from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
 from photonpano.threads import in_order
+from photonpano.values import FrameSpan
+
+_BLOCK_BYTES = 8 * 1024**2
+"""Bytes of the frames that are read at once, packed if the source is."""
+_COMPARED_POSITIONS, _COMPARED_FRAMES = 16, 16
+"""To decide whether a partial file belongs to a source, 16 frames at each of 16 positions are compared."""
 
 
 def truth_path(path: Path) -> Path:
@@ -37,19 +45,18 @@ def write_packed(
             `PackedSource` are never unpacked.
         path: the .npy file.
         progress: called with the number of frames written since the last call.
-        threads: how many threads ask the source for frames.
-        resumed: makes the writing one that can be continued: what is written before it is interrupted stays in
-            `part_path(path)`, and if such a file is there already, this is called with the number of frames of the source
-            that it holds; 0 if it is of another capture, and written anew.
+        threads: how many threads read the source.
+        resumed: makes the file resumable: after an interruption it stays as `part_path(path)`, and the next call continues it.
+            Then this is called with the number of frames that it holds; 0 if it is of another capture, and written anew.
 
     Returns:
         The files written, the capture first.
 
     Raises:
-        InputError: the source is not binary, or it takes something out of sums, which bits cannot hold.
-        OutputError: the files cannot be written, or will not fit on the disk. Nothing is left under the final names then, or
+        InputError: the source is not binary, or corrects its sums, which bits cannot hold.
+        OutputError: the files cannot be written, or do not fit on the disk. Nothing is left under the final names then, nor
             when the source fails.
-        PluginError: the source gives frames of another shape than it promises.
+        PluginError: the source returns frames of another shape than it promises.
     """
     if source.info.kind != "binary":
         raise InputError(f"cannot write {path}: packed .npy files hold binary frames, and this source gives intensities")
@@ -83,7 +90,7 @@ def _write_capture(
     packed = PackedFrames(source)
     there = temporary.stat().st_size if temporary.exists() else 0
     require_space(final, packed.n_bytes + truth_bytes - there)
-    # Made before it is known what is in it: another process that writes to it must not be disturbed.
+    # Locked before it is read: another process may be writing it.
     with temporary.open("r+b" if temporary.exists() else "x+b") as file:
         _lock(file, final)
         done = packed.found_in(file) if there else 0
@@ -100,7 +107,7 @@ def _write_capture(
             file.write(frames.data)
             if progress is not None:
                 progress(len(frames))
-        # A disk that is full must show before the truth gets its final name.
+        # A full disk must be noticed before the truth gets its final name.
         file.flush()
         os.fsync(file.fileno())
 
@@ -113,3 +120,66 @@ def _lock(file: BinaryIO, final: Path) -> None:
         except BlockingIOError as error:
             remedy = "wait for it, or choose another name"
             raise OutputError(f"cannot write {final}: another process is writing it; {remedy}") from error
+
+
+class PackedFrames:
+    """A binary source as the content of a packed .npy file."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        info = source.info
+        self._frame = (info.height, -(-info.width // 8))
+        self._read_bytes = math.prod(self._frame if isinstance(source, PackedSource) else info.frame_shape)
+        header = io.BytesIO()
+        shape = (info.n_frames, *self._frame)
+        np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        self.header = header.getvalue()
+
+    @property
+    def n_bytes(self) -> int:
+        """The size of the whole file."""
+        return self.position(self._source.info.n_frames)
+
+    def position(self, frame: int) -> int:
+        """Return where a frame begins in the file."""
+        return len(self.header) + frame * math.prod(self._frame)
+
+    def blocks(self, first: int) -> Iterator[FrameSpan]:
+        """Yield the spans in which the frames are read, from the first on."""
+        n_frames, step = self._source.info.n_frames, max(1, _BLOCK_BYTES // self._read_bytes)
+        for start in range(first, n_frames, step):
+            yield FrameSpan(start, min(start + step, n_frames))
+
+    def of(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span: (n, H, ceil(W / 8)) uint8, contiguous.
+
+        Raises:
+            PluginError: the source returns an array of another shape or type.
+        """
+        source = self._source
+        packed = source.packed(span) if isinstance(source, PackedSource) else np.packbits(source.frames(span), axis=-1)
+        expected = (len(span), *self._frame)
+        if packed.shape != expected or packed.dtype != np.uint8:
+            raise PluginError(
+                f"the source broke its contract at {span}: expected packed frames of uint8 {expected}, "
+                f"got {packed.dtype} {packed.shape}"
+            )
+        return np.ascontiguousarray(packed)
+
+    def found_in(self, file: BinaryIO) -> int:
+        """Return how many frames of this source a file holds: 0 if it has another header or other frames.
+
+        16 frames at each of 16 positions are compared, the last frame among them.
+        """
+        file.seek(0)
+        if file.read(len(self.header)) != self.header:
+            return 0
+        size = file.seek(0, io.SEEK_END)
+        there = min((size - len(self.header)) // math.prod(self._frame), self._source.info.n_frames)
+        length = min(_COMPARED_FRAMES, there)
+        starts = np.linspace(0, there - length, _COMPARED_POSITIONS).astype(int).tolist() if there else []
+        for start in dict.fromkeys(starts):
+            file.seek(self.position(start))
+            if file.read(self.position(length) - len(self.header)) != self.of(FrameSpan(start, start + length)).tobytes():
+                return 0
+        return there

@@ -56,7 +56,7 @@ class HotPixels(Correction):
             how = f"have more than {limit:.2g} dark counts a frame in {self.dark.name}"
         elif decide is not None:
             bad, n_frames = _standing_out(pixels, source, self.threshold)
-            how = f"stand out from their neighbours in {n_frames} frames looked at all over the capture"
+            how = f"stand out from their neighbours in {n_frames} frames sampled all over the capture"
         else:
             return pixels
         if decide is not None:

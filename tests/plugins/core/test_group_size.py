@@ -76,7 +76,7 @@ def test_choose_group_size_reduces_blur_in_bright_light() -> None:
 
 
 def test_choose_group_size_assumes_500_frames_without_speed() -> None:
-    how = "no motion can be told at any of 12 places"
+    how = "no motion was found at any of 12 places"
     assert choice(0.01, None, how=how) == (500, f"{how}, so 500 frames are assumed")
     assert choice(0.01, None, 2000, how) == (
         250,

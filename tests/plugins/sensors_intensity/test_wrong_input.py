@@ -234,15 +234,15 @@ CASES = {
         "image-folder",
         ".",
         pictures(*[SMALL] * 8),
-        "error: DIR/spec.yaml:2:1: source: no pixel is brighter than black in any of 8 frames looked at all over the capture; "
+        "error: DIR/spec.yaml:2:1: source: no pixel is brighter than black in any of 8 frames sampled all over the capture; "
         "check that the file is the right one, and that the lens was open\n",
     ),
     "a saturated capture": Case(
         "image-folder",
         ".",
         pictures(*[SMALL + 255] * 8),
-        "error: DIR/spec.yaml:2:1: source: every pixel is saturated in all of 8 frames looked at all over the capture, "
-        "so that no flux can be told; check the layout of the file, or expose less\n",
+        "error: DIR/spec.yaml:2:1: source: every pixel is saturated in all of 8 frames sampled all over the capture, "
+        "so the flux cannot be estimated; check the layout of the file, or expose less\n",
     ),
 }
 

@@ -10,11 +10,11 @@ from photonpano.captures.summary import require_photons
 from photonpano.photometry import IntensityResponse
 
 DARK = (
-    "no pixel is lit in any of {} frames looked at all over the capture; "
+    "no pixel is lit in any of {} frames sampled all over the capture; "
     "check that the file is the right one, and that the lens was open"
 )
 LIT = (
-    "every pixel is lit in all of {} frames looked at all over the capture, so that no flux can be told; "
+    "every pixel is lit in all of {} frames sampled all over the capture, so the flux cannot be estimated; "
     "check the layout of the file, or expose less"
 )
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, StreamInfo
-from photonpano.captures.preview import Look, pictures, preview_spans, white_flux
+from photonpano.captures.preview import Style, pictures, preview_spans, white_flux
 
-UNLABELLED = Look(white_flux=1.0, label=False)
+UNLABELLED = Style(white_flux=1.0, label=False)
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_levels_are_those_of_the_flux_in_srgb(memory_source: type, ramp: np.ndar
         encoded = np.where(flux <= 0.0031308, 12.92 * flux, 1.055 * flux ** (1 / 2.4) - 0.055)
         assert picture.dtype == np.uint8
         assert np.abs(picture - 255 * encoded).max() <= 0.51
-    (linear,) = pictures(memory_source(ramp), spans[1:], Look(1.0, srgb=False, label=False))
+    (linear,) = pictures(memory_source(ramp), spans[1:], Style(1.0, srgb=False, label=False))
     assert np.abs(linear - 255 * flux).max() <= 0.51
 
 
@@ -65,7 +65,7 @@ def test_pixels_that_must_not_be_used_are_black(memory_source: type) -> None:
 
 def test_a_label_stands_below_and_leaves_the_picture_as_it_is(memory_source: type, ramp: np.ndarray) -> None:
     source, spans = memory_source(ramp), [FrameSpan(0, 100), FrameSpan(500, 600)]
-    plain, labelled = (list(pictures(source, spans, Look(1.0, label=label))) for label in (False, True))
+    plain, labelled = (list(pictures(source, spans, Style(1.0, label=label))) for label in (False, True))
     strips = [each[len(bare) :] for each, bare in zip(labelled, plain, strict=True)]
     for each, bare in zip(labelled, plain, strict=True):
         assert each.shape[1] == bare.shape[1]
@@ -94,7 +94,7 @@ def test_levels_are_those_of_photoncube(tmp_path: Path, memory_source: type, ram
     subprocess.run(command, check=True, capture_output=True)
     files = sorted(theirs.iterdir())
     source = memory_source(ramp)
-    ours = list(pictures(source, preview_spans(source.info, 128, 128), Look(1.0, srgb=curve == "srgb", label=False)))
+    ours = list(pictures(source, preview_spans(source.info, 128, 128), Style(1.0, srgb=curve == "srgb", label=False)))
     assert len(files) == len(ours) == 4
     for file, picture in zip(files, ours, strict=True):
         difference = picture - cv2.imread(str(file), cv2.IMREAD_GRAYSCALE).astype(int)

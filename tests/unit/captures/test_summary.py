@@ -71,7 +71,7 @@ def test_a_capture_that_stands_still_is_slow() -> None:
 def test_a_capture_too_dark_or_without_texture_tells_nothing(flux: float, contrast: float) -> None:
     summary = summarise(Film(lambda frame: 0.3 * frame, 200, flux, contrast))
     assert summary.speed_px is None
-    assert summary.how == "no motion can be told at any of 12 places"
+    assert summary.how == "no motion was found at any of 12 places"
 
 
 def test_pixels_that_are_not_valid_do_not_pretend_to_stand_still() -> None:
@@ -88,7 +88,7 @@ def test_it_does_not_depend_on_the_number_of_threads() -> None:
 def test_a_few_frames_tell_no_motion() -> None:
     summary = summarise(Film(lambda frame: frame, 20, 0.5))
     assert summary.speed_px is None
-    assert summary.how == "20 frames are too few to tell a motion"
+    assert summary.how == "20 frames are too few to estimate a motion"
     assert summary.flux == pytest.approx(0.5, rel=0.1)
 
 

@@ -53,7 +53,7 @@ class TruthfulSource(RandomSource):
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.captures.packed_frames._BLOCK_BYTES", 7 * 6 * 19)
+    monkeypatch.setattr("photonpano.captures.writing._BLOCK_BYTES", 7 * 6 * 19)
 
 
 @pytest.mark.usefixtures("small_blocks")

@@ -88,13 +88,13 @@ def test_convert_refuses_intensities(cube: Path, invoke: Callable[..., Any], mon
 SLOWLY = """
 import time
 from photonpano.cli.app import main
-from photonpano.captures import packed_frames
-packed_frames._BLOCK_BYTES = 20 * 96 * 20
-of = packed_frames.PackedFrames.of
+from photonpano.captures import writing
+writing._BLOCK_BYTES = 20 * 96 * 20
+of = writing.PackedFrames.of
 def slowly(self, span):
     time.sleep(0.05)
     return of(self, span)
-packed_frames.PackedFrames.of = slowly
+writing.PackedFrames.of = slowly
 main()
 """
 

@@ -95,8 +95,8 @@ def test_info_keeps_corrections_in_printed_spec(cube: Path, invoke: Callable[...
 @pytest.mark.parametrize(
     ("value", "flux", "warning"),
     [
-        (0, 0, "no pixel is lit in any of 256 frames looked at all over the capture; check that the file is the right one, "),
-        (255, 7.2, "every pixel is lit in all of 256 frames looked at all over the capture, so that no flux can be told; "),
+        (0, 0, "no pixel is lit in any of 256 frames sampled all over the capture; check that the file is the right one, "),
+        (255, 7.2, "every pixel is lit in all of 256 frames sampled all over the capture, so the flux cannot be estimated; "),
     ],
 )
 def test_info_warns_of_dark_and_saturated_captures(
@@ -133,5 +133,5 @@ def test_info_warns_of_capture_too_short_for_groups(folder: Path, invoke: Callab
     result = invoke("info", "cube.npy")
     assert result.exit_code == 0
     rows = rows_of(result.stdout)
-    assert (rows["speed"], rows["group size"]) == ("5 frames are too few to tell a motion", "unknown")
+    assert (rows["speed"], rows["group size"]) == ("5 frames are too few to estimate a motion", "unknown")
     assert "warning: the capture has 5 frames, " in result.stderr

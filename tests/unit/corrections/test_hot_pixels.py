@@ -56,7 +56,7 @@ def test_the_capture_itself_tells_hot_and_dead_pixels(corrections: Callable) -> 
     source = corrected_source(MemorySource(exposed(np.where(dead, 0, flux + hot))), corrections("hot-pixels"))
     np.testing.assert_array_equal(source.valid, ~(hot | dead))
     assert source.decisions[0].value == (hot | dead).sum()
-    assert "stand out from their neighbours in 2000 frames looked at all over the capture" in source.decisions[0].reason
+    assert "stand out from their neighbours in 2000 frames sampled all over the capture" in source.decisions[0].reason
 
 
 def test_edges_and_lines_of_the_scene_are_no_hot_pixels(corrections: Callable) -> None:
