@@ -10,8 +10,8 @@ import pytest
 
 from photonpano import FrameSpan, Group, Located, NotLocated, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, normalised, rescaled
+from photonpano.motion.level import Level, NamedLocator
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.components import Level, NamedLocator
 from photonpano.threads import one_thread_inside
 
 FRAMES = 10

@@ -19,7 +19,7 @@ from photonpano.threads import in_order, lagging
 from photonpano.values import Edge, FloatArray, Located, NotLocated, VirtualExposure
 
 BRIDGE = 3
-"""An exposure that none of its pairs ties to an earlier one is tried against this many predecessors."""
+"""If no pair of an exposure with earlier ones is located, pairs with this many predecessors are tried."""
 MIN_PAIR_WEIGHT = 0.05
 """Lower bound of a pair's weight. Shared photons carry no new information: their noise agrees with the motion known so far."""
 

@@ -9,8 +9,8 @@ import pytest
 from photonpano import FrameSpan, Group, InputError, PluginError
 from photonpano.context import Context, Quiet
 from photonpano.geometry import from_parameters, inverse, normalised, translation
+from photonpano.motion.level import Level
 from photonpano.motion.loop import ReferencedTrajectory, estimate_motion
-from photonpano.pipeline.components import Level
 from photonpano.specs.settings import GraphSettings
 
 N_FRAMES = 120
