@@ -1,1 +1,1 @@
-"""The plugin with photonpano's own locator: direct alignment of photon counts."""
+"""Locator `direct`: alignment of brightness at the limit of photon noise."""

@@ -1,4 +1,4 @@
-"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+"""Config of the locator; light enough to be imported when plugins are listed."""
 
 from __future__ import annotations
 

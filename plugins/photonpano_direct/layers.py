@@ -1,4 +1,4 @@
-"""One image of a pyramid, with what alignment needs of it."""
+"""A level of an image pyramid, with its derivatives."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 
 class Layer(NamedTuple):
-    """One level of a pyramid.
+    """A level of an image pyramid.
 
     Attributes:
         image: (H, W) float32, variance-stabilised and blurred.
-        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
-        blur_px: standard deviation of the Gaussian that leaves as much of white noise as the blur and the halving did, in px
-            of the layer.
-        gradients: (2, H, W) float32, the derivatives of the image along x and y.
-        smoothed: (2, H, W) float32, the same, blurred once more as the noise was.
+        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 at masked pixels.
+        blur_px: standard deviation of the Gaussian that reduces white noise as much as the blur and the halving did, in px of
+            the layer.
+        gradients: (2, H, W) float32, derivatives of the image along x and y.
+        smoothed: (2, H, W) float32, the gradients, blurred by the same Gaussian once more.
     """
 
     image: NDArray[np.float32]

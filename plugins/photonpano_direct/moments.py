@@ -1,4 +1,4 @@
-"""Sums over the pixels of two images, from which a step of their alignment is made: one look at each pixel."""
+"""Residuals and moments of two images: all sums over pixels that a step of their alignment needs, in one pass."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import run_from, sample_run, visible_columns
 from photonpano_direct.layers import Layer
 
 
 class Buffers(NamedTuple):
-    """Images that a thread writes to again and again: new memory costs more than what is done to it.
+    """Images that a thread reuses, since to allocate them takes longer than to fill them.
 
     Attributes:
         residual: (H, W) float32.
@@ -27,43 +28,43 @@ class Buffers(NamedTuple):
 
 
 @compiled
-def look(
+def residuals_and_moments(
     moving: Layer,
     fixed: Layer,
-    homography: NDArray[np.float64],
+    homography: Homography,
     buffers: Buffers,
-    along_x: NDArray[np.float64],
-    along_y: NDArray[np.float64],
+    moments_x: FloatArray,
+    moments_y: FloatArray,
 ) -> tuple[int, float, float]:
-    """Compare a template with the image that it is aligned to.
+    """Compute the residuals of a template, their weights, and the moments of the weighted residuals times derivatives.
 
-    Coordinates x and y of the sums run from -1 to 1 along the longer side, with 0 in the middle.
+    Moments are in unit coordinates: x and y are 0 in the centre, and run from -1 to 1 along the longer side.
 
     Args:
         moving: the template.
         fixed: the other image, of the same shape.
         homography: (3, 3), pixels of the template to pixels of the fixed image.
-        buffers: their residual becomes the fixed image seen from the template, minus the template, and their weight the inverse
-            variance of that, 0 where one of them saw nothing.
-        along_x: (3, 3), becomes the sums of residual times weight times derivative along x times x^i y^j.
-        along_y: (3, 3), the same for the derivative along y.
+        buffers: output: `residual` is the warped fixed image minus the template, `weight` the inverse variance of the residual,
+            0 where either is masked.
+        moments_x: (3, 3) output: sums of residual times weight times derivative along x times x^i y^j.
+        moments_y: (3, 3) output: the same for the derivative along y.
 
     Returns:
-        The number of pixels that both see, the weighted sum of the squares of their residuals, and the sum of the weights.
+        The number of pixels that both see, the weighted sum of the squared residuals, and the sum of the weights.
     """
     height, width = moving.image.shape
     half = max(height, width) / 2
-    along_x[:] = 0
-    along_y[:] = 0
+    moments_x[:] = 0
+    moments_y[:] = 0
     seen, squares, weights = 0.0, 0.0, 0.0
     across, zero, one = _across(width, half), np.float32(0), np.float32(1)
     for y in range(height):
         _compare(moving, fixed, homography, y, buffers)
-        different, weighted = buffers.residual[y], buffers.weight[y]
+        residual, weight = buffers.residual[y], buffers.weight[y]
         gx, gy = moving.gradients[0][y], moving.gradients[1][y]
         x0, x1, x2, y0, y1, square, count, total = zero, zero, zero, zero, zero, zero, zero, zero
         for t in range(width):
-            x, r, w = across[t], different[t], weighted[t]
+            x, r, w = across[t], residual[t], weight[t]
             wr = w * r
             by_x, by_y = wr * gx[t], wr * gy[t]
             x0 += by_x
@@ -81,18 +82,18 @@ def look(
         power = 1.0
         for j in range(3):
             if j < 2:
-                along_x[0, j] += x0 * power
-                along_x[1, j] += x1 * power
-                along_x[2, j] += x2 * power
-            along_y[0, j] += y0 * power
-            along_y[1, j] += y1 * power
+                moments_x[0, j] += x0 * power
+                moments_x[1, j] += x1 * power
+                moments_x[2, j] += x2 * power
+            moments_y[0, j] += y0 * power
+            moments_y[1, j] += y1 * power
             power *= y_unit
     return int(seen), squares, weights
 
 
 @compiled
-def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: int, buffers: Buffers) -> None:
-    """Subtract row y of the template from what the fixed image shows there; see `look`."""
+def _compare(moving: Layer, fixed: Layer, homography: Homography, y: int, buffers: Buffers) -> None:
+    """Compute residual and weight of row y; see `residuals_and_moments`."""
     height, width = fixed.image.shape
     image, weight, residual, combined = moving.image[y], moving.weight[y], buffers.residual[y], buffers.weight[y]
     zero, tiny = np.float32(0), np.float32(1e-20)
@@ -105,10 +106,10 @@ def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: in
     while x < last:
         run = run_from(homography, x, y, last - x, height, width)
         sample_run(fixed.image, run, residual[x : x + run.size])
-        # Interpolated too: from the nearest pixel, the border would jump.
+        # Weights are interpolated too: with nearest neighbours they would jump at borders.
         sample_run(fixed.weight, run, combined[x : x + run.size])
         x += run.size
-    # One loop for each image that is written to, since only such loops are vectorised.
+    # One loop for each output, since only such loops are vectorised.
     image, weight, residual, combined = image[first:last], weight[first:last], residual[first:last], combined[first:last]
     for t in range(len(image)):
         residual[t] -= image[t]
@@ -118,26 +119,26 @@ def _compare(moving: Layer, fixed: Layer, homography: NDArray[np.float64], y: in
 
 @compiled
 def _across(width: int, half: float) -> NDArray[np.float32]:
-    """Return the coordinates of the pixels of a row: (width,). Loops read them faster than they make them."""
+    """Return the unit coordinates of the pixels of a row: (width,). To read them is faster than to compute them in loops."""
     return ((np.arange(width) - (width - 1) / 2) / half).astype(np.float32)
 
 
 @compiled
-def products(
-    first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32], sums: NDArray[np.float64]
+def derivative_moments(
+    first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32], moments: FloatArray
 ) -> None:
-    """Sum products of the derivatives of two images, times powers of x and y.
+    """Compute the moments of products of the derivatives of two images, in unit coordinates.
 
     Args:
         first: (2, H, W) derivatives of one image along x and y.
         second: (2, H, W) those of the other.
-        weight: (H, W) what each pixel counts.
-        sums: (3, 5, 5), becomes the sums times x^i y^j of the products along x and x, along x and y, and along y and y.
+        weight: (H, W) weights of pixels.
+        moments: (3, 5, 5) output: sums of the products xx, xy and yy times x^i y^j.
     """
     height, width = weight.shape
     half = max(height, width) / 2
     across, zero = _across(width, half), np.float32(0)
-    sums[:] = 0
+    moments[:] = 0
     for y in range(height):
         px, py, qx, qy, w = first[0][y], first[1][y], second[0][y], second[1][y], weight[y]
         xx0, xx1, xx2, xx3, xx4 = zero, zero, zero, zero, zero
@@ -164,19 +165,19 @@ def products(
         power = 1.0
         for j in range(5):
             if j < 3:
-                sums[0, 0, j] += xx0 * power
-                sums[0, 1, j] += xx1 * power
-                sums[0, 2, j] += xx2 * power
-                sums[0, 3, j] += xx3 * power
-                sums[0, 4, j] += xx4 * power
+                moments[0, 0, j] += xx0 * power
+                moments[0, 1, j] += xx1 * power
+                moments[0, 2, j] += xx2 * power
+                moments[0, 3, j] += xx3 * power
+                moments[0, 4, j] += xx4 * power
             if j < 4:
-                sums[1, 0, j] += xy0 * power
-                sums[1, 1, j] += xy1 * power
-                sums[1, 2, j] += xy2 * power
-                sums[1, 3, j] += xy3 * power
-            sums[2, 0, j] += yy0 * power
-            sums[2, 1, j] += yy1 * power
-            sums[2, 2, j] += yy2 * power
+                moments[1, 0, j] += xy0 * power
+                moments[1, 1, j] += xy1 * power
+                moments[1, 2, j] += xy2 * power
+                moments[1, 3, j] += xy3 * power
+            moments[2, 0, j] += yy0 * power
+            moments[2, 1, j] += yy1 * power
+            moments[2, 2, j] += yy2 * power
             power *= y_unit
 
 

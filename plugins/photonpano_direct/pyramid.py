@@ -1,4 +1,4 @@
-"""Pyramids of exposures on the scale on which photon noise is uniform."""
+"""Image pyramids of exposures, on the scale on which photon noise is uniform."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ import cv2
 import numpy as np
 
 from photonpano import VirtualExposure
-from photonpano.locating import View, view_pyramid
+from photonpano.locating import SMALLEST_SIDE, View, view_pyramid
 from photonpano_direct.layers import Layer
 from photonpano_direct.moments import differentiate
 from photonpano_direct.similarity import Details, details_of
 
-_SMALLEST_SIDE = 24
-"""The pyramid ends before an image gets smaller than this, in px."""
-JUDGE = 2
-"""The layer on which images are compared in the end: coarse, so that noise is small and blur hardly counts."""
+_COMPARED = 2
+"""Number of the layer on which aligned images are compared: coarse, so that noise is small and motion blur hardly matters."""
 
 
 class Pyramid(NamedTuple):
@@ -25,28 +23,28 @@ class Pyramid(NamedTuple):
 
     Attributes:
         layers: finest first.
-        details: of the layer of number `JUDGE`, or of the coarsest.
+        details: those of the layer `compared`.
     """
 
     layers: tuple[Layer, ...]
     details: Details
 
     @property
-    def judge(self) -> int:
-        """The number of the layer that the details are of."""
-        return min(JUDGE, len(self.layers) - 1)
+    def compared(self) -> int:
+        """Number of the layer on which aligned images are compared."""
+        return min(_COMPARED, len(self.layers) - 1)
 
 
 def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> Pyramid:
     """Return an exposure and its halves, finest first.
 
     Args:
-        exposure: what is to be aligned.
-        levels: how many layers at most; small images have fewer.
-        blur_px: standard deviation of the Gaussian that quiets photon noise, in px of the exposure.
+        exposure: flux and weight.
+        levels: largest number of layers; small images have fewer.
+        blur_px: standard deviation of the Gaussian blur against photon noise, in px of the exposure.
     """
-    layers = tuple(_layer_of(view) for view in view_pyramid(exposure, blur_px, levels, _SMALLEST_SIDE))
-    return Pyramid(layers, details_of(layers[min(JUDGE, len(layers) - 1)]))
+    layers = tuple(_layer_of(view) for view in view_pyramid(exposure, blur_px, levels, SMALLEST_SIDE))
+    return Pyramid(layers, details_of(layers[min(_COMPARED, len(layers) - 1)]))
 
 
 def _layer_of(view: View) -> Layer:

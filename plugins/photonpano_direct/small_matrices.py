@@ -1,15 +1,15 @@
-"""Products, inverses and roots of small matrices, as loops: those of numpy take a compiler ten times as long to translate."""
+"""Linear algebra of small matrices as loops, which numba compiles ten times as fast as calls of numpy."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photonpano import FloatArray
 from photonpano.compiling import compiled
 
 
 @compiled
-def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+def product(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the product of (n, k) and (k, m) matrices."""
     result = np.zeros((first.shape[0], second.shape[1]))
     for i in range(first.shape[0]):
@@ -20,7 +20,7 @@ def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
 
 
 @compiled
-def dot(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+def dot(first: FloatArray, second: FloatArray) -> float:
     """Return the scalar product of two (k,) vectors."""
     total = 0.0
     for k in range(len(first)):
@@ -29,8 +29,8 @@ def dot(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
 
 
 @compiled
-def transposed(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transpose of a matrix, in the order of memory that is usual."""
+def transposed(matrix: FloatArray) -> FloatArray:
+    """Return the transpose of a matrix as a C-contiguous copy."""
     result = np.empty((matrix.shape[1], matrix.shape[0]))
     for i in range(matrix.shape[0]):
         for j in range(matrix.shape[1]):
@@ -39,7 +39,7 @@ def transposed(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @compiled
-def applied(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def applied(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the product of an (n, k) matrix and a (k,) vector."""
     result = np.empty(matrix.shape[0])
     for i in range(matrix.shape[0]):
@@ -48,7 +48,7 @@ def applied(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray
 
 
 @compiled
-def inverse_homography(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_homography(matrix: FloatArray) -> FloatArray:
     """Return the inverse of a (3, 3) matrix, up to scale: its adjugate."""
     result = np.empty((3, 3))
     for i in range(3):
@@ -60,8 +60,8 @@ def inverse_homography(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @compiled
-def rescaled(homography: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """Return the same motion between images that are both rescaled; what `photonpano.geometry.rescaled` does, for one."""
+def rescaled(homography: FloatArray, scale: float) -> FloatArray:
+    """Return the same motion between images that are both rescaled; `photonpano.geometry.rescaled` for one homography."""
     offset = 0.5 * scale - 0.5
     there = np.array([[scale, 0.0, offset], [0.0, scale, offset], [0.0, 0.0, 1.0]])
     back = np.array([[1 / scale, 0.0, -offset / scale], [0.0, 1 / scale, -offset / scale], [0.0, 0.0, 1.0]])
@@ -69,7 +69,7 @@ def rescaled(homography: NDArray[np.float64], scale: float) -> NDArray[np.float6
 
 
 @compiled
-def scaled_to_one(homography: NDArray[np.float64]) -> NDArray[np.float64]:
+def scaled_to_one(homography: FloatArray) -> FloatArray:
     """Return a homography with h33 = 1."""
     result = np.empty((3, 3))
     for i in range(3):
@@ -79,8 +79,8 @@ def scaled_to_one(homography: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @compiled
-def cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> bool:
-    """Write the lower root of a matrix into zeros; tell whether it is positive definite."""
+def cholesky(matrix: FloatArray, root: FloatArray) -> bool:
+    """Write the lower Cholesky factor into `root`, which holds zeros; return whether the matrix is positive definite."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             left = matrix[i, j]
@@ -96,8 +96,8 @@ def cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> bool:
 
 
 @compiled
-def solve_lower(root: NDArray[np.float64], right: NDArray[np.float64]) -> None:
-    """Replace the right side of R x = right by its solution, for a lower triangular R; right is (n, m)."""
+def solve_lower(root: FloatArray, right: FloatArray) -> None:
+    """Solve R x = right in place, for a lower triangular R and (n, m) right sides."""
     for i in range(len(root)):
         for j in range(right.shape[1]):
             left = right[i, j]
@@ -107,8 +107,8 @@ def solve_lower(root: NDArray[np.float64], right: NDArray[np.float64]) -> None:
 
 
 @compiled
-def solve(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
-    """Replace the right side of linear equations, (n, 1), by their solution; tell whether the matrix is positive definite."""
+def solve(matrix: FloatArray, right: FloatArray) -> bool:
+    """Solve linear equations with an (n, 1) right side in place; return whether the matrix is positive definite."""
     n = len(right)
     root = np.zeros((n, n))
     if not cholesky(matrix, root):

@@ -9,7 +9,7 @@ import pytest
 from photonpano import discover
 
 
-def test_without_the_library_it_is_listed_and_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_locator_is_listed_with_install_hint_if_library_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert discover().find("locator", "pycolmap-two-view").unavailable == (
         "the locator 'pycolmap-two-view' needs pycolmap, which is not installed: "

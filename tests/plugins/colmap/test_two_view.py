@@ -65,7 +65,7 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("true", MOTIONS.values(), ids=MOTIONS)
-def test_known_motions_are_found_and_not_their_inverse(seen_from: Callable, still: Features, true: np.ndarray) -> None:
+def test_two_view_finds_known_motions_and_not_their_inverse(seen_from: Callable, still: Features, true: np.ndarray) -> None:
     motion = located(register(seen_from(true, 1), still))
     assert error_px(motion, true) < 0.2
     assert error_px(motion, inverse(true)) > 10
@@ -73,7 +73,7 @@ def test_known_motions_are_found_and_not_their_inverse(seen_from: Callable, stil
     assert motion.evidence["inliers"] > 100
 
 
-def test_in_the_dark_too(seen_from: Callable) -> None:
+def test_two_view_works_in_the_dark(seen_from: Callable) -> None:
     """At 0.02 photons per pixel per frame, 250 frames."""
     true = MOTIONS["shift"]
     motion = register(seen_from(true, 1, 0.04), locator().describe(seen_from(STILL, 2, 0.04)))
@@ -85,8 +85,8 @@ def noise_free(flux: np.ndarray) -> VirtualExposure:
     return VirtualExposure(flux.astype(np.float32), weight, Group(FrameSpan(0, 250), 0), 1.0, BinaryResponse())
 
 
-def test_pixel_centres_are_integers() -> None:
-    """Blobs between and on pixels: where the library says that they are, it is half a pixel down and to the right."""
+def test_keypoints_have_integer_pixel_centres() -> None:
+    """Blobs between and on pixels; the library's own positions are half a pixel down and to the right."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     true = np.array([[40, 40], [120.5, 40], [200, 40.25], [40.75, 120], [120, 120], [200.5, 120.5]])
     blobs = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * 4**2)) for a, b in true)
@@ -97,8 +97,8 @@ def test_pixel_centres_are_integers() -> None:
     np.testing.assert_allclose(handed_on, found.points, atol=1e-4)
 
 
-def test_a_change_of_scale_shows_a_wrong_half_pixel(street: np.ndarray) -> None:
-    """Where one image is smaller than the other, half a pixel of one is not half a pixel of the other."""
+def test_two_view_is_exact_to_half_a_pixel_between_scales(street: np.ndarray) -> None:
+    """Half a pixel of the smaller image is more than half a pixel of the other."""
     true = translation(20, 15) @ np.diag([0.75, 0.75, 1])
     views = (translation(400, 280) @ motion for motion in (true, STILL))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -108,7 +108,7 @@ def test_a_change_of_scale_shows_a_wrong_half_pixel(street: np.ndarray) -> None:
     assert error_px(register(moving, locator().describe(fixed)), true) < 0.05
 
 
-def test_it_says_how_well_it_knows(seen_from: Callable) -> None:
+def test_information_predicts_corner_errors_over_noisy_pairs(seen_from: Callable) -> None:
     """Over three pairs at 0.1 photons, corners err as much as the information predicts, to a factor of 3."""
     true, frame = MOTIONS["homography"], corners(SHAPE)
     two_view = locator(max_keypoints=400)
@@ -122,8 +122,8 @@ def test_it_says_how_well_it_knows(seen_from: Callable) -> None:
     assert 1 / 3 < np.sqrt(np.mean(np.square(errors)) / np.mean(predicted)) < 3
 
 
-def test_a_motion_known_so_far_tells_what_looks_alike(photograph: Callable) -> None:
-    """A wallpaper of 40 px repeats itself six times across the frame: only the motion known tells which is which."""
+def test_initial_motion_resolves_repeated_texture(photograph: Callable) -> None:
+    """A wallpaper with a period of 40 px, six periods wide."""
     tile = 0.1 + np.random.default_rng(0).random((10, 10)).repeat(4, axis=0).repeat(4, axis=1)
     wallpaper = np.tile(tile, (7, 9))
     two_view = locator()
@@ -134,13 +134,13 @@ def test_a_motion_known_so_far_tells_what_looks_alike(photograph: Callable) -> N
         assert error_px(two_view.register(moving, fixed, translation(4 + 40 * wallpapers, 1)), true) < 0.2
 
 
-def test_a_motion_known_so_far_may_be_wrong(seen_from: Callable, still: Features) -> None:
+def test_two_view_finds_motion_from_wrong_initial_motion(seen_from: Callable, still: Features) -> None:
     true = MOTIONS["rotation"]
     motion = register(seen_from(true, 1), still, translation(30, 0) @ true)
     assert error_px(motion, true) < 0.2
 
 
-def test_the_same_input_gives_the_same_bytes_from_any_thread_in_any_order(seen_from: Callable) -> None:
+def test_result_is_independent_of_threads_and_order(seen_from: Callable) -> None:
     two_view = locator(seed=2**40, max_keypoints=300)
     exposures = [seen_from(translation(9 * index, 0), index) for index in range(3)]
     features = [two_view.describe(each) for each in exposures]
@@ -167,8 +167,8 @@ def masked(exposure: VirtualExposure, unseen: np.ndarray) -> VirtualExposure:
     )
 
 
-def test_what_was_not_seen_does_not_pull(seen_from: Callable) -> None:
-    """A third of both exposures, at the same place, as on a sensor with a dead corner."""
+def test_masked_third_does_not_bias_motion(seen_from: Callable) -> None:
+    """The same third of both exposures, as on a sensor with a dead corner."""
     left = np.arange(SHAPE[1]) < 80 + np.zeros((SHAPE[0], 1))
     two_view, true = locator(), MOTIONS["shift"]
     moving, fixed = (two_view.describe(masked(each, left)) for each in (seen_from(true, 1), seen_from(STILL, 2)))
@@ -177,7 +177,7 @@ def test_what_was_not_seen_does_not_pull(seen_from: Callable) -> None:
 
 
 @pytest.mark.parametrize("what", ["grey", "dark", "unseen", "lit"])
-def test_without_texture_nothing_is_located(photograph: Callable, still: Features, what: str) -> None:
+def test_pair_without_texture_is_rejected(photograph: Callable, still: Features, what: str) -> None:
     two_view = locator(max_keypoints=300)
     wall = photograph(np.full(SHAPE, {"grey": 0.5, "dark": 0.0, "unseen": 0.5, "lit": 50.0}[what]))
     if what == "unseen":
@@ -194,7 +194,7 @@ def test_without_texture_nothing_is_located(photograph: Callable, still: Feature
             )
 
 
-def test_the_largest_keypoints_are_kept(seen_from: Callable, still: Features) -> None:
+def test_describe_keeps_the_largest_keypoints(seen_from: Callable, still: Features) -> None:
     best = locator(max_keypoints=50).describe(seen_from(STILL, 2))
     assert len(still.points) > 300
     assert len(best.points) == len(best.keypoints) == len(best.descriptors.data) == 50

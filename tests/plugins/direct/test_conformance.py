@@ -1,4 +1,4 @@
-"""The locator of this plugin keeps what every locator promises."""
+"""Conformance of the locator."""
 
 from __future__ import annotations
 

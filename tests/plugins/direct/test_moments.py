@@ -1,4 +1,4 @@
-"""Sums over pixels, against the same sums written out."""
+"""Moments against the same sums written out in numpy."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import apply
-from photonpano_direct.moments import Buffers, differentiate, look, products
-from photonpano_direct.pyramid import Layer
+from photonpano_direct.layers import Layer
+from photonpano_direct.moments import Buffers, derivative_moments, differentiate, residuals_and_moments
 
 SHAPE = (31, 47)
 HOMOGRAPHY = np.array([[1.01, 0.02, 3.3], [-0.01, 0.99, -2.63], [1e-4, -2e-4, 1]])
@@ -19,14 +19,14 @@ def images() -> np.ndarray:
 
 
 def places() -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y of all pixels, from -1 to 1 along the longer side."""
+    """Return the unit coordinates of all pixels."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     half = max(SHAPE) / 2
     return (x - (SHAPE[1] - 1) / 2) / half, (y - (SHAPE[0] - 1) / 2) / half
 
 
 def interpolated(image: np.ndarray) -> np.ndarray:
-    """Look at an image from each pixel; NaN outside."""
+    """Warp an image by linear interpolation; NaN outside."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     u, v = apply(HOMOGRAPHY, np.stack([x.ravel(), y.ravel()], axis=-1)).T
     seen = (u >= 0) & (u <= SHAPE[1] - 1) & (v >= 0) & (v <= SHAPE[0] - 1)
@@ -38,14 +38,14 @@ def interpolated(image: np.ndarray) -> np.ndarray:
     return np.where(seen, (1 - b) * upper + b * lower, np.nan).reshape(SHAPE)
 
 
-def test_a_look_compares_and_sums(images: np.ndarray) -> None:
+def test_residuals_and_moments_match_sums_written_out(images: np.ndarray) -> None:
     image, weight, gx, gy, fixed, fixed_weight = images
     weight[:4] = 0
     fixed_weight[:, :5] = 0
     buffers = Buffers(*(np.empty(shape, np.float32) for shape in (SHAPE, SHAPE, (2, *SHAPE))))
     along_x, along_y = np.empty((3, 3)), np.empty((3, 3))
     moving = Layer(image, weight, 1.0, images[2:4].copy(), images[2:4].copy())
-    pixels, squares, weights = look(
+    pixels, squares, weights = residuals_and_moments(
         moving, Layer(fixed, fixed_weight, 1.0, images[:2].copy(), images[:2].copy()), HOMOGRAPHY, buffers, along_x, along_y
     )
     there = interpolated(fixed_weight)
@@ -63,10 +63,10 @@ def test_a_look_compares_and_sums(images: np.ndarray) -> None:
         assert along_y[i, j] == pytest.approx(np.sum(expected * differs * gy * x**i * y**j), rel=1e-3, abs=1e-3)
 
 
-def test_products_are_summed_with_the_powers_that_are_needed(images: np.ndarray) -> None:
+def test_derivative_moments_match_sums_written_out(images: np.ndarray) -> None:
     first, second, weight = images[:2].copy(), images[2:4].copy(), images[4]
     sums = np.empty((3, 5, 5))
-    products(first, second, weight, sums)
+    derivative_moments(first, second, weight, sums)
     x, y = places()
     xx, yy = weight * first[0] * second[0], weight * first[1] * second[1]
     xy = weight * (first[0] * second[1] + first[1] * second[0]) / 2
@@ -76,7 +76,7 @@ def test_products_are_summed_with_the_powers_that_are_needed(images: np.ndarray)
                 assert sums[index, i, j] == pytest.approx(np.sum(image * x**i * y**j), rel=1e-3, abs=1e-2)
 
 
-def test_derivatives_are_central_differences(images: np.ndarray) -> None:
+def test_differentiate_gives_central_differences_and_0_at_borders(images: np.ndarray) -> None:
     gradients = np.empty((2, *SHAPE), np.float32)
     differentiate(images[0], gradients)
     np.testing.assert_allclose(gradients[0, :, 1:-1], (images[0, :, 2:] - images[0, :, :-2]) / 2, atol=1e-6)

@@ -25,7 +25,7 @@ def not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("not_installed")
-def test_without_its_libraries_it_is_listed_with_what_to_install() -> None:
+def test_locator_is_listed_with_install_hint_if_library_is_missing() -> None:
     shown = CliRunner().invoke(app, ["plugins", "list", "--kind", "locator"], prog_name="photonpano").stdout
     for name in NAMES:
         assert re.search(rf"^locator +{name} .*\[not installed: photonpano\[kornia\]\]", shown, re.MULTILINE), shown
@@ -34,12 +34,12 @@ def test_without_its_libraries_it_is_listed_with_what_to_install() -> None:
 
 
 @pytest.mark.usefixtures("not_installed")
-def test_without_its_libraries_a_spec_that_names_it_is_wrong() -> None:
+def test_spec_with_locator_is_rejected_if_library_is_missing() -> None:
     with pytest.raises(SpecError, match="pip install"):
         parse_spec({"version": 1, "source": {"use": "simulator"}, "locate": {"use": NAMES[0]}})
 
 
-def test_weights_that_are_not_there_are_a_problem_of_the_spec(tmp_path: Path) -> None:
+def test_missing_weights_are_a_problem_of_the_spec(tmp_path: Path) -> None:
     contribution = discover().find("locator", "kornia-loftr").contribution
     stream = StreamInfo(100, 64, 96, frame_rate_hz=None)
     weights = tmp_path / "loftr.ckpt"
@@ -51,6 +51,6 @@ def test_weights_that_are_not_there_are_a_problem_of_the_spec(tmp_path: Path) ->
     assert contribution.check(config, stream) == ()
 
 
-def test_weights_count_from_the_folder_of_the_spec(tmp_path: Path) -> None:
+def test_path_of_weights_is_relative_to_folder_of_spec(tmp_path: Path) -> None:
     config = KorniaLoftrConfig.model_validate({"weights": "loftr.ckpt"}, context={"directory": tmp_path})
     assert config.weights == tmp_path / "loftr.ckpt"

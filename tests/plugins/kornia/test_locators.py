@@ -1,4 +1,4 @@
-"""What the kit does not ask of the locators that need no weights: starts further off, the dark, what torch shares, memory."""
+"""What the conformance kit does not test of locators without weights: wrong initial motions, darkness, threads, memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BACKENDS = {
     "smnn": ("kornia-features", {"max_keypoints": 400}, 0.3),
     "adalam": ("kornia-features", {"max_keypoints": 400, "matcher": "adalam"}, 0.3),
 }
-"""Locators, what they are told, and their tolerance in px at 0.5 photons per pixel per frame."""
+"""Locators, their configs, and their tolerance in px at 0.5 photons per pixel per frame."""
 SHIFT = translation(20.25, 7.5)
 HOMOGRAPHY = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
 
@@ -60,13 +60,13 @@ def error_px(motion: Located | NotLocated, true: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_motion_known_so_far_is_corrected(backend: str, shot: Callable) -> None:
+def test_locator_corrects_initial_motion_off_by_3_px(backend: str, shot: Callable) -> None:
     motion = register(backend, shot(HOMOGRAPHY, 1), shot(STILL, 2), HOMOGRAPHY @ translation(3, -2))
     assert error_px(motion, HOMOGRAPHY) < BACKENDS[backend][2]
 
 
-def test_what_is_known_so_far_tells_what_looks_alike(backend: str, photograph: Callable) -> None:
-    """A wallpaper of 40 px repeats itself across the frame."""
+def test_initial_motion_resolves_repeated_texture(backend: str, photograph: Callable) -> None:
+    """A wallpaper with a period of 40 px."""
     tile = 0.1 + np.random.default_rng(0).random((10, 10)).repeat(4, axis=0).repeat(4, axis=1)
     wallpaper = np.tile(tile, (6, 8))
     fixed, moving = photograph(wallpaper[20:140, 20:196], 0), photograph(wallpaper[23:143, 27:203], 1)
@@ -74,7 +74,7 @@ def test_what_is_known_so_far_tells_what_looks_alike(backend: str, photograph: C
     assert error_px(register(backend, moving, fixed, translation(45, 2)), true) < BACKENDS[backend][2]
 
 
-def test_in_the_dark_too(backend: str, shot: Callable) -> None:
+def test_locator_works_in_the_dark(backend: str, shot: Callable) -> None:
     """At 0.02 photons per pixel per frame."""
     assert error_px(register(backend, shot(SHIFT, 1, 0.04), shot(STILL, 2, 0.04)), SHIFT) < 0.8
 
@@ -88,8 +88,8 @@ def threads() -> None:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_the_same_input_gives_the_same_bytes_from_any_thread(backend: str, shot: Callable) -> None:
-    """However many threads torch would use, and whatever it would draw next; both are left as they were."""
+def test_result_is_independent_of_threads_and_generator_state(backend: str, shot: Callable) -> None:
+    """Torch's number of threads and its generator are left unchanged."""
     locator = built(backend)
     exposures = [shot(translation(9 * index, 0), index) for index in range(3)]
 
@@ -107,13 +107,13 @@ def test_the_same_input_gives_the_same_bytes_from_any_thread(backend: str, shot:
     assert all_pairs(1) == all_pairs(3)
 
 
-def test_an_exposure_lies_where_it_lies(backend: str, shot: Callable) -> None:
+def test_exposure_registered_to_itself_gives_identity(backend: str, shot: Callable) -> None:
     exposure = shot(STILL)
     assert error_px(register(backend, exposure, exposure), STILL) < 1e-3
 
 
-def test_what_was_not_seen_does_not_pull(backend: str, shot: Callable) -> None:
-    """A third of one exposure is missing."""
+def test_masked_third_does_not_bias_motion(backend: str, shot: Callable) -> None:
+    """A third of one exposure is masked."""
     moving, unseen = shot(SHIFT, 1), np.arange(SHAPE[1]) < 50 + np.zeros((SHAPE[0], 1))
     moving = replace(
         moving, flux=np.where(unseen, np.float32(np.nan), moving.flux), weight=np.where(unseen, np.float32(0), moving.weight)
@@ -121,8 +121,8 @@ def test_what_was_not_seen_does_not_pull(backend: str, shot: Callable) -> None:
     assert error_px(register(backend, moving, shot(STILL, 2)), SHIFT) < 2 * BACKENDS[backend][2]
 
 
-def test_what_is_kept_of_an_exposure_is_small(backend: str, shot: Callable) -> None:
-    """At most what four images of float32 take."""
+def test_description_takes_less_memory_than_four_images(backend: str, shot: Callable) -> None:
+    """Images of float32."""
     described = built(backend).describe(shot(STILL))
     kept = [described] if backend == "smnn" else described
     arrays = [getattr(each, name) for each in kept for name in type(each).__dataclass_fields__]

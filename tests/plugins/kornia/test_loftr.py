@@ -26,7 +26,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def weights() -> dict[str, torch.Tensor]:
-    """Weights of a network that has learned nothing."""
+    """Weights of an untrained network."""
     with torch.random.fork_rng():
         torch.manual_seed(1)
         return kornia.feature.LoFTR(pretrained=None).state_dict()
@@ -44,8 +44,10 @@ def build(file: Path) -> Callable[..., LoftrLocator]:
     return lambda **config: LoftrLocator(KorniaLoftrConfig(weights=file, **config), seed=0)
 
 
-def test_the_network_has_the_weights_of_the_file(weights: dict[str, torch.Tensor], file: Path, tmp_path: Path) -> None:
-    """As a checkpoint of its authors' has them, and bare; the generator of random numbers stays as it was."""
+def test_loftr_from_loads_weights_and_keeps_generator_state(
+    weights: dict[str, torch.Tensor], file: Path, tmp_path: Path
+) -> None:
+    """From a checkpoint of the authors, and from bare tensors."""
     bare = tmp_path / "bare.pt"
     torch.save(weights, bare)
     before = torch.get_rng_state()
@@ -57,7 +59,7 @@ def test_the_network_has_the_weights_of_the_file(weights: dict[str, torch.Tensor
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_positions_are_encoded_as_the_weights_were_trained(file: Path) -> None:
+def test_corrected_positions_switch_the_positional_encoding(file: Path) -> None:
     encodings = [
         loftr_from(file, CPU, corrected_positions=corrected, min_confidence=0.2).pos_encoding.pe for corrected in (False, True)
     ]
@@ -70,7 +72,7 @@ def refused(path: Path) -> str:
     return str(caught.value)
 
 
-def test_a_file_with_something_else_in_it_is_refused(weights: dict[str, torch.Tensor], tmp_path: Path) -> None:
+def test_loftr_from_rejects_files_without_weights(weights: dict[str, torch.Tensor], tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
     assert refused(path) == f"there is no file {path} with weights of LoFTR; check the path"
     path.write_bytes(b"not weights")
@@ -91,14 +93,14 @@ def test_a_file_with_something_else_in_it_is_refused(weights: dict[str, torch.Te
     assert refused(path) == f"{path} does not hold the weights of LoFTR: {unknown}"
 
 
-def test_no_code_in_a_file_is_run(tmp_path: Path) -> None:
+def test_loftr_from_runs_no_code_of_the_file(tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
     torch.save(pytest.approx, path)
     assert refused(path) == f"torch cannot read weights from {path}: UnpicklingError"
 
 
-def test_a_network_that_has_learned_nothing_is_certain_of_nothing(build: Callable, shot: Callable) -> None:
-    """The real network is asked."""
+def test_untrained_network_locates_nothing(build: Callable, shot: Callable) -> None:
+    """With the real network."""
     locator = build()
     pair = [locator.describe(shot(STILL, seed)) for seed in range(2)]
     assert locator.register(*pair, None) == NotLocated("0 matches, fewer than min_inliers = 12", {"matches": 0})
@@ -107,7 +109,7 @@ def test_a_network_that_has_learned_nothing_is_certain_of_nothing(build: Callabl
 
 
 def knows(true: np.ndarray, monkeypatch: pytest.MonkeyPatch, wrong: int = 0) -> None:
-    """Make of LoFTR a network that knows the motion: it matches its coarse cells, whose coordinates end in half pixels."""
+    """Replace LoFTR by a network that matches its coarse cells, at half pixels, by the true motion."""
 
     def forward(self: object, data: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         assert data["image0"].shape == data["image1"].shape == (1, 1, *SHAPE)
@@ -127,10 +129,10 @@ TRUE = from_parameters([0.12, 0.05, -0.05, 0.1, 9.0, -4.0, 1e-4, -5e-5])
 
 
 @pytest.mark.parametrize("initial", [None, TRUE, STILL], ids=["unknown", "known", "far off"])
-def test_its_matches_are_those_of_pixel_centres(
+def test_matches_are_converted_to_pixel_centres(
     build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch, initial: np.ndarray | None
 ) -> None:
-    """Half a pixel would move the corners by 0.1 px here. A third of the matches is wrong."""
+    """An error of half a pixel would move the corners by 0.1 px. A third of the matches are outliers."""
     knows(TRUE, monkeypatch, wrong=100)
     locator = build()
     moving, fixed = (locator.describe(shot(STILL, seed)) for seed in range(2))
@@ -140,7 +142,7 @@ def test_its_matches_are_those_of_pixel_centres(
     assert 40 < motion.evidence["inliers"] <= motion.evidence["matches"]
 
 
-def test_what_was_not_seen_is_not_matched(build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matches_in_masked_areas_are_dropped(build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     knows(STILL, monkeypatch)
     locator, half = build(), shot(STILL)
     half.flux[:, :88], half.weight[:, :88] = np.nan, 0
@@ -153,7 +155,7 @@ def test_what_was_not_seen_is_not_matched(build: Callable, shot: Callable, monke
     assert locator.register(fixed, locator.describe(half), None) == NotLocated("all pixels are masked")
 
 
-def test_tiny_images_are_refused(build: Callable, photograph: Callable) -> None:
+def test_images_below_32_px_are_rejected(build: Callable, photograph: Callable) -> None:
     locator = build()
     tiny = locator.describe(photograph(np.full((20, 40), 0.5)))
     assert locator.register(tiny, tiny, None).reason == "the images have 20 x 40 px, LoFTR needs at least 32 along each side"

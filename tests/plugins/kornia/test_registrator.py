@@ -24,8 +24,8 @@ def locator(**config: object) -> RegistratorLocator:
     return RegistratorLocator(KorniaRegistratorConfig.model_validate(config))
 
 
-def test_pixels_are_where_the_warper_of_kornia_thinks_they_are() -> None:
-    """An image of its own coordinates, seen through a homography, shows what the homography maps pixels to."""
+def test_unit_square_matches_pixel_centres_of_kornia_warper() -> None:
+    """Warping an image of coordinates by a homography gives the mapped coordinates."""
     height, width = 20, 30
     homography = translation(2.25, 1.5) @ np.diag([0.8, 0.7, 1]) + np.array([[0, 0.02, 0], [0.01, 0, 0], [1e-4, 2e-4, 0]])
     y, x = np.mgrid[:height, :width].astype(float)
@@ -37,19 +37,19 @@ def test_pixels_are_where_the_warper_of_kornia_thinks_they_are() -> None:
     np.testing.assert_allclose(seen, apply(homography, np.stack([x.ravel(), y.ravel()], axis=1)), atol=1e-4)
 
 
-def test_the_edges_of_an_image_stay_when_it_is_halved() -> None:
-    """Half a pixel: the layers of a pyramid share the coordinates of kornia."""
+def test_unit_square_keeps_edges_of_halved_image() -> None:
+    """So all layers of a pyramid have the same coordinates in kornia."""
     halved = unit_square((40, 60)) @ rescaling(0.5) @ inverse(unit_square((80, 120)))
     np.testing.assert_allclose(halved, STILL, atol=1e-12)
 
 
-def test_the_pyramid_is_finest_first_and_ends_before_it_is_too_small(shot: Callable) -> None:
+def test_pyramid_is_finest_first_and_ends_above_smallest_side(shot: Callable) -> None:
     views = locator().describe(shot(STILL))
     assert [view.shape for view in views] == [(120, 176), (60, 88), (30, 44)]
     assert len(locator(pyramid_levels=1).describe(shot(STILL))) == 1
 
 
-def test_it_says_why_images_do_not_match(shot: Callable) -> None:
+def test_pair_of_different_places_is_rejected_with_reason(shot: Callable) -> None:
     one = locator()
     motion = one.register(one.describe(shot(translation(0, 250), 1)), one.describe(shot(STILL, 2)), STILL)
     assert isinstance(motion, NotLocated)

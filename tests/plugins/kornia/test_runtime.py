@@ -15,8 +15,8 @@ import torch
 from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
 
 
-def test_torch_keeps_to_one_thread_inside_and_gets_its_own_back() -> None:
-    """Also in a thread in which torch was not used before."""
+def test_one_thread_limits_torch_and_restores_its_number() -> None:
+    """Also in a thread that has not used torch before."""
 
     def counts(_: object = None) -> tuple[int, int]:
         with one_thread():
@@ -33,7 +33,7 @@ def test_torch_keeps_to_one_thread_inside_and_gets_its_own_back() -> None:
         torch.set_num_threads(before)
 
 
-def test_a_seed_counts_inside_only() -> None:
+def test_seeded_restores_the_generator_state() -> None:
     before = torch.get_rng_state()
     drawn = []
     for seed in (1, 1, 2):
@@ -44,7 +44,7 @@ def test_a_seed_counts_inside_only() -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_of_missing_gpu_raises_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_of("cpu") == torch.device("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError) as caught:
@@ -55,7 +55,7 @@ def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     )
 
 
-def test_images_are_copied() -> None:
+def test_images_on_copies_images() -> None:
     image = np.zeros((2, 3), np.float32)
     image.flags.writeable = False
     tensor = images_on(torch.device("cpu"), image, image > 0)

@@ -1,4 +1,4 @@
-"""The locators of this plugin keep what every locator promises."""
+"""Conformance of the locators."""
 
 from __future__ import annotations
 

@@ -16,14 +16,14 @@ STILL = np.eye(3)
 LOCATOR = EccLocator(OpencvEccConfig())
 
 
-def test_the_pyramid_is_finest_first_and_ends_before_it_is_too_small(seen_from: Callable) -> None:
+def test_pyramid_is_finest_first_and_ends_above_smallest_side(seen_from: Callable) -> None:
     views = LOCATOR.describe(seen_from(STILL))
     assert [view.shape for view in views] == [(160, 240), (80, 120), (40, 60)]
     assert len(EccLocator(OpencvEccConfig(pyramid_levels=1)).describe(seen_from(STILL))) == 1
 
 
-def test_lamps_may_flicker(seen_from: Callable) -> None:
-    """The correlation coefficient does not change with brightness; what is said of the certainty is less, then."""
+def test_ecc_locates_pair_of_different_brightness_with_less_certainty(seen_from: Callable) -> None:
+    """The correlation coefficient does not depend on brightness; the expected error does."""
     true = translation(10, -3)
     alike, dimmed = (
         LOCATOR.register(LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2, brightness)), None)
@@ -35,7 +35,7 @@ def test_lamps_may_flicker(seen_from: Callable) -> None:
     assert dimmed.residual_px > 2 * alike.residual_px
 
 
-def test_a_level_that_leads_nowhere_is_passed_over(seen_from: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ecc_skips_layers_that_fail(seen_from: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     find = cv2.findTransformECCWithMask
 
     def on_fine_levels_only(moving: np.ndarray, *rest: object) -> object:
@@ -51,8 +51,8 @@ def test_a_level_that_leads_nowhere_is_passed_over(seen_from: Callable, monkeypa
     assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
 
 
-def test_what_opencv_raises_is_a_reason(seen_from: Callable) -> None:
-    """From a start where nothing overlaps, OpenCV raises at every level."""
+def test_ecc_reports_error_of_opencv_as_reason(seen_from: Callable) -> None:
+    """From an initial motion without overlap OpenCV raises on every layer."""
     pair = (LOCATOR.describe(seen_from(each, seed)) for seed, each in enumerate((STILL, STILL)))
     motion = LOCATOR.register(*pair, translation(235, 0))
     assert isinstance(motion, NotLocated)

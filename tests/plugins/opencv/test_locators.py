@@ -1,4 +1,4 @@
-"""What the kit does not ask of locators: far shifts, starts that are further off, the dark, an exposure that saw less."""
+"""What the conformance kit does not test: large shifts, wrong initial motions, darkness, masked areas."""
 
 from __future__ import annotations
 
@@ -48,18 +48,18 @@ def error_px(motion: Located | NotLocated, true: np.ndarray) -> float:
     return float(corner_displacements(located(motion).homography, true, SHAPE).mean())
 
 
-def test_a_far_shift_is_found(name: str, seen_from: Callable) -> None:
+def test_locator_finds_shift_of_48_px(name: str, seen_from: Callable) -> None:
     true = translation(-48, 0)
     assert error_px(register(name, seen_from(true, 1), seen_from(STILL, 2)), true) < TOLERANCE_PX[name]
 
 
-def test_a_motion_known_so_far_is_corrected(name: str, seen_from: Callable) -> None:
+def test_locator_corrects_initial_motion_off_by_3_px(name: str, seen_from: Callable) -> None:
     true = SHIFT if name == "phase-correlation" else HOMOGRAPHY
     motion = register(name, seen_from(true, 1), seen_from(STILL, 2), true @ translation(3, -2))
     assert error_px(motion, true) < TOLERANCE_PX[name]
 
 
-def test_in_the_dark_too(name: str, seen_from: Callable) -> None:
+def test_locator_works_in_the_dark(name: str, seen_from: Callable) -> None:
     """At 0.02 photons per pixel per frame."""
     motion = register(name, seen_from(SHIFT, 1, 0.04), seen_from(STILL, 2, 0.04))
     assert error_px(motion, SHIFT) < 3 * TOLERANCE_PX[name]
@@ -73,8 +73,8 @@ def masked(exposure: VirtualExposure, unseen: np.ndarray) -> VirtualExposure:
     )
 
 
-def test_what_was_not_seen_does_not_pull(name: str, seen_from: Callable) -> None:
-    """A third of one exposure is missing, and what stands there in the other is bright."""
+def test_masked_third_does_not_bias_motion(name: str, seen_from: Callable) -> None:
+    """A third of one exposure is masked; in the other it is bright."""
     true = SHIFT
     left = np.arange(SHAPE[1]) < 80 + np.zeros((SHAPE[0], 1))
     motion = register(name, masked(seen_from(true, 1), left), seen_from(STILL, 2))

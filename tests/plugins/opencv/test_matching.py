@@ -11,12 +11,12 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Few values, so that near ties and clear matches both come up."""
+    """Descriptors of few values, so that there are near ties and distinct matches."""
     return unit_descriptors(rng.integers(0, 4, (count, 128), dtype=np.uint8) ** rng.integers(1, 5, (count, 1), dtype=np.uint8))
 
 
 def chosen(moving: np.ndarray, fixed: np.ndarray, allowed: np.ndarray, ratio: float) -> set[tuple[int, int]]:
-    """Do what the docstrings say, pair by pair: mutual nearest, and so many times nearer than the second."""
+    """Match pair by pair: mutual nearest neighbours that pass Lowe's ratio test."""
     distance = np.where(allowed, np.sqrt(np.maximum(2 - 2 * moving.astype(float) @ fixed.T.astype(float), 0)), np.inf)
     pairs = set()
     for i in range(len(moving)):
@@ -30,14 +30,14 @@ def chosen(moving: np.ndarray, fixed: np.ndarray, allowed: np.ndarray, ratio: fl
     return pairs
 
 
-def test_descriptors_become_unit_vectors_of_square_roots() -> None:
+def test_unit_descriptors_are_square_roots_of_length_1() -> None:
     unit = unit_descriptors(np.array([[1, 4, 4] + [0] * 125, [0] * 128], np.uint8))
     np.testing.assert_allclose(unit[0, :3], [1 / 3, 2 / 3, 2 / 3], rtol=1e-6)
     np.testing.assert_array_equal(unit[1], 0)
 
 
 @given(seed=seeds)
-def test_bits_become_unit_vectors_whose_squared_distance_is_hammings(seed: int) -> None:
+def test_unit_bits_have_hamming_distance_as_squared_distance(seed: int) -> None:
     raw = np.random.default_rng(seed).integers(0, 256, (2, 32), dtype=np.uint8)
     first, second = unit_bits(raw)
     differing = np.count_nonzero(np.unpackbits(raw[0]) != np.unpackbits(raw[1]))
@@ -46,7 +46,7 @@ def test_bits_become_unit_vectors_whose_squared_distance_is_hammings(seed: int) 
 
 
 @given(n_moving=counts, n_fixed=counts, seed=seeds)
-def test_everywhere_it_takes_mutual_and_clear_matches(n_moving: int, n_fixed: int, seed: int) -> None:
+def test_match_everywhere_keeps_mutual_distinct_matches(n_moving: int, n_fixed: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     moving, fixed = descriptors(rng, n_moving), descriptors(rng, n_fixed)
     pairs = match_everywhere(moving, fixed, 0.95)
@@ -58,7 +58,9 @@ def test_everywhere_it_takes_mutual_and_clear_matches(n_moving: int, n_fixed: in
 
 
 @given(n_moving=counts, n_fixed=counts, seed=seeds, radius_px=st.floats(1, 200))
-def test_nearby_it_takes_those_among_the_neighbours(n_moving: int, n_fixed: int, seed: int, radius_px: float) -> None:
+def test_match_nearby_keeps_mutual_distinct_matches_within_radius(
+    n_moving: int, n_fixed: int, seed: int, radius_px: float
+) -> None:
     rng = np.random.default_rng(seed)
     moving, fixed = descriptors(rng, n_moving), descriptors(rng, n_fixed)
     predicted, points = rng.uniform(0, 100, (n_moving, 2)), rng.uniform(0, 100, (n_fixed, 2)).astype(np.float32)

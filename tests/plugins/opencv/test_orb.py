@@ -18,8 +18,8 @@ def described(exposure: object, **config: object) -> Keypoints:
     return OrbLocator(OpencvOrbConfig.model_validate(config), seed=0).describe(exposure)
 
 
-def test_keypoints_of_coarse_levels_lie_where_they_are(seen_from: Callable) -> None:
-    """Of an exposure that is turned by half a turn, they lie half a turn away, and not half a pixel beside it."""
+def test_keypoints_of_coarse_levels_are_not_off_by_half_a_pixel(seen_from: Callable) -> None:
+    """The keypoints of an exposure turned by 180 degrees are those of the exposure, turned."""
     exposure = seen_from(np.eye(3))
     here = described(exposure)
     turned = described(replace(exposure, flux=exposure.flux[::-1, ::-1].copy(), weight=exposure.weight[::-1, ::-1].copy()))
@@ -35,8 +35,8 @@ def test_keypoints_of_coarse_levels_lie_where_they_are(seen_from: Callable) -> N
     assert np.abs(np.mean(offsets, axis=0)).max() < 0.1
 
 
-def test_matches_that_round_alike_are_not_taken_for_exact(seen_from: Callable) -> None:
-    """A shift of a third of a pixel, which whole pixels do not show."""
+def test_information_accounts_for_common_rounding_of_keypoints(seen_from: Callable) -> None:
+    """A shift of a third of a pixel, which rounding to whole pixels hides."""
     locator, true = OrbLocator(OpencvOrbConfig(), seed=0), translation(0.3, -0.2)
     motion = locator.register(locator.describe(seen_from(true, 1)), locator.describe(seen_from(np.eye(3), 2)), None)
     assert isinstance(motion, Located)
@@ -44,7 +44,7 @@ def test_matches_that_round_alike_are_not_taken_for_exact(seen_from: Callable) -
     assert np.diag(np.linalg.inv(motion.information)[4:6, 4:6]).min() > 1 / 12
 
 
-def test_the_strongest_keypoints_are_kept(seen_from: Callable) -> None:
+def test_describe_keeps_at_most_max_keypoints(seen_from: Callable) -> None:
     best = described(seen_from(np.eye(3)), max_keypoints=50)
     assert 30 < len(best.points) <= 50
     assert len(best.points) == len(best.sizes)

@@ -19,7 +19,7 @@ LOCATOR = PhaseCorrelationLocator(PhaseCorrelationConfig())
 
 
 def waves(x_px: float, y_px: float) -> View:
-    """An image of forty waves that do not repeat in it, moved by so much: band-limited, so that it can be moved exactly."""
+    """A sum of 40 plane waves, shifted: band-limited, so that the shift is exact."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:80, :120]
     image = np.zeros(x.shape)
@@ -30,19 +30,19 @@ def waves(x_px: float, y_px: float) -> View:
 
 @settings(max_examples=30, deadline=None)
 @given(x_px=st.floats(-8, 8), y_px=st.floats(-8, 8))
-def test_shifts_are_found_between_pixels(x_px: float, y_px: float) -> None:
+def test_phase_correlation_finds_sub_pixel_shifts(x_px: float, y_px: float) -> None:
     motion = LOCATOR.register(waves(0, 0), waves(x_px, y_px), None)
     assert isinstance(motion, Located), motion
     np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.2)
 
 
-def test_without_contrast_there_is_no_shift() -> None:
+def test_shift_between_returns_none_without_contrast() -> None:
     flat = View(np.ones(SHAPE, np.float32), np.ones(SHAPE, np.float32), 1.0)
     assert shift_between(flat, flat, 1.5) is None
 
 
-def test_nothing_but_the_shift_is_taken_from_what_is_known(seen_from: Callable) -> None:
-    """Rolls and perspective that no pair measures would be fed back from level to level."""
+def test_phase_correlation_drops_roll_and_perspective_of_initial_motion(seen_from: Callable) -> None:
+    """Otherwise their errors, which no pair measures, would be fed back from level to level."""
     true = translation(37, -11)
     known = true @ from_parameters([0.01, 0.004, -0.006, 0.02, 2, -3, 2e-5, -3e-5])
     exposures = LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2))
@@ -53,9 +53,8 @@ def test_nothing_but_the_shift_is_taken_from_what_is_known(seen_from: Callable) 
         np.testing.assert_allclose(motion.homography, true, atol=0.1)
 
 
-def test_it_says_how_well_it_knows_a_camera_that_also_turns_otherwise(seen_from: Callable) -> None:
-    """Over 20 pairs whose other six parameters are as large as its prior says, errors at the middle of the frame and at its
-    corners are as large as the information predicts, to a factor of 2.5."""
+def test_information_predicts_errors_if_camera_also_rolls(seen_from: Callable) -> None:
+    """Over 20 pairs with six other parameters drawn from the prior, to a factor of 2.5, in the centre and at the corners."""
     rng = np.random.default_rng(3)
     points = np.array([[119.5, 79.5], [0, 0], [239, 159]])
     errors, predicted = [], []
@@ -71,14 +70,14 @@ def test_it_says_how_well_it_knows_a_camera_that_also_turns_otherwise(seen_from:
         errors.append(np.sum((apply(motion.homography, points) - apply(true, points)) ** 2, axis=1))
         j = jacobian(motion.homography, points)
         predicted.append(np.trace(j @ np.linalg.inv(motion.information) @ j.transpose(0, 2, 1), axis1=1, axis2=2))
-    # The turns are a third of what the prior allows, so that they can be told from another place.
+    # The parameters have a third of the standard deviation of the prior, so that the pairs are accepted.
     ratio = 3 * np.sqrt(np.mean(errors, axis=0) / np.mean(predicted, axis=0))
     assert np.all((ratio > 0.4) & (ratio < 2.5)), ratio
 
 
 @pytest.mark.parametrize("brightness", [1.0, 0.1])
-def test_a_shift_is_known_as_well_as_it_says(seen_from: Callable, brightness: float) -> None:
-    """Of cameras that do nothing else, over 12 pairs; p5 and p6 while the rest is held."""
+def test_information_predicts_errors_of_pure_shifts(seen_from: Callable, brightness: float) -> None:
+    """Over 12 pairs; p5 and p6 with the other parameters held."""
     true = translation(10, -3)
     errors, predicted = [], []
     for seed in range(12):
@@ -90,7 +89,7 @@ def test_a_shift_is_known_as_well_as_it_says(seen_from: Callable, brightness: fl
     assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
 
 
-def test_a_camera_that_rolls_is_not_located(seen_from: Callable) -> None:
+def test_phase_correlation_rejects_roll_of_17_degrees(seen_from: Callable) -> None:
     roll = from_parameters([np.cos(0.3) - 1, np.sin(0.3), -np.sin(0.3), np.cos(0.3) - 1, 25, -30, 0, 0])
     motion = LOCATOR.register(LOCATOR.describe(seen_from(roll, 1)), LOCATOR.describe(seen_from(STILL, 2)), None)
     assert isinstance(motion, NotLocated)

@@ -33,7 +33,7 @@ def error_px(motion: Located | NotLocated, true: np.ndarray) -> float:
 
 
 def roll(degrees: float) -> np.ndarray:
-    """Turn about the middle of the frame."""
+    """Return a rotation about the centre of the frame."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     middle = translation((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
     return middle @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ inverse(middle)
@@ -49,8 +49,10 @@ MOTIONS = {
 
 @pytest.mark.parametrize(("brightness", "tolerance_px"), [(1.0, 0.2), (0.2, 0.4)])
 @pytest.mark.parametrize("true", MOTIONS.values(), ids=MOTIONS)
-def test_it_finds_known_motions(seen_from: Callable, true: np.ndarray, brightness: float, tolerance_px: float) -> None:
-    """At 0.5 and 0.1 photons per pixel per frame, 250 frames; from moving to fixed, not the other way."""
+def test_sift_finds_known_motions_and_not_their_inverse(
+    seen_from: Callable, true: np.ndarray, brightness: float, tolerance_px: float
+) -> None:
+    """At 0.5 and 0.1 photons per pixel per frame, 250 frames."""
     moving, fixed = seen_from(true, 1, brightness), seen_from(np.eye(3), 2, brightness)
     motion = located(register(moving, fixed))
     assert error_px(motion, true) < tolerance_px
@@ -60,8 +62,8 @@ def test_it_finds_known_motions(seen_from: Callable, true: np.ndarray, brightnes
     assert 0.02 <= motion.residual_px <= 1
 
 
-def test_it_says_how_well_it_knows(seen_from: Callable) -> None:
-    """Over ten pairs at 0.1 photons, the errors of the corners are as large as the information predicts, to a factor of 3."""
+def test_information_predicts_corner_errors_over_noisy_pairs(seen_from: Callable) -> None:
+    """Over ten pairs at 0.1 photons per pixel per frame, to a factor of 3."""
     true, frame = MOTIONS["perspective"], corners(SHAPE)
     errors, predicted = [], []
     for seed in range(10):
@@ -74,15 +76,15 @@ def test_it_says_how_well_it_knows(seen_from: Callable) -> None:
 
 
 @pytest.mark.parametrize("off_px", [0, 8, 15, 30])
-def test_a_motion_known_so_far_may_be_off(seen_from: Callable, off_px: float) -> None:
-    """Within `search_px` it guides; further off, matches are looked for everywhere."""
+def test_sift_finds_motion_from_wrong_initial_motion(seen_from: Callable, off_px: float) -> None:
+    """Within `search_px` matching is guided; beyond, matches are searched in the whole image."""
     true = MOTIONS["roll"]
     initial = translation(off_px, 0) @ true
     assert error_px(register(seen_from(true, 1), seen_from(np.eye(3), 2), initial), true) < 0.2
 
 
-def test_a_motion_known_so_far_tells_what_looks_alike(photograph: Callable) -> None:
-    """A wallpaper of 40 px repeats itself six times across the frame: only the motion known tells which is which."""
+def test_initial_motion_resolves_repeated_texture(photograph: Callable) -> None:
+    """A wallpaper with a period of 40 px, six periods wide."""
     tile = 0.1 + np.random.default_rng(0).random((10, 10)).repeat(4, axis=0).repeat(4, axis=1)
     wallpaper = np.tile(tile, (7, 9))
     fixed, moving = photograph(wallpaper[20:180, 20:260], 0), photograph(wallpaper[23:183, 27:267], 1)
@@ -97,7 +99,7 @@ def few(motion: Located | NotLocated) -> tuple[str, dict[str, float]]:
     return motion.reason, dict(motion.evidence)
 
 
-def test_without_texture_it_is_not_located_and_says_with_which_numbers(photograph: Callable) -> None:
+def test_pair_without_texture_is_rejected_with_numbers(photograph: Callable) -> None:
     reason, evidence = few(register(photograph(np.full(SHAPE, 0.5), 0), photograph(np.full(SHAPE, 0.5), 1)))
     assert reason == (
         f"{evidence['matches']:.0f} matches, fewer than min_inliers = 12 "
@@ -106,7 +108,7 @@ def test_without_texture_it_is_not_located_and_says_with_which_numbers(photograp
 
 
 @pytest.mark.parametrize("flux", [0.0, np.nan, 6.2146], ids=["dark", "unseen", "lit"])
-def test_nothing_to_see_is_not_located(photograph: Callable, seen_from: Callable, flux: float) -> None:
+def test_dark_masked_or_saturated_exposures_are_rejected(photograph: Callable, seen_from: Callable, flux: float) -> None:
     empty = photograph(np.zeros(SHAPE))
     empty.flux[:] = flux
     if np.isnan(flux):
@@ -119,13 +121,13 @@ def test_nothing_to_see_is_not_located(photograph: Callable, seen_from: Callable
 
 
 @pytest.mark.parametrize("initial", [None, np.eye(3), MOTIONS["roll"]], ids=["unknown", "still", "roll"])
-def test_another_place_is_not_located(seen_from: Callable, initial: np.ndarray | None) -> None:
+def test_pair_of_different_places_is_rejected(seen_from: Callable, initial: np.ndarray | None) -> None:
     few(register(seen_from(translation(0, 330), 0), seen_from(np.eye(3), 1), initial))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_noise_is_not_located_near_the_motion_known_so_far(photograph: Callable, seed: int) -> None:
-    """Hundreds of keypoints of noise find matches near where any motion puts them; they do not agree."""
+def test_noise_is_rejected_with_initial_motion(photograph: Callable, seed: int) -> None:
+    """Hundreds of keypoints of noise match near any predicted position, but do not agree."""
     moving, fixed = (photograph(np.full(SHAPE, 0.5), 2 * seed + index) for index in (0, 1))
     sift = locator()
     features = sift.describe(moving), sift.describe(fixed)
@@ -135,19 +137,19 @@ def test_noise_is_not_located_near_the_motion_known_so_far(photograph: Callable,
 
 
 def features(points: np.ndarray, seed: int = 0) -> Keypoints:
-    """Keypoints that match one to one, each with a descriptor of its own."""
+    """Keypoints that match one to one, with distinct descriptors."""
     descriptors = np.random.default_rng(seed).integers(0, 256, (len(points), 128), dtype=np.uint8)
     return Keypoints(points.astype(np.float32), np.full(len(points), 4, np.float32), descriptors, SHAPE)
 
 
-def test_keypoints_on_a_line_do_not_pin_the_frame_down() -> None:
+def test_keypoints_on_a_line_are_rejected() -> None:
     line = np.stack([np.linspace(10, 230, 40), np.full(40, 80.0)], axis=1)
     moved = line + np.random.default_rng(0).normal(scale=0.3, size=line.shape)
     few(locator().register(features(line), features(moved), None))
 
 
-def test_matches_that_agree_by_chance_are_no_motion() -> None:
-    """Two hundred matches of which none is right; 8 + 0.1 * 200 would have to agree."""
+def test_matches_that_agree_by_chance_are_rejected() -> None:
+    """200 outliers; more than 8 + 0.1 * 200 matches must agree."""
     rng = np.random.default_rng(0)
     points, moved = rng.uniform((0, 0), (239, 159), (2, 200, 2))
     reason, evidence = few(locator().register(features(points), features(moved), None))
@@ -158,7 +160,7 @@ def test_matches_that_agree_by_chance_are_no_motion() -> None:
     assert error_px(locator().register(features(points), features(moved), None), translation(3, 4)) < 0.1
 
 
-def test_a_cluster_of_keypoints_leaves_the_corners_uncertain() -> None:
+def test_clustered_keypoints_are_rejected_for_uncertain_corners() -> None:
     cluster = np.random.default_rng(0).uniform((20, 20), (60, 60), (30, 2))
     moved = cluster + np.random.default_rng(1).normal(scale=0.5, size=cluster.shape)
     reason, evidence = few(locator(max_std_px=0.5).register(features(cluster), features(moved), None))
@@ -167,8 +169,8 @@ def test_a_cluster_of_keypoints_leaves_the_corners_uncertain() -> None:
     assert evidence["inliers"] == 30
 
 
-def test_what_no_camera_does_is_refused() -> None:
-    """Keypoints at half their distances from the middle."""
+def test_implausible_motion_is_rejected() -> None:
+    """Keypoints at half their distances from the centre."""
     points = np.random.default_rng(0).uniform((0, 0), (239, 159), (60, 2))
     assert few(locator().register(features(points), features(0.5 * points + [60, 40]), None))[0] == (
         "the homography changes the area of the image by a factor of 0.25 (at most 2 is plausible), from 60 matches"
@@ -176,7 +178,7 @@ def test_what_no_camera_does_is_refused() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 11])
-def test_few_keypoints_are_few_matches(count: int) -> None:
+def test_too_few_keypoints_are_rejected_with_their_numbers(count: int) -> None:
     points = np.random.default_rng(0).uniform((0, 0), (239, 159), (count, 2))
     for initial in (None, np.eye(3)):
         reason, evidence = few(locator().register(features(points), features(points), initial))
@@ -184,7 +186,7 @@ def test_few_keypoints_are_few_matches(count: int) -> None:
         assert evidence == {"keypoints_moving": count, "keypoints_fixed": count, "matches": evidence["matches"]}
 
 
-def test_the_strongest_keypoints_are_kept(seen_from: Callable) -> None:
+def test_describe_keeps_at_most_max_keypoints(seen_from: Callable) -> None:
     exposure = seen_from(np.eye(3))
     every, best = locator().describe(exposure), locator(max_keypoints=50).describe(exposure)
     assert len(every.points) > 300
@@ -192,7 +194,7 @@ def test_the_strongest_keypoints_are_kept(seen_from: Callable) -> None:
     assert best.shape == SHAPE
 
 
-def test_keypoints_lie_where_something_was_seen(seen_from: Callable) -> None:
+def test_describe_finds_no_keypoints_in_masked_areas(seen_from: Callable) -> None:
     exposure = seen_from(np.eye(3))
     exposure.flux[:, :100], exposure.weight[:, :100] = np.nan, 0
     found = locator().describe(exposure)
@@ -200,7 +202,7 @@ def test_keypoints_lie_where_something_was_seen(seen_from: Callable) -> None:
     assert found.points[:, 0].min() > 98
 
 
-def test_half_of_the_frame_is_enough(seen_from: Callable) -> None:
+def test_sift_locates_half_masked_exposure(seen_from: Callable) -> None:
     true = MOTIONS["shift"]
     moving = seen_from(true, 1)
     moving.flux[:, :100], moving.weight[:, :100] = np.nan, 0

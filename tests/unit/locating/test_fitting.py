@@ -21,14 +21,14 @@ def error_px(homography: np.ndarray) -> float:
     return float(corner_displacements(homography, TRUE, SHAPE).mean())
 
 
-def test_without_noise_it_is_exact() -> None:
+def test_fit_is_exact_without_noise() -> None:
     fit = fit_homography(*matches(0), SIZES, np.eye(3))
     assert error_px(fit.homography) < 1e-4
     assert fit.residual_px == MIN_NOISE_PX
 
 
-def test_the_information_is_that_of_the_scatter() -> None:
-    """Over 100 fits to matches that err by 0.3 px: chi squared of eight parameters has the mean 8."""
+def test_information_predicts_scatter_of_100_fits() -> None:
+    """With errors of 0.3 px: chi squared of eight parameters has the mean 8."""
     chi_squared = []
     for seed in range(100):
         fit = fit_homography(*matches(seed, 0.3), SIZES, TRUE)
@@ -37,8 +37,8 @@ def test_the_information_is_that_of_the_scatter() -> None:
     assert np.mean(chi_squared) == pytest.approx(8, rel=0.2)
 
 
-def test_what_all_matches_err_alike_is_not_averaged_out() -> None:
-    """Over 100 fits to matches that are all off by about 0.3 px, and hardly scatter."""
+def test_rounding_px_keeps_common_error_in_information() -> None:
+    """Over 100 fits to matches with a common error of about 0.3 px and little scatter."""
     chi_squared = []
     for seed in range(100):
         here, there = matches(seed, 0.05)
@@ -49,18 +49,18 @@ def test_what_all_matches_err_alike_is_not_averaged_out() -> None:
     assert np.mean(chi_squared) == pytest.approx(8, rel=0.2)
 
 
-def test_a_quarter_of_wrong_matches_does_little_harm() -> None:
+def test_fit_is_robust_against_a_quarter_of_outliers() -> None:
     here, there = matches(0, 0.3)
     clean = fit_homography(here, there, SIZES, TRUE)
     there[:30] += np.random.default_rng(1).uniform(-4, 4, (30, 2)).astype(np.float32)
     wrong = fit_homography(here, there, SIZES, TRUE)
     assert error_px(wrong.homography) < 2.5 * error_px(clean.homography) + 0.05
-    # It cannot know which of them are wrong, and says that it is less certain.
+    # The outliers are unknown, so the residual is larger.
     assert 2 * clean.residual_px < wrong.residual_px < 1.5
 
 
-def test_large_keypoints_count_less() -> None:
-    """Where they err in proportion to their sizes, this is better than to count all alike."""
+def test_weights_by_keypoint_size_lower_the_error() -> None:
+    """For position errors proportional to the sizes."""
     sizes = np.tile(np.float32([2, 20]), 60)
     errors = []
     for weighted in (sizes, SIZES):
@@ -69,7 +69,7 @@ def test_large_keypoints_count_less() -> None:
     assert errors[0] < 0.6 * errors[1]
 
 
-def test_it_tells_how_uncertain_the_corners_are() -> None:
+def test_corner_std_px_predicts_scatter_of_corners() -> None:
     fit = fit_homography(*matches(0, 0.3), SIZES, TRUE)
     errors = [
         corner_displacements(fit_homography(*matches(seed, 0.3), SIZES, TRUE).homography, TRUE, SHAPE) for seed in range(50)
@@ -78,6 +78,6 @@ def test_it_tells_how_uncertain_the_corners_are() -> None:
     assert fit.corner_std_px(SHAPE) == pytest.approx(worst, rel=0.4)
 
 
-def test_a_degenerate_fit_leaves_the_corners_free() -> None:
+def test_corner_std_px_is_large_for_points_on_a_line() -> None:
     line = np.stack([np.linspace(0, 200, 120), np.full(120, 50.0)], axis=1).astype(np.float32)
     assert fit_homography(line, line, SIZES, np.eye(3)).corner_std_px(SHAPE) > 1e3

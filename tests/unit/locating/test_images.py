@@ -27,13 +27,13 @@ def located(motion: Located | NotLocated) -> Located:
 
 
 def corner_std_px(motion: Located) -> float:
-    """Return the expected error of a corner that the information tells."""
+    """Return the expected error of a corner, from the information."""
     to_corners = jacobian(motion.homography, corners(SHAPE)).reshape(8, 8)
     return float(np.sqrt(np.trace(to_corners @ np.linalg.inv(motion.information) @ to_corners.T) / 4))
 
 
 @pytest.mark.parametrize("brightness", [1.0, 0.1])
-def test_the_right_motion_is_believed(seen_from: Callable, brightness: float) -> None:
+def test_true_motion_is_accepted_with_evidence(seen_from: Callable, brightness: float) -> None:
     moving, fixed = seen_from(SHIFT, 1, brightness), seen_from(STILL, 2, brightness)
     motion = located(judged(moving, fixed, SHIFT, evidence={"steps": 7.0}))
     assert motion.homography is SHIFT
@@ -45,7 +45,7 @@ def test_the_right_motion_is_believed(seen_from: Callable, brightness: float) ->
 
 
 def gauss_newton(moving: View, fixed: View) -> np.ndarray:
-    """Return the shift that least squares finds from SHIFT, for a check by an estimator that is known to be efficient."""
+    """Return the shift relative to SHIFT by least squares, an efficient estimator."""
     there = fixed.seen_from(SHIFT)
     inside = (slice(12, -12), slice(12, -12))
     y, x = np.gradient((moving.image + there.image) / 2)
@@ -54,8 +54,8 @@ def gauss_newton(moving: View, fixed: View) -> np.ndarray:
 
 
 @pytest.mark.parametrize("brightness", [1.0, 0.2])
-def test_the_information_is_that_of_the_scatter(seen_from: Callable, brightness: float) -> None:
-    """Of shifts that least squares finds in 30 pairs, against what the information on p5 and p6 says when the rest is held."""
+def test_information_predicts_scatter_of_least_squares_shifts(seen_from: Callable, brightness: float) -> None:
+    """Over 30 pairs, against the information on p5 and p6 with the other parameters held."""
     errors, predicted = [], []
     for seed in range(30):
         moving, fixed = (view_of(seen_from(each, 2 * seed + i, brightness), BLUR_PX) for i, each in enumerate((SHIFT, STILL)))
@@ -65,7 +65,7 @@ def test_the_information_is_that_of_the_scatter(seen_from: Callable, brightness:
     assert np.sqrt(np.mean(errors) / np.mean(predicted)) == pytest.approx(1, abs=0.35)
 
 
-def test_what_a_backend_leaves_alone_is_known_as_cameras_move(seen_from: Callable) -> None:
+def test_parameters_not_estimated_get_weak_prior(seen_from: Callable) -> None:
     moving, fixed = seen_from(SHIFT, 1), seen_from(STILL, 2)
     every = located(judged(moving, fixed, SHIFT))
     shift = located(judged(moving, fixed, SHIFT, free=(4, 5)))
@@ -80,7 +80,7 @@ def test_what_a_backend_leaves_alone_is_known_as_cameras_move(seen_from: Callabl
     assert std_px.min() < 0.2 * corner_std_px(shift)
 
 
-def test_a_misalignment_costs_information(seen_from: Callable) -> None:
+def test_misalignment_lowers_information(seen_from: Callable) -> None:
     moving, fixed = seen_from(SHIFT, 1), seen_from(STILL, 2)
     exact, off = (located(judged(moving, fixed, each)) for each in (SHIFT, translation(1, 0) @ SHIFT))
     assert off.evidence["noise_ratio"] > 3 * exact.evidence["noise_ratio"]
@@ -88,14 +88,14 @@ def test_a_misalignment_costs_information(seen_from: Callable) -> None:
 
 
 @pytest.mark.parametrize("brightness", [1.0, 0.1])
-def test_another_place_does_not_agree(seen_from: Callable, brightness: float) -> None:
+def test_pair_of_different_places_is_rejected_for_similarity(seen_from: Callable, brightness: float) -> None:
     failure = judged(seen_from(translation(0, 330), 1, brightness), seen_from(STILL, 2, brightness), STILL)
     assert isinstance(failure, NotLocated)
     alike = failure.evidence["similarity"]
     assert failure.reason == f"after alignment the similarity of the images is {alike:.2f}, less than min_agreement = 0.5"
 
 
-def test_noise_does_not_agree(photograph: Callable) -> None:
+def test_pair_of_noise_is_rejected(photograph: Callable) -> None:
     walls = (photograph(np.full(SHAPE, 0.5), seed) for seed in (1, 2))
     failure = judged(*walls, STILL)
     assert isinstance(failure, NotLocated)
@@ -108,7 +108,7 @@ def masked(exposure: VirtualExposure, seen: np.ndarray) -> VirtualExposure:
     )
 
 
-def test_too_little_overlap_says_how_much(seen_from: Callable) -> None:
+def test_too_little_overlap_is_rejected_with_its_share(seen_from: Callable) -> None:
     left = np.arange(SHAPE[1]) < 125 + np.zeros((SHAPE[0], 1))
     moving, fixed = masked(seen_from(STILL, 1), left), masked(seen_from(STILL, 2), ~left)
     assert judged(moving, fixed, STILL) == NotLocated(
@@ -117,12 +117,12 @@ def test_too_little_overlap_says_how_much(seen_from: Callable) -> None:
     assert judged(moving, fixed, translation(235, 0)) == NotLocated("the images overlap by 2% (at least 10% is needed)")
 
 
-def test_what_no_camera_does_is_refused(seen_from: Callable) -> None:
+def test_implausible_motion_is_rejected(seen_from: Callable) -> None:
     exposure = seen_from(STILL)
     assert judged(exposure, exposure, np.diag([-1.0, 1, 1])).reason == "the homography mirrors or folds the image"
 
 
-def test_images_that_tell_too_little_are_refused(seen_from: Callable) -> None:
+def test_uncertain_corners_are_rejected(seen_from: Callable) -> None:
     moving, fixed = (view_of(seen_from(STILL, seed, 0.1), BLUR_PX) for seed in (1, 2))
     failure = motion_from_images(moving, fixed, STILL, ImageLimits(max_std_px=0.01))
     assert isinstance(failure, NotLocated)
@@ -130,8 +130,8 @@ def test_images_that_tell_too_little_are_refused(seen_from: Callable) -> None:
     assert failure.reason.endswith("px, more than max_std_px = 0.01")
 
 
-def test_the_information_is_on_the_parameters_of_the_homography(seen_from: Callable) -> None:
-    """A pair and its inverse tell the same of where the corners lie."""
+def test_pair_and_its_inverse_have_equal_corner_errors(seen_from: Callable) -> None:
+    """So the information is that of the parameters of the homography, in its direction."""
     true = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
     moving, fixed = seen_from(true, 1), seen_from(STILL, 2)
     there, back = located(judged(moving, fixed, true)), located(judged(fixed, moving, inverse(true)))

@@ -16,7 +16,7 @@ LIMITS = PointLimits()
 
 
 def matches(count: int = 120, wrong: int = 0, std_px: float = 0.3, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points that move by TRUE and err by 0.3 px; the first of them belong to something else."""
+    """Points that move by TRUE with errors of 0.3 px; the first `wrong` of them are outliers."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((0, 0), (239, 159), (count, 2))
     moved = apply(TRUE, points) + rng.normal(0, std_px, points.shape)
@@ -34,7 +34,7 @@ def lost(motion: Located | NotLocated) -> NotLocated:
     return motion
 
 
-def test_inliers_are_fitted_and_the_others_counted() -> None:
+def test_motion_from_points_fits_inliers_and_counts_outliers() -> None:
     motion = located(motion_from_points(*matches(wrong=30), NEAR, SHAPE, LIMITS, evidence={"keypoints": 400.0}))
     assert corner_displacements(motion.homography, TRUE, SHAPE).mean() < 0.2
     assert corner_displacements(motion.homography, inverse(TRUE), SHAPE).mean() > 10
@@ -42,26 +42,26 @@ def test_inliers_are_fitted_and_the_others_counted() -> None:
     assert motion.evidence == {"keypoints": 400, "matches": 120, "inliers": 90}
 
 
-def test_a_second_round_takes_in_what_the_start_missed() -> None:
+def test_second_round_adds_inliers_that_initial_motion_missed() -> None:
     start = translation(1.8, 0) @ TRUE
     once, twice = (located(motion_from_points(*matches(), start, SHAPE, LIMITS, rounds=rounds)) for rounds in (1, 2))
     assert once.evidence["inliers"] < 90
     assert twice.evidence["inliers"] == 120
 
 
-def test_points_may_be_float32_and_of_different_sizes() -> None:
+def test_motion_from_points_accepts_float32_and_sizes() -> None:
     points, moved = (each.astype(np.float32) for each in matches())
     motion = motion_from_points(points, moved, NEAR, SHAPE, LIMITS, sizes=np.full(120, 4, np.float32))
     assert corner_displacements(located(motion).homography, TRUE, SHAPE).mean() < 0.2
 
 
-def test_too_few_inliers_say_how_many() -> None:
+def test_too_few_inliers_are_rejected_with_their_number() -> None:
     failure = lost(motion_from_points(*matches(40, wrong=29), NEAR, SHAPE, LIMITS))
     assert failure.reason == "11 of 40 matches lie within 2 px of the motion, fewer than min_inliers = 12"
     assert failure.evidence == {"matches": 40, "inliers": 11}
 
 
-def test_a_cluster_leaves_the_corners_uncertain() -> None:
+def test_clustered_points_are_rejected_for_uncertain_corners() -> None:
     points, moved = matches(40)
     near = np.linalg.norm(points - points.mean(axis=0), axis=1) < 60
     failure = lost(motion_from_points(points[near], moved[near], TRUE, SHAPE, PointLimits(max_std_px=0.5)))
@@ -77,14 +77,14 @@ def test_a_cluster_leaves_the_corners_uncertain() -> None:
     ],
     ids=["shrinks", "nan"],
 )
-def test_a_start_that_no_camera_makes_is_refused(start: np.ndarray, reason: str) -> None:
+def test_implausible_initial_motion_is_rejected(start: np.ndarray, reason: str) -> None:
     assert lost(motion_from_points(*matches(), start, SHAPE, LIMITS)).reason == f"{reason}, from 120 matches"
 
 
 @settings(deadline=None)
 @given(count=st.integers(0, 30), seed=st.integers(0, 2**32 - 1), degenerate=st.booleans())
-def test_no_points_make_it_raise(count: int, seed: int, degenerate: bool) -> None:
-    """Also where all of them lie in one place; what is located has an information that can be inverted."""
+def test_motion_from_points_never_raises(count: int, seed: int, degenerate: bool) -> None:
+    """Also for coincident points; the information of a located pair is positive definite."""
     points, moved = matches(count, seed=seed)
     if degenerate:
         points[:], moved[:] = points[:1], moved[:1]

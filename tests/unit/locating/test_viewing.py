@@ -11,8 +11,8 @@ from photonpano.locating import blur_against_noise, stabilised_8_bit, view_of
 SHAPE = (160, 240)
 
 
-def test_noise_is_as_strong_in_the_dark_as_in_the_light(photograph: Callable) -> None:
-    """On a linear scale it would be twenty times as strong."""
+def test_stabilised_8_bit_has_equal_noise_in_dark_and_bright_parts(photograph: Callable) -> None:
+    """On a linear scale the ratio would be 20."""
     flux = np.full(SHAPE, 0.05)
     flux[:, 120:] = 2.0
     image, mask = stabilised_8_bit(photograph(flux), 1.0)
@@ -23,7 +23,7 @@ def test_noise_is_as_strong_in_the_dark_as_in_the_light(photograph: Callable) ->
     assert 0.6 < dark.std() / bright.std() < 1.5
 
 
-def test_single_hot_pixels_do_not_flatten_the_rest(photograph: Callable) -> None:
+def test_stabilised_8_bit_clips_single_hot_pixels(photograph: Callable) -> None:
     flux = np.full(SHAPE, 0.2)
     flux[:, ::2] = 0.3
     calm = stabilised_8_bit(photograph(flux), 0)[0].std()
@@ -31,7 +31,7 @@ def test_single_hot_pixels_do_not_flatten_the_rest(photograph: Callable) -> None
     assert stabilised_8_bit(photograph(flux), 0)[0].std() > 0.8 * calm
 
 
-def test_nothing_leaks_in_from_where_nothing_was_seen(photograph: Callable) -> None:
+def test_stabilised_8_bit_is_not_biased_by_masked_pixels(photograph: Callable) -> None:
     exposure = photograph(np.full(SHAPE, 0.5))
     exposure.flux[:, :100], exposure.weight[:, :100] = np.nan, 0
     exposure.flux[:, 100:] = 0.5
@@ -42,7 +42,7 @@ def test_nothing_leaks_in_from_where_nothing_was_seen(photograph: Callable) -> N
     assert np.ptp(image[:, 100:190]) <= 1
 
 
-def test_an_exposure_that_saw_nothing_is_black(photograph: Callable) -> None:
+def test_stabilised_8_bit_of_masked_exposure_is_black(photograph: Callable) -> None:
     exposure = photograph(np.full(SHAPE, 0.5))
     exposure.flux[:], exposure.weight[:] = np.nan, 0
     image, mask = stabilised_8_bit(exposure, 1.0)
@@ -50,7 +50,7 @@ def test_an_exposure_that_saw_nothing_is_black(photograph: Callable) -> None:
     assert not mask.any()
 
 
-def test_the_dark_is_blurred_more(seen_from: Callable) -> None:
+def test_blur_against_noise_grows_in_the_dark(seen_from: Callable) -> None:
     blurs = [blur_against_noise(seen_from(np.eye(3), 0, brightness)) for brightness in (1.0, 0.1, 0.02, 0.0)]
     assert blurs == sorted(blurs)
     assert (blurs[0], blurs[-1]) == pytest.approx((1.0, 2.5))
@@ -58,7 +58,7 @@ def test_the_dark_is_blurred_more(seen_from: Callable) -> None:
 
 @pytest.mark.parametrize("halvings", [0, 1, 2])
 @pytest.mark.parametrize("blur_px", [0.0, 1.0, 2.0])
-def test_a_view_tells_its_noise(photograph: Callable, blur_px: float, halvings: int) -> None:
+def test_noise_left_predicts_variance_of_blurred_and_halved_noise(photograph: Callable, blur_px: float, halvings: int) -> None:
     view = view_of(photograph(np.full((320, 480), 0.5)), blur_px)
     for _ in range(halvings):
         view = view.halved()
@@ -68,7 +68,7 @@ def test_a_view_tells_its_noise(photograph: Callable, blur_px: float, halvings: 
     assert np.var(view.image[view.seen]) == pytest.approx(predicted, rel=0.15)
 
 
-def test_a_view_bridges_single_pixels_and_ends_before_edges(photograph: Callable) -> None:
+def test_view_interpolates_single_pixels_and_masks_borders(photograph: Callable) -> None:
     exposure = photograph(np.full(SHAPE, 0.5))
     hot = np.zeros(SHAPE, bool)
     hot[50::20, 150::20] = True
@@ -80,7 +80,7 @@ def test_a_view_bridges_single_pixels_and_ends_before_edges(photograph: Callable
     assert seen[5:155, 105:235].all()
 
 
-def test_a_view_of_nothing_sees_nothing(photograph: Callable) -> None:
+def test_view_of_masked_exposure_is_masked(photograph: Callable) -> None:
     exposure = photograph(np.full(SHAPE, 0.5))
     exposure.flux[:], exposure.weight[:] = np.nan, 0
     view = view_of(exposure, 1.0)
@@ -88,8 +88,8 @@ def test_a_view_of_nothing_sees_nothing(photograph: Callable) -> None:
     assert not view.image.any()
 
 
-def test_a_view_can_be_seen_from_another(seen_from: Callable) -> None:
-    """By a whole number of pixels, so that nothing is interpolated; where it does not reach, it saw nothing."""
+def test_seen_from_warps_image_and_mask(seen_from: Callable) -> None:
+    """By a whole number of pixels, so that nothing is interpolated."""
     view = view_of(seen_from(np.eye(3)), 1.0)
     there = view.seen_from(translation(30, -10))
     np.testing.assert_allclose(there.image[10:, :210], view.image[:150, 30:], atol=1e-6)

@@ -1,0 +1,155 @@
+"""Align one layer of an exposure, the template, to that of another, and estimate how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from threading import local
+
+import numpy as np
+
+from photonpano import FloatArray, Homography, NotLocated
+from photonpano.geometry import corners, generators, slopes, unit_coordinates, why_implausible
+from photonpano.locating import ALL_PARAMETERS, NO_TEXTURE, PRIOR_STD
+from photonpano_direct import descent
+from photonpano_direct.curvature import information_of
+from photonpano_direct.layers import Layer
+from photonpano_direct.moments import Buffers
+
+_PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
+"""(8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
+rolls by 1 or 2 degrees and changes the perspective by little."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quality:
+    """How well two images agree.
+
+    Attributes:
+        information: (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images.
+        noise_ratio: mean squared residual relative to that of photon noise.
+        overlap: fraction of the template that both see.
+        std_px: expected error of a corner, in px of the layer.
+    """
+
+    information: FloatArray
+    noise_ratio: float
+    overlap: float
+    std_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """An aligned template.
+
+    Attributes:
+        template: the moving layer.
+        homography: (3, 3), pixels of the template to pixels of the fixed layer.
+        pixels: number of pixels that both see.
+        squares: weighted sum of the squared residuals.
+        weights: sum of the weights, the inverse variances of the residuals.
+        buffers: residual and weight at the last step. They belong to the thread, and are valid until it aligns another template
+            of this shape.
+    """
+
+    template: Layer
+    homography: Homography
+    pixels: int
+    squares: float
+    weights: float
+    buffers: Buffers
+
+    @property
+    def overlap(self) -> float:
+        """Fraction of the template that both see."""
+        return self.pixels / self.template.image.size
+
+    def quality(self) -> Quality:
+        """Return how well the images agree. Overwrites the buffers, so it can be called once."""
+        # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
+        noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
+        geometry = _geometry(self.template.image.shape)
+        information, std_px = information_of(
+            self.template,
+            self.buffers,
+            self.homography,
+            self.pixels,
+            self.weights,
+            noise_ratio,
+            _PRIOR,
+            geometry.generators,
+            geometry.to_corners(ALL_PARAMETERS),
+        )
+        return Quality(information=information, noise_ratio=noise_ratio, overlap=self.overlap, std_px=std_px)
+
+
+def align(
+    template: Layer,
+    fixed: Layer,
+    homography: Homography,
+    prior_mean: Homography,
+    free: tuple[int, ...],
+    tolerance_px: float,
+    max_steps: int,
+) -> Aligned | NotLocated:
+    """Align a template to another layer.
+
+    Args:
+        template: the moving layer.
+        fixed: the other layer, of the same shape.
+        homography: (3, 3) initial map, pixels of the template to pixels of the fixed layer.
+        prior_mean: (3, 3) prior mean of the homography.
+        free: indices of the parameters p1..p8 to estimate.
+        tolerance_px: converged when a step moves no corner further.
+        max_steps: step limit.
+    """
+    shape = template.image.shape
+    geometry, buffers = _geometry(shape), _buffers(shape)
+    status, homography, pixels, squares, weights = descent.descend(
+        template,
+        fixed,
+        homography,
+        prior_mean,
+        _PRIOR,
+        geometry.unit,
+        np.array(free),
+        geometry.to_corners(free),
+        tolerance_px,
+        max_steps,
+        buffers,
+    )
+    if status == descent.CONVERGED:
+        return Aligned(template, homography, pixels, squares, weights, buffers)
+    if status == descent.DIVERGED:
+        return NotLocated(f"the alignment diverges: {why_implausible(homography, (shape[0], shape[1]), 0.0)}")
+    if status == descent.NO_TEXTURE:
+        return NotLocated(NO_TEXTURE)
+    return NotLocated(f"the alignment has not converged after {max_steps} steps")
+
+
+class _Geometry:
+    """Arrays that depend on the shape of a layer only, in a form that compiled functions take."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        homogeneous = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
+        self.unit, self.generators = np.array(unit_coordinates(shape)), np.array(generators(shape))
+        self._to_corners = slopes(homogeneous, self.generators @ homogeneous)
+        self._of_parameters: dict[tuple[int, ...], FloatArray] = {}
+
+    def to_corners(self, free: tuple[int, ...]) -> FloatArray:
+        """Return the derivatives of the corners with respect to some of p1..p8: (8, len(free))."""
+        if free not in self._of_parameters:
+            self._of_parameters[free] = np.ascontiguousarray(self._to_corners[:, list(free)])
+        return self._of_parameters[free]
+
+
+_geometry = cache(_Geometry)
+_of_thread = local()
+
+
+def _buffers(shape: tuple[int, ...]) -> Buffers:
+    """Return the buffers of this thread for images of a shape."""
+    buffers: dict[tuple[int, ...], Buffers] = _of_thread.__dict__.setdefault("buffers", {})
+    if shape not in buffers:
+        buffers[shape] = Buffers(*(np.empty(size, np.float32) for size in (shape, shape, (2, *shape))))
+    return buffers[shape]
