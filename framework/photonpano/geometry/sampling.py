@@ -1,7 +1,7 @@
-"""Rows of pixels seen through a homography: which of them see an image, and which see it next to each other.
+"""Linear interpolation of an image along the rows of a grid that a homography maps to it. Compiled.
 
-Where an image is hardly turned, neighbours on a row see neighbours. Along such a run its pixels are read in the order in which
-they lie in memory, and interpolation can be vectorised.
+Where the homography hardly rotates, neighbours on a row of the grid map to neighbours in the image. Along such a run the image
+is read in the order of memory, so that interpolation is vectorised.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from photonpano.compiling import compiled
 Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
 LONGEST_RUN = 512
-"""So that small numbers stay exact enough in float32."""
+"""Largest size of a run, so that float32 is exact enough."""
 _STEPS = np.arange(LONGEST_RUN, dtype=np.float32)
-"""Counters are turned to float32 by reading them here: loops do it slower than all the rest."""
+"""Precomputed float32 indices: an int-to-float conversion in the loop would dominate it."""
 
 
 class Run(NamedTuple):
-    """Pixels of a row, t = 0, 1, ..., that see `left + t` and its neighbour, in the image's rows `top` and `top + 1`.
+    """Pixels t = 0, 1, ... of a grid row that map between columns `left + t` and `left + t + 1`, rows `top` and `top + 1`.
 
-    Pixel t looks further right by `(a0 + a1 t + a2 t^2) / (1 + slope t)`, and further down by `(b0 + b1 t) / (1 + slope t)`;
-    both are fractions, from 0 to 1.
+    The fraction along x is `(a0 + a1 t + a2 t^2) / (1 + slope t)`, that along y is `(b0 + b1 t) / (1 + slope t)`; both are from
+    0 to 1.
     """
 
     size: int
@@ -43,7 +43,17 @@ class Run(NamedTuple):
 def visible_columns(
     to_image: NDArray[np.float64], y: int, left: float, right: float, top: float, bottom: float, width: int
 ) -> tuple[int, int]:
-    """Return the pixels of a row, half-open, that see a rectangle of the image, border included."""
+    """Return the half-open range of pixels of a grid row that map into a rectangle of the image, border included.
+
+    Args:
+        to_image: (3, 3), pixels of the grid to pixels of the image.
+        y: the row.
+        left: least x of the rectangle.
+        right: largest x.
+        top: least y.
+        bottom: largest y.
+        width: columns of the grid.
+    """
     depth, along = to_image[2, 1] * y + to_image[2, 2], to_image[2, 0]
     u, du = to_image[0, 1] * y + to_image[0, 2], to_image[0, 0]
     v, dv = to_image[1, 1] * y + to_image[1, 2], to_image[1, 0]
@@ -69,13 +79,13 @@ def visible_columns(
 
 @compiled
 def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: int, width: int) -> Run:
-    """Return the run of pixels that starts at (x, y).
+    """Return the run of pixels of a grid row that starts at (x, y).
 
     Args:
         to_image: (3, 3), pixels of the grid to pixels of the image.
-        x: the first pixel, which must see the image, border included, as all must that follow.
-        y: its row.
-        most: how many pixels the row has from there.
+        x: the first pixel. It and the following ones must map into the image, border included: see `visible_columns`.
+        y: the row.
+        most: largest size of the run.
         height: rows of the image.
         width: columns of the image.
     """
@@ -87,7 +97,7 @@ def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: i
     a, b = u - left, v - top
     a1, a2 = to_image[0, 0] * per_depth - left * slope - 1, -slope
     b1 = to_image[1, 0] * per_depth - top * slope
-    # How far both fractions stay between 0 and 1.
+    # The size of the run: both fractions stay between 0 and 1.
     ahead = float(min(most, LONGEST_RUN, width - 1 - left))
     ahead = _positive_until(a, a1, a2, ahead)
     ahead = _positive_until(1 - a, slope - a1, -a2, ahead)
@@ -112,8 +122,8 @@ def sample_run(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
 
     Args:
         image: (h, w) float32 or uint32.
-        run: where its pixels look.
-        into: (run.size,) becomes what they see.
+        run: from `run_from`.
+        into: (run.size,) output.
     """
     pixels, width = image.reshape(-1), image.shape[1]
     above, below = run.top * width + run.left, (run.top + 1) * width + run.left
@@ -133,9 +143,9 @@ def sample_run(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
 
 @compiled
 def _positive_until(constant: float, linear: float, square: float, most: float) -> float:
-    """Return how far a polynomial that is positive at 0 stays so, `most` at most."""
+    """Return the first root of a polynomial that is positive at 0, at most `most`."""
     at_end = constant + most * (linear + most * square)
-    # Where it is concave, its least value lies at an end; where it is convex, perhaps between.
+    # A concave polynomial has its minimum at an end, a convex one perhaps between.
     if at_end >= 0 and (square <= 0 or linear >= 0 or linear + 2 * square * most <= 0):
         return most
     discriminant = linear * linear - 4 * square * constant
@@ -144,5 +154,5 @@ def _positive_until(constant: float, linear: float, square: float, most: float) 
     root = np.sqrt(discriminant)
     if square < 0:
         return float(min(most, (linear + root) / (-2 * square)))
-    # Written so that it holds for a square of 0, too.
+    # In this form it holds for a square of 0 too.
     return float(min(most, 2 * constant / (root - linear)))

@@ -1,4 +1,4 @@
-"""What a homography does to the shape of an image, as a number: fast enough to be asked at every step of an alignment."""
+"""Test whether a homography between two images of one camera is possible. Compiled, for every step of an alignment."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 from photonpano.compiling import compiled
 
 MAX_AREA_CHANGE = 2.0
-"""Two exposures that share the field of view of one camera do not differ more than this in size."""
+"""Largest ratio of the areas of two overlapping images of one camera."""
 MAX_SIDE_CHANGE = 1.5
-"""The same for the ratio of opposite sides, which perspective changes."""
+"""Largest ratio of opposite sides, which perspective changes."""
 PLAUSIBLE, INFINITE, BEHIND, FOLDED, AREA, SIDES = range(6)
-"""What may be wrong: nothing; it is not finite, sends something behind the camera, mirrors or folds, changes the area, or the
-ratio of opposite sides."""
+"""Results of `violation`: possible, not finite, points behind the camera, mirrored or folded, implausible change of the area or
+of the ratio of opposite sides."""
 
 
 @compiled
 def violation(homography: NDArray[np.float64], height: int, width: int) -> tuple[int, float]:
-    """Tell why a homography cannot be that between two images of one camera, and the number that tells it.
+    """Return why a homography between two images of one camera is impossible, and the number that decides; `PLAUSIBLE` if not.
 
     Args:
         homography: (3, 3), pixels of the moving image to pixels of the fixed one.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, from_parameters, generators, jacobian, translation
-from photonpano.locating import View, shift_between
+from photonpano.locating import View
 from photonpano_opencv.configs import PhaseCorrelationConfig
 from photonpano_opencv.phase import PhaseCorrelationLocator
 
@@ -34,11 +34,6 @@ def test_phase_correlation_finds_sub_pixel_shifts(x_px: float, y_px: float) -> N
     motion = LOCATOR.register(waves(0, 0), waves(x_px, y_px), None)
     assert isinstance(motion, Located), motion
     np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.2)
-
-
-def test_shift_between_returns_none_without_contrast() -> None:
-    flat = View(np.ones(SHAPE, np.float32), np.ones(SHAPE, np.float32), 1.0)
-    assert shift_between(flat, flat, 1.5) is None
 
 
 def test_phase_correlation_drops_roll_and_perspective_of_initial_motion(seen_from: Callable) -> None:
