@@ -11,7 +11,7 @@ from photonpano.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from photonpano.api.capture_info import CaptureInfo, info
-    from photonpano.api.captures import WrittenCapture, capture_plan, convert, simulate
+    from photonpano.api.captures import WrittenCapture, convert, simulate
     from photonpano.api.dark_counts import DarkMeasurement, dark
     from photonpano.api.explanation import explain, forecast
     from photonpano.api.pictures import Preview, preview
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
         Trajectory,
     )
     from photonpano.registry import Catalog, discover
-    from photonpano.specs import Plan, load_spec, parse_spec
+    from photonpano.specs import Plan, capture_plan, load_spec, parse_spec
     from photonpano.values import (
         BoolArray,
         CaptureSummary,

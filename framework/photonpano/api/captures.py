@@ -1,8 +1,8 @@
-"""Name a capture, and write it to a packed .npy file."""
+"""Write captures to packed .npy files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,7 @@ from typing import Any
 from photonpano.captures.writing import write_packed
 from photonpano.context import Progress, Quiet
 from photonpano.pipeline.components import build_source
-from photonpano.registry import Catalog
-from photonpano.specs import Plan, parse_spec
+from photonpano.specs import Plan
 from photonpano.threads import thread_count
 from photonpano.values import StreamInfo
 
@@ -33,32 +32,6 @@ class WrittenCapture:
     info: StreamInfo
     n_masked: int
     source: Mapping[str, Any]
-
-
-def capture_plan(
-    path: Path | str,
-    keys: Mapping[str, Any] | None = None,
-    *,
-    source: str = "auto",
-    corrections: Sequence[Any] = (),
-    overrides: Sequence[str] = (),
-    catalog: Catalog | None = None,
-) -> Plan:
-    """Make the plan of a capture without a spec.
-
-    Args:
-        path: the file or folder, relative to the current folder.
-        keys: keys of its source, such as `{"frame_rate_hz": 96_800}`.
-        source: the source that reads it; by default the one that recognises it.
-        corrections: corrections, as in a spec.
-        overrides: other values of the spec, such as `run.threads=2`.
-        catalog: what can be chosen; by default what the installed plugins offer.
-
-    Raises:
-        SpecError: no source recognises the capture, or a key or a correction is wrong.
-    """
-    section = {"use": source, "with": {"path": path, **(keys or {})}}
-    return parse_spec({"version": 1, "source": section, "corrections": list(corrections)}, overrides=overrides, catalog=catalog)
 
 
 def convert(

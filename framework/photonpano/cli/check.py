@@ -13,10 +13,10 @@ def check(spec: SpecPath, overrides: Overrides = None) -> None:
 
     Example: photonpano check scan.yaml
     """
-    from photonpano.cli.options import spec_plan
     from photonpano.pipeline.components import foreseen_groups, open_source
+    from photonpano.specs import load_spec
 
-    plan = spec_plan(spec, overrides)
+    plan = load_spec(spec, overrides or ())
     with open_source(plan) as source:
         count = len(plan.levels)
         levels = f"{'up to ' if plan.until_converged else ''}{count} level{'' if count == 1 else 's'}"

@@ -22,9 +22,9 @@ def explain(
     Example: photonpano explain scan.yaml > resolved.yaml
     """
     from photonpano.api.explanation import explain as explanation
-    from photonpano.cli.options import spec_plan
     from photonpano.registry import discover
+    from photonpano.specs import load_spec
 
     catalog = discover()
-    plan = spec_plan(spec, overrides, catalog=catalog)
+    plan = load_spec(spec, overrides or (), catalog=catalog)
     typer.echo(explanation(plan, with_forecast=forecast, catalog=catalog), nl=False)

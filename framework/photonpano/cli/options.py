@@ -57,29 +57,6 @@ Corrections = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
-SPEC_SUFFIXES = {".yaml", ".yml"}
-
-
-def spec_plan(path: Path, overrides: Sequence[str] | None, output: Path | None = None, catalog: Catalog | None = None) -> Plan:
-    """Load the spec that a command names.
-
-    Raises:
-        SpecError: the spec is wrong.
-        WrongArgumentError: the path is a capture.
-    """
-    from photonpano.cli.errors import WrongArgumentError
-    from photonpano.errors import SpecError
-    from photonpano.specs import load_spec
-
-    try:
-        return load_spec(path, overrides or (), output, catalog)
-    except SpecError:
-        if not _is_spec(path) and _is_capture(path, catalog):
-            raise WrongArgumentError(
-                f"{path} is a capture, and this command takes a spec; `photonpano info {path}` reads it and prints a spec"
-            ) from None
-        raise
-
 
 @contextmanager
 def capture_plan(
@@ -104,9 +81,9 @@ def capture_plan(
         SpecError: the spec is wrong.
         WrongArgumentError: no source recognises the capture, or an option is wrong.
     """
-    from photonpano.api.captures import capture_plan as plan_of_capture
+    from photonpano import specs
     from photonpano.cli.errors import WrongArgumentError
-    from photonpano.specs import load_spec
+    from photonpano.errors import SpecError
 
     for key in keys or ():
         if "=" not in key:
@@ -116,38 +93,13 @@ def capture_plan(
         changes.append(f"source.use={source}")
     if corrections:
         changes.append(f"corrections=[{', '.join(corrections)}]")
-    if _is_spec(path):
-        yield load_spec(path, changes, catalog=catalog)
+    if path.suffix.lower() in specs.SPEC_SUFFIXES:
+        yield specs.load_spec(path, changes, catalog=catalog)
         return
-    with _attributing_to_options(source):
-        yield plan_of_capture(path, overrides=changes, catalog=catalog)
-
-
-@contextmanager
-def _attributing_to_options(source: str | None) -> Iterator[None]:
-    from photonpano.cli.errors import WrongArgumentError
-    from photonpano.errors import SpecError
-
     try:
-        yield
+        yield specs.capture_plan(path, overrides=changes, catalog=catalog)
     except SpecError as error:
         raise WrongArgumentError("\n".join(_message(each, source) for each in error.problems)) from error
-
-
-def _is_capture(path: Path, catalog: Catalog | None) -> bool:
-    """Return whether a source recognises a path, even if it cannot read it."""
-    from photonpano.api.captures import capture_plan as plan_of_capture
-    from photonpano.errors import SpecError
-
-    try:
-        plan_of_capture(path, catalog=catalog)
-    except SpecError as error:
-        return all(problem.where != "source.with.path" for problem in error.problems)
-    return True
-
-
-def _is_spec(path: Path) -> bool:
-    return path.suffix.lower() in SPEC_SUFFIXES
 
 
 def _message(problem: Problem, source: str | None) -> str:

@@ -26,11 +26,11 @@ def run(
     Example: photonpano run scan.yaml --output runs/first --set render.scale=2
     """
     from photonpano.cli.errors import warn
-    from photonpano.cli.options import spec_plan
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.pipeline.run import run as run_plan
+    from photonpano.specs import load_spec
 
-    result = run_plan(spec_plan(spec, overrides, output), progress_for_stderr())
+    result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())
     for warning in result.record["warnings"]:
         warn(warning)
     directory = result.directory.resolve()

@@ -21,8 +21,8 @@ def simulate(
     Example: photonpano simulate capture.yaml --output cube.npy
     """
     from photonpano.api.captures import simulate as write_simulated
-    from photonpano.cli.options import spec_plan
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.tables import print_written
+    from photonpano.specs import load_spec
 
-    print_written(write_simulated(spec_plan(spec, overrides), output, progress_for_stderr()))
+    print_written(write_simulated(load_spec(spec, overrides or ()), output, progress_for_stderr()))

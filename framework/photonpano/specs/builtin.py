@@ -88,7 +88,7 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
     if not path.exists():
         spec.wrong(f"{keys}.path", missing_file(path, "file or folder"))
         return None
-    recognised, failures = _ask_sources(spec.catalog, path)
+    recognised, failures = ask_sources(spec.catalog, path)
     if len(recognised) != 1:
         several = [f"{entry.name} ({answer.because})" for entry, answer in recognised]
         if several:
@@ -113,7 +113,7 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
     return section | {"use": entry.name, "with": found.data | others}
 
 
-def _ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
+def ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
     """Show a path to all sources: return those that recognise it, and a clause for each that raised or broke its contract."""
     recognised: list[tuple[Entry, Recognised]] = []
     failures: list[str] = []

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem, SpecError
 from photonpano.registry import Catalog, discover
+from photonpano.specs.builtin import ask_sources
 from photonpano.specs.resolution import resolve
 from photonpano.specs.written import Place, WrittenSpec, from_python, given, joined
 from photonpano.specs.yaml_reader import read_yaml
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from photonpano.specs.plan import Plan
 
+SPEC_SUFFIXES = {".yaml", ".yml"}
 MAX_BYTES = 2**20
 """The largest size of a spec file: no spec is as long, but a capture that is given by mistake is."""
 
@@ -37,9 +39,14 @@ def load_spec(
     Raises:
         SpecError: the file cannot be read, or the spec is wrong; carries all problems, each with line and column.
     """
-    path = Path(path)
-    text = _read(path)
-    return _load(text, Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog)
+    path, catalog = Path(path), discover() if catalog is None else catalog
+    try:
+        return _load(_read(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog)
+    except SpecError:
+        if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
+            raise
+        message = f"this is a capture, not a spec; `photonpano info {path}` reads it and prints a spec to start from"
+        raise SpecError([Problem("", message, path)]) from None
 
 
 def parse_spec(
@@ -64,7 +71,35 @@ def parse_spec(
     Raises:
         SpecError: the spec is wrong; carries all problems.
     """
+    catalog = discover() if catalog is None else catalog
     return _load(spec, Place(), Path(directory).absolute(), name, overrides, output, catalog)
+
+
+def capture_plan(
+    path: str | Path,
+    keys: Mapping[str, Any] | None = None,
+    *,
+    source: str = "auto",
+    corrections: Sequence[Any] = (),
+    overrides: Sequence[str] = (),
+    catalog: Catalog | None = None,
+) -> Plan:
+    """Make the plan of a capture without a spec.
+
+    Args:
+        path: the file or folder, relative to the current folder.
+        keys: keys of its source, such as `{"frame_rate_hz": 96_800}`.
+        source: the source that reads it; by default the one that recognises it.
+        corrections: corrections, as in a spec.
+        overrides: other values of the spec, such as `run.threads=2`.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        SpecError: no source recognises the capture, or a key or a correction is wrong.
+    """
+    section = {"use": source, "with": {"path": path, **(keys or {})}}
+    spec = {"version": 1, "source": section, "corrections": list(corrections)}
+    return parse_spec(spec, overrides=overrides, catalog=catalog)
 
 
 def _read(path: Path) -> str:
@@ -97,7 +132,7 @@ def _load(
     name: str,
     overrides: Sequence[str],
     output: str | Path | None,
-    catalog: Catalog | None,
+    catalog: Catalog,
 ) -> Plan:
     problems: list[Problem] = []
     written = read_yaml(spec, place, problems) if isinstance(spec, str) else from_python(spec, place)

@@ -143,7 +143,8 @@ def test_spec_command_given_a_capture_names_info(cube: Path, invoke: Callable[..
     result = invoke(command, "cube.npy")
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == (
-        "error: cube.npy is a capture, and this command takes a spec; `photonpano info cube.npy` reads it and prints a spec\n"
+        "cube.npy: this is a capture, not a spec; `photonpano info cube.npy` reads it and prints a spec to start from\n"
+        "error: the spec has 1 problem\n"
     )
 
 
@@ -162,7 +163,7 @@ def test_run_names_info_for_any_recognised_capture(
     arrange(cube.parent / name)
     result = invoke("run", name)
     assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {name} is a capture, and this command takes a spec; ")
+    assert result.stderr.startswith(f"{name}: this is a capture, not a spec; ")
 
 
 def test_run_reports_file_that_is_neither_spec_nor_capture(cube: Path, invoke: Callable[..., Any]) -> None:
