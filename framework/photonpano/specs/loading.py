@@ -143,7 +143,7 @@ def _load(
     for override in overrides:
         _apply_override(written, override)
     _set_output(written, None if output is None else Path(output).absolute(), Path("runs", name))
-    written.directory, written.catalog = directory, discover() if catalog is None else catalog
+    written.directory, written.catalog = directory, catalog
     return resolve(written)
 
 
