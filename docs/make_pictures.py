@@ -1,10 +1,9 @@
-"""Make the pictures of the README and of the docs, from simulated captures.
+"""Make the pictures of the README and of the docs from simulated captures.
 
     python docs/make_pictures.py
 
-Simulates a capture into a folder, `runs/pictures` unless another is given, runs it in several ways, writes the PNG files of
-docs/images, and prints the scores that the docs mention. A capture or a run that is there already is not made
-again.
+Simulates captures into a folder, `runs/pictures` by default, runs them in several ways, writes the PNG files of docs/images,
+and prints the scores that the docs mention. Existing captures and runs are used again.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
 IMAGES = Path(__file__).parent / "images"
 EXAMPLES = Path(__file__).parents[1] / "examples" / "pipelines"
 GAP, LABEL = 8, 26
-"""Pixels between pictures, and above each for its label."""
+"""Pixels between pictures, and above a picture for its label."""
 
 STREET = {
     "version": 1,
@@ -68,7 +67,7 @@ STREET = {
         },
     },
 }
-"""The camera goes to and fro over the street in a tenth of a second, in a trembling hand, in little light."""
+"""The camera scans the street back and forth in a tenth of a second, with tremor, in low light."""
 HIGH_SPEED = {
     "version": 1,
     "source": {
@@ -80,22 +79,22 @@ HIGH_SPEED = {
         },
     },
 }
-"""A conventional camera goes along the street in 0.4 seconds."""
+"""A conventional camera pans along the street in 0.4 seconds."""
 GROUP_SIZE = 125
 LEVELS = ("one level", "two levels", "three levels")
 WAYS = ("scan", "constant groups", "naive average")
-"""Specs of examples/pipelines, on the capture that is beside them."""
+"""Specs of examples/pipelines, for the capture beside them."""
 PLACE = (235, 85)
-"""The middle of the place that is compared, in pixels of the reference frame, which all ways share."""
+"""Centre of the compared place, in pixels of the reference frame, which is the same for all specs."""
 INTERPOLATORS = {
     "geodesic": ("tab:green", "-"),
     "lucas-kanade": ("black", "-"),
     "lie": ("tab:orange", "--"),
     "smoothing-spline": ("tab:blue", "-"),
 }
-"""And the lines that stand for them."""
+"""Interpolators, with the colour and style of their lines."""
 SPACINGS = (125, 31)
-"""Frames between knots: those of the first level of `street_spec`, and those of the third."""
+"""Frames between knots at the first and at the third level of `street_spec`."""
 
 
 def main() -> None:
@@ -141,7 +140,7 @@ def written(plan: Plan, cube: Path) -> Path:
 
 
 def filmed(plan: Plan, path: Path) -> Path:
-    """Write a simulated capture as a video, as a camera does, and its truth."""
+    """Write a simulated capture as a video, with its truth."""
     if not path.exists():
         with open_source(plan) as source, av.open(str(path), "w") as container:
             stream: Any = container.add_stream("libx264", rate=30)
@@ -215,7 +214,7 @@ def high_speed(folder: Path, section: dict[str, Any]) -> Picture:
 
 
 def levels(folder: Path, cube: Path) -> Picture:
-    """Return what one group of frames gives at each level, as the motion becomes known."""
+    """Return the exposure of one group at each level, along the motion of the level before."""
     plan = parse_spec(street_spec(cube))
     known = {
         "level 1: no motion is known": None,
@@ -236,7 +235,7 @@ def levels(folder: Path, cube: Path) -> Picture:
 
 
 def baselines(folder: Path) -> Picture:
-    """Return the same place of the panoramas of several ways, three times as large."""
+    """Return the same place of the panoramas of several specs, magnified three times."""
     pictures = []
     for name in WAYS:
         file = f"{name.replace(' ', '-')}.yaml"
@@ -249,7 +248,7 @@ def baselines(folder: Path) -> Picture:
 
 
 def hot_pixels(folder: Path) -> Picture:
-    """Return the same place of two panoramas of a sensor with hot pixels, three times as large: as it is, and corrected."""
+    """Return a place of two panoramas of a sensor with hot pixels, magnified three times: uncorrected and corrected."""
     pictures = []
     for name, corrections in {"hot pixels": "[]", "hot pixels masked": "[hot-pixels]"}.items():
         directory = in_folder(folder, name)
@@ -266,7 +265,7 @@ def hot_pixels(folder: Path) -> Picture:
 
 
 def interpolation(cube: Path) -> Picture:
-    """Return the errors between knots on the true motion of a capture, and print what they are on average."""
+    """Return a plot of the errors between knots on the true motion of a capture, and print their means."""
     with np.load(truth_path(cube)) as file:
         truth, shape = file["homographies"], tuple(file["frame_shape"])
     truth = normalised(inverse(truth[len(truth) // 2]) @ truth)
@@ -294,7 +293,7 @@ def interpolation(cube: Path) -> Picture:
 def between_knots(
     name: str, motion: NDArray[np.float64], spacing: int, error_px: float, shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return the mean corner error of each frame, where each coordinate of the corners of a knot errs by so many px."""
+    """Return the mean corner error of each frame; the corners of knots have normal errors of `error_px` per coordinate."""
     instants = np.arange(spacing // 2, len(motion), spacing)
     noise = np.random.default_rng(0).normal(0, error_px, (len(instants), 8))
     to_corners = np.array([jacobian(knot, corners(shape)).reshape(8, 8) for knot in motion[instants]])
@@ -307,7 +306,7 @@ def between_knots(
 
 
 def draw_errors(panel: Axes, title: str, spacing: int, errors: dict[str, NDArray[np.float64]]) -> None:
-    """Draw the errors of a thousand frames, and where the knots are."""
+    """Draw the errors of 1,000 frames, and the positions of knots."""
     start = len(errors["lie"]) // 2
     frames = np.arange(start, start + 1000)
     for knot in frames[frames % spacing == 0]:
@@ -320,7 +319,7 @@ def draw_errors(panel: Axes, title: str, spacing: int, errors: dict[str, NDArray
 
 
 def turned(angles: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the maps that turn a frame about its middle."""
+    """Return the maps that rotate a frame about its centre."""
     height, width = shape
     centred = translation((width - 1) / 2, (height - 1) / 2)
     turns = np.tile(np.eye(3), (len(angles), 1, 1))
@@ -331,13 +330,13 @@ def turned(angles: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.fl
 
 
 def motion(directory: Path) -> FrameTrajectory:
-    """Return the motion that a run found."""
+    """Return the estimated motion of a run."""
     with np.load(directory / "trajectory.npz") as trajectory:
         return FrameTrajectory(trajectory["homographies"])
 
 
 def picture(flux: NDArray[np.float32], white: float) -> Picture:
-    """Return flux as 8-bit sRGB; what is unknown is white, as the page is."""
+    """Return flux as 8-bit sRGB; unknown pixels are white, as is the page."""
     return np.where(np.isfinite(flux), tone_mapped(flux, white), np.uint8(255))
 
 
@@ -363,7 +362,7 @@ def stacked(pictures: Sequence[Picture]) -> Picture:
 
 
 def save(name: str, image: Picture) -> None:
-    """Write a PNG of 64 grey levels, which halves the file and cannot be seen."""
+    """Write a PNG of 64 grey levels, which halves the file without a visible difference."""
     quantised = np.where(image == 255, 255, image & 0xFC).astype(np.uint8)
     cv2.imwrite(str(IMAGES / name), quantised, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     print(f"{IMAGES / name}: {(IMAGES / name).stat().st_size / 1e3:.0f} kB")

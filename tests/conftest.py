@@ -1,4 +1,4 @@
-"""Small captures, exposures and motions that many tests need: in memory; and simulated, for whole runs."""
+"""Small captures, exposures and motions for many tests: in memory, and simulated for whole runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def known_motion() -> type[KnownMotion]:
 
 @pytest.fixture(scope="session")
 def pan() -> Callable[..., KnownMotion]:
-    """Make a motion of so many pixels a frame."""
+    """Return a motion of `x_px` and `y_px` pixels per frame."""
 
     def make(x_px: float, y_px: float = 0.0) -> KnownMotion:
         return KnownMotion(lambda frame: translation(x_px * frame, y_px * frame))
@@ -47,7 +47,7 @@ def street() -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def photograph() -> Callable[..., VirtualExposure]:
-    """Take a virtual exposure from an image of flux: 250 frames, without motion, with photon noise."""
+    """Simulate a virtual exposure of an image of flux: 250 frames, without motion, with photon noise."""
     n_frames, response = 250, BinaryResponse()
 
     def photograph(flux: np.ndarray, seed: int = 0) -> VirtualExposure:
@@ -61,7 +61,7 @@ def photograph() -> Callable[..., VirtualExposure]:
 
 @pytest.fixture(scope="session")
 def seen_from(street: np.ndarray, photograph: Callable) -> Callable[..., VirtualExposure]:
-    """Take an exposure of (160, 240) px: `motion` maps its pixels to those of the exposure that the identity gives."""
+    """Simulate an exposure of (160, 240) px: `motion` maps its pixels to those of the exposure for the identity."""
     import cv2
 
     def seen_from(motion: np.ndarray, seed: int = 0, brightness: float = 1.0) -> VirtualExposure:
@@ -74,7 +74,7 @@ def seen_from(street: np.ndarray, photograph: Callable) -> Callable[..., Virtual
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Write a small capture and its truth: 300 frames of 128x160 px of a street, on a pan of 60 px with a trembling hand."""
+    """Write a small capture and its truth: 300 frames of 128x160 px of a street, on a pan of 60 px with tremor."""
     from photonpano.captures.writing import write_packed
     from photonpano.pipeline.components import build_source
     from photonpano.specs import parse_spec
@@ -103,7 +103,7 @@ def small_capture(simulated: Callable[..., Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def small_spec(small_capture: Path) -> dict[str, Any]:
-    """A spec of the small capture with groups of 50 frames; three levels as by default."""
+    """A spec of the small capture with groups of 50 frames."""
     return {
         "version": 1,
         "source": {"use": "packed-npy", "with": {"path": str(small_capture), "frame_rate_hz": 96800}},
@@ -113,7 +113,7 @@ def small_spec(small_capture: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """A whole run of the small capture. Tests read its folder and leave it as it is."""
+    """A whole run of the small capture. Tests must not change its folder."""
     from photonpano import run
     from photonpano.specs import parse_spec
 
@@ -122,7 +122,7 @@ def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture
 def write_video(tmp_path: Path) -> Callable[..., Path]:
-    """Write the levels of frames, as they are, as the luma of a video."""
+    """Write grey levels unchanged as the luma of a video."""
 
     def write(frames: np.ndarray, name: str, codec: str, pixels: str, **options: Any) -> Path:
         av = pytest.importorskip("av")

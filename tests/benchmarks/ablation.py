@@ -1,9 +1,9 @@
-"""Which part of the method buys which part of the accuracy: the table and the plot of docs/explanation/ablation.md.
+"""Measure what each part of the method contributes to the accuracy: table and plot of docs/explanation/ablation.md.
 
     python tests/benchmarks/ablation.py docs/explanation/ablation.md
 
-Every locator, graph and resampler runs on the same captures: the built-in street, a path of 360 px in 2,400 frames, a hand that
-trembles. The last row of each flux is the bound of Cramer and Rao. It takes some minutes.
+Every locator, graph and resampler runs on the same captures: the built-in street, a path of 360 px in 2,400 frames with tremor.
+The last row of each flux is the Cramer-Rao bound. It takes some minutes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ CAPTURE: dict[str, Any] = {
 }
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 Results: TypeAlias = dict[tuple[float, str, str, str], tuple[float, float, float] | str]
-"""Mean and largest error and loss by flux, locator, graph and resampler; or why there are none."""
+"""Mean error, largest error and loss of PSNR by flux, locator, graph and resampler; or why the run failed."""
 HEADER = ("Flux", "Locator", "Graph", "Groups", "Mean", "Worst frame", "Below the oracle")
 
 
@@ -54,7 +54,7 @@ def simulate(folder: Path, flux: float) -> Path:
 
 
 def measure(cube: Path, locator: str, graph: str, resampler: str) -> tuple[float, float, float]:
-    """Return the mean and the largest corner error, in px, and by how many dB the panorama falls short of the oracle."""
+    """Return the mean and the largest corner error, in px, and the loss of PSNR compared with the oracle, in dB."""
     plan = parse_spec(
         {
             "version": 1,
@@ -72,7 +72,7 @@ def measure(cube: Path, locator: str, graph: str, resampler: str) -> tuple[float
 
 
 def bound_px(cube: Path) -> float:
-    """Return the mean, over the capture, of the least error of an exposure of a scene that is known without noise."""
+    """Return the mean, over the capture, of the Cramer-Rao bound of an exposure of a known scene."""
     truth = load_truth(cube.with_suffix(".truth.npz"))
     assert truth.scene is not None
     height, width = truth.frame_shape

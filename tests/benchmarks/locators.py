@@ -1,12 +1,11 @@
-"""How exact, how reliable and how fast every locator is: the table of docs/how-to/choose-a-locator.md.
+"""Measure accuracy, reliability and speed of every locator: the table of docs/how-to/choose-a-locator.md.
 
     python tests/benchmarks/locators.py docs/how-to/choose-a-locator.md [--scenes 2] [--fluxes 0.5 0.1 0.02]
 
 Every locator that is installed and needs no key registers the same pairs of virtual exposures, of the built-in street: groups
-of 250 frames of 254x496 pixels, one and two group lengths apart, while a camera that trembles pans over 25 px in each. Groups
-are merged as at level 1, where they are blurred and nothing tells where to start; and as at the last, along the true motion,
-with a start that puts every corner wrong by 2 px. Times are those of one thread, to describe the exposures and to register the
-pairs, for each pair.
+of 250 frames of 254x496 pixels, one and two group lengths apart, each with a pan of 25 px and tremor. Groups are merged as at
+level 1, blurred and without a start; and as at the last level, along the true motion, with a start whose corners are 2 px off.
+Times are those of one thread, per pair, to describe the exposures and to register the pairs.
 """
 
 from __future__ import annotations
@@ -50,12 +49,12 @@ BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 
 
 class Views(NamedTuple):
-    """Exposures of one capture, and where they truly lie.
+    """Exposures of one capture, with their true poses.
 
     Attributes:
         exposures: one for each group.
-        to_plane: (N, 3, 3), their pixels to a common plane.
-        context: for locators of this capture.
+        to_plane: (N, 3, 3), pixels of the exposures to a common plane.
+        context: context for locators of this capture.
     """
 
     exposures: list[VirtualExposure]
@@ -63,7 +62,7 @@ class Views(NamedTuple):
     context: StageContext
 
     def pairs(self) -> Iterator[tuple[int, int, np.ndarray]]:
-        """Yield which exposure is moving, which is fixed, and the true motion between them."""
+        """Yield the indices of the moving and the fixed exposure, and the true motion between them."""
         for apart in (1, 2):
             for fixed in range(len(self.exposures) - apart):
                 moving = fixed + apart
@@ -71,7 +70,7 @@ class Views(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """How one locator did on one kind of exposures: median error of those that were found, share that was not, time."""
+    """Result of a locator on one kind of exposures: median error of located pairs, share of lost pairs, time."""
 
     error_px: float
     lost: float
@@ -122,14 +121,14 @@ def available(catalog: Catalog, context: StageContext) -> Iterator[tuple[str, Lo
 
 
 def nearly(true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a motion that puts every corner of the frame wrong by 2 px, in any direction."""
+    """Return a start whose corners are 2 px off, each in a random direction."""
     angles = rng.uniform(0, 2 * np.pi, 4)
     wrong = apply(true, corners(SHAPE)) + WRONG_PX * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return normalised(cv2.getPerspectiveTransform(corners(SHAPE).astype(np.float32), wrong.astype(np.float32)))
 
 
 def measure(locator: Locator, captures: Sequence[Views], known: bool) -> Figures:
-    """Register all pairs, from a start that is nearly right if the motion is known, or from nowhere."""
+    """Register all pairs, from a start that is nearly right if `known`, without a start otherwise."""
     errors, lost, seconds = [], 0, 0.0
     rng = np.random.default_rng(0)
     for capture in captures:
@@ -159,7 +158,7 @@ def table(fluxes: Sequence[float], scenes: int) -> list[str]:
     for flux in fluxes:
         kinds = [[views(flux, seed, compensated) for seed in range(scenes)] for compensated in (False, True)]
         for name, locator in available(catalog, kinds[0][0].context):
-            # The first pair pays for what is compiled or loaded.
+            # The first pair takes longer: code is compiled and libraries are loaded.
             measure(locator, [Views(kinds[1][0].exposures[:2], *kinds[1][0][1:])], known=True)
             blurred, compensated = (
                 measure(locator, captures, known) for captures, known in zip(kinds, (False, True), strict=True)

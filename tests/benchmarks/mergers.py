@@ -1,9 +1,9 @@
-"""Which merger to choose: the tables of docs/how-to/choose-a-merger.md.
+"""Measure speed and accuracy of every merger: the tables of docs/how-to/choose-a-merger.md.
 
     python tests/benchmarks/mergers.py docs/how-to/choose-a-merger.md
 
-All merge the same groups along the true motion. Times are CPU times of one thread, the least of several; frames are unpacked
-and summed from a file in the page cache. PSNR is that of the flux of one exposure against what its reference instant shows.
+All merge the same groups along the true motion. Times are CPU times of one thread, the minimum of several; frames are
+unpacked and summed from a file in the page cache. PSNR compares the flux of an exposure with the scene at the reference.
 It takes a minute or two.
 """
 
@@ -34,7 +34,7 @@ FLUXES = (0.005, 0.02, 0.1, 0.5)
 TIMED_FRAMES = 200
 SEEN_FRAMES = 500
 SIDE_PX, WAY_PX = 40, 100
-"""The size of the thing that moves by itself, and how far it goes within a group."""
+"""Size of the moving object, and its path within a group."""
 MERGERS: dict[str, Merger] = {
     "photon-mle, 1 px": PhotonMleMerger(PhotonMleConfig()),
     "photon-mle, 0.25 px": PhotonMleMerger(PhotonMleConfig(tolerance_px=0.25)),
@@ -56,7 +56,7 @@ def opened(folder: Path, frames: np.ndarray) -> Source:
 
 
 def seconds(merger: Merger, source: Source, motion: FrameTrajectory) -> float:
-    """Return the CPU time of a frame."""
+    """Return the CPU time per frame."""
     group = Group(FrameSpan(0, TIMED_FRAMES), (TIMED_FRAMES - 1) / 2)
     times = []
     for _ in range(7):
@@ -81,7 +81,7 @@ def times(folder: Path) -> list[str]:
 
 
 def view(scene: np.ndarray, to_scene: np.ndarray, instant: float, moving: bool) -> np.ndarray:
-    """Return the flux that a frame sees, with or without a bright square that goes its own way."""
+    """Return the flux in a frame, with or without a bright square that moves by itself."""
     seen = cv2.warpPerspective(scene, to_scene, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     if moving:
         left = round(150 + WAY_PX * instant / SEEN_FRAMES)

@@ -1,4 +1,4 @@
-"""How long a run takes, stage by stage, and what limits it: the tables and the plot of docs/explanation/speed.md.
+"""Measure the time of each stage of a run, and its limits: the tables and the plot of docs/explanation/speed.md.
 
     python tests/benchmarks/speed.py docs/explanation/speed.md [--frames 10000 30000 100000]
 
@@ -44,7 +44,7 @@ PROGRAM = [sys.executable, "-c", "from photonpano.cli import main; main()"]
 
 
 def simulate(folder: Path, n_frames: int) -> Path:
-    """Write a capture that moves by 0.02 px a frame, with its truth beside it."""
+    """Write a capture that moves by 0.02 px per frame, with its truth beside it."""
     cube = folder / f"{n_frames}.npy"
     length_px = PX_A_FRAME * n_frames
     width = max(2048, round(length_px))
@@ -63,7 +63,7 @@ def simulate(folder: Path, n_frames: int) -> Path:
 
 
 def seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """Return the least time that some work takes."""
+    """Return the minimum time of several repetitions."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -73,13 +73,13 @@ def seconds(work: Callable[[], object], repeats: int = 3) -> float:
 
 
 def spread(work: Callable[[int], object], items: range, threads: int) -> None:
-    """Do work on all items, by several threads."""
+    """Do work on all items in several threads."""
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, items))
 
 
 def sums(cube: Path) -> list[str]:
-    """Return the rows of the table of sums: GB of packed frames a second."""
+    """Return the rows of the table of sums: GB of packed frames per second."""
     frame_bytes = SHAPE[0] * SHAPE[1] // 8
     rows = ["| Frames in a sum | unpackbits | one thread | two threads |", "| --- | --- | --- | --- |"]
     with PACKED_NPY.build(PackedNpyConfig(path=cube), SourceContext()) as source:
@@ -102,7 +102,7 @@ def sums(cube: Path) -> list[str]:
 
 
 def reading(cube: Path) -> float:
-    """Return the rate of nothing but reading a cube from the page cache by all threads, bytes a second: the physical limit."""
+    """Return the rate at which all threads read a cube from the page cache, in bytes per second: the physical limit."""
     size = cube.stat().st_size
     blocks = range(size // BLOCK_BYTES)
 
@@ -115,7 +115,7 @@ def reading(cube: Path) -> float:
 
 
 def warped_one_by_one(source: Source, span: FrameSpan, to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unpack and warp every frame of a span, as is done where nothing is shared: its counts and weights."""
+    """Unpack and warp every frame of a span by itself, and return counts and weights."""
     counts, weight = np.zeros(SHAPE, np.float32), np.zeros(SHAPE, np.float32)
     ones = np.ones(SHAPE, np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -197,7 +197,7 @@ def stages(record: dict[str, Any]) -> dict[str, float]:
 
 
 def runs(records: dict[int, dict[str, Any]], rate: float) -> list[str]:
-    """Return the rows of the table of whole runs, and what they are to be compared with: reading, in bytes a second."""
+    """Return the rows of the table of whole runs; `rate` is that of reading, in bytes per second, for comparison."""
     rows = [
         "| Frames | Whole | merge | locate | panorama | other | Peak memory | Mean error |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -225,7 +225,7 @@ def runs(records: dict[int, dict[str, Any]], rate: float) -> list[str]:
 
 
 def plot(records: dict[int, dict[str, Any]], file: Path) -> None:
-    """Draw what each stage takes."""
+    """Draw the time of each stage."""
     figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
     left = np.zeros(len(records))
     labels = [f"{n_frames:,} frames" for n_frames in records]

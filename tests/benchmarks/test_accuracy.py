@@ -1,8 +1,8 @@
-"""How far the motion and the panorama are from the truth, on simulated captures of frames of 254x496.
+"""Accuracy of motion and panorama on simulated captures of 254x496 px.
 
-Every run has three levels and default components: `direct`, which offers the pairs that it loses to `opencv-sift`. Captures are
-10,000 frames along a random spline of 1,500 px, with half a photon per pixel per frame or less, and a hand that is still or
-trembles; a path at five times the speed; and a raster that comes back to places it has seen. Bounds are on means over scenes.
+Every run has three levels and the default components: `direct`, with `opencv-sift` as the fallback for lost pairs. Captures
+have 10,000 frames along a random spline of 1,500 px, at most 0.5 photons per pixel per frame, with and without tremor;
+one has a path at five times the speed, and one a raster with loop closures. Bounds are on means over scenes.
 
 `make bench` prints the tables. Scenes are three streets that are built in; photographs can be added, separated by colons:
 
@@ -35,7 +35,7 @@ SHAKE = {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]}
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of capture, and what must be reached on it on average over the scenes."""
+    """A kind of capture, with bounds on the mean scores over the scenes."""
 
     flux: float
     mean_px: float
@@ -61,7 +61,7 @@ FAST = Case(0.5, 0.5, below_oracle_db=1.0, path_px=3000, n_frames=4000)
 REVISITS = Case(0.5, 0.08, path_px=3000, n_frames=20_000, kind="scan")
 TREMBLING = Case(0.5, 0.08, shake=True, path_px=750)
 STRETCHES = 10
-"""Parts of a path of which none may be much worse than the others."""
+"""Parts of a path that are compared with each other."""
 NEIGHBOURS = {"skips": [], "closure_overlap": None}
 HEADER = (
     "| scene | path px | frames | group | flux | shake | variant "
@@ -70,7 +70,7 @@ HEADER = (
 
 
 def photonpano(*arguments: str) -> str:
-    """Run the program as a user would, and return what it prints."""
+    """Run the command line as users do, and return its output."""
     command = [sys.executable, "-c", "from photonpano.cli import main; main()", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -124,14 +124,14 @@ def mean(rows: list[dict[str, float]], figure: str) -> float:
 
 
 def errors_px(cube: Path) -> np.ndarray:
-    """Return the error of every frame of the run that was measured last."""
+    """Return the error of every frame of the last run."""
     with np.load(cube.with_name("run") / "trajectory.npz") as found, np.load(cube.with_name("cube.truth.npz")) as truth:
         return corner_errors(found["homographies"], truth["homographies"], tuple(truth["frame_shape"])).errors_px
 
 
 @pytest.mark.timeout(14_400)
 @pytest.mark.parametrize("case", [*CASES, FAST], ids=str)
-def test_three_levels_come_as_close_to_the_truth_as_photons_allow(tmp_path, case):
+def test_run_reaches_accuracy_bounds(tmp_path, case):
     rows = []
     for scene in SCENES:
         folder = tmp_path / scene
@@ -149,7 +149,7 @@ def test_three_levels_come_as_close_to_the_truth_as_photons_allow(tmp_path, case
 
 
 @pytest.mark.timeout(14_400)
-def test_closures_keep_the_error_from_growing_along_a_path_that_revisits_places(tmp_path):
+def test_loop_closures_bound_drift(tmp_path):
     chains, closed = [], []
     for scene in SCENES:
         folder = tmp_path / scene
@@ -165,8 +165,8 @@ def test_closures_keep_the_error_from_growing_along_a_path_that_revisits_places(
 
 
 @pytest.mark.timeout(7200)
-def test_each_level_improves_and_both_ablations_are_clearly_worse(tmp_path):
-    """A hand that trembles within the distance of two groups: what is between them must be seen to be known."""
+def test_each_level_improves_and_ablations_are_worse(tmp_path):
+    """The tremor is faster than the distance of two groups, so that level 1 cannot resolve it."""
     case = TREMBLING
     cube = simulate(tmp_path, "street 0", case)
     one, two = (measure(cube, "street 0", case, f"{levels} levels", levels=levels) for levels in (1, 2))

@@ -36,7 +36,7 @@ def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None =
         raise ValueError(
             f"packed frames of width {width} must be uint8 (n, H, {-(-width // 8)}), got {packed.dtype} {packed.shape}"
         )
-    from photonpano.photometry.carry_save import MAX_FRAMES, add_counts
+    from photonpano.photometry.bits import MAX_FRAMES, add_counts
 
     n_frames, height, row_bytes = packed.shape
     if counts is None:

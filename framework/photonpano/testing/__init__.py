@@ -40,5 +40,5 @@ __all__ = [
 _MODULES = ("scenes", "captures", "sources", "resamplers", "mergers", "locators", "interpolators")
 """Where the public names are defined."""
 
-if not TYPE_CHECKING:  # type checkers see the imports, and so know which names there are
+if not TYPE_CHECKING:  # type checkers see the imports above
     __getattr__, __dir__ = imported_on_use(__name__, __all__, _MODULES)

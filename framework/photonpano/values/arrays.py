@@ -11,7 +11,7 @@ FloatArray: TypeAlias = NDArray[np.float64]
 """Any float64 array: coordinates, parameters, covariances."""
 
 Homography: TypeAlias = NDArray[np.float64]
-"""(3, 3) float64 with h33 = 1; (N, 3, 3) where the text says so."""
+"""(3, 3) float64 with h33 = 1; (N, 3, 3) where stated."""
 
 FluxImage: TypeAlias = NDArray[np.float32]
 """(H, W) float32: photons per pixel per frame, NaN where unknown."""

@@ -38,7 +38,7 @@ def fit() -> Callable[..., Trajectory]:
 
 @pytest.fixture(scope="session")
 def turning() -> Callable[[np.ndarray], np.ndarray]:
-    """Return the homographies of a camera with the lens of a phone that is turned by (T, 3) rotation vectors, in radians."""
+    """Return the homographies of a phone camera rotated by (T, 3) rotation vectors, in radians."""
     height, width = FRAME_SHAPE
     lens = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
 
@@ -50,7 +50,7 @@ def turning() -> Callable[[np.ndarray], np.ndarray]:
 
 @pytest.fixture(scope="session")
 def motions() -> Callable[[int, int], np.ndarray]:
-    """Return (N, 3, 3) homographies by chance, of any kind and not only of a camera that turns: `motions(n, seed)`."""
+    """Return (N, 3, 3) random homographies, of more than rotating cameras: `motions(n, seed)`."""
 
     def motions(n: int, seed: int) -> np.ndarray:
         sizes = np.array([1e-2, 1e-2, 1e-2, 1e-2, 30, 30, 1e-5, 1e-5])

@@ -110,7 +110,7 @@ def test_robust_merge_reduces_weight_at_moving_object(memory_source: type, scene
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_robust_merge_equals_photon_mle_without_trajectory(memory_source: type, scene: np.ndarray, scale: float) -> None:
-    """Camera and scene cannot be told apart there."""
+    """Motion of camera and scene are not separable there."""
     source = capture(memory_source, scene, 0, crossed=True)
     exposure, other = (each.merge(source, GROUP, None, scale) for each in (robust(), plain()))
     np.testing.assert_array_equal(exposure.flux, other.flux)

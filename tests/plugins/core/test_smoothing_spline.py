@@ -22,13 +22,13 @@ def to_corners(homographies: np.ndarray) -> np.ndarray:
 
 
 def noisy(homographies: np.ndarray, std_px: np.ndarray | float, seed: int = 0) -> np.ndarray:
-    """Add errors of so many px, (N, 8) or what makes that, to the coordinates of the corners."""
+    """Add errors in px, which broadcast to (N, 8), to the coordinates of the corners."""
     drawn = np.random.default_rng(seed).normal(size=(len(homographies), 8)) * std_px
     return from_parameters(parameters(homographies) + np.linalg.solve(to_corners(homographies), drawn[..., None])[..., 0])
 
 
 def information(homographies: np.ndarray, std_px: np.ndarray | float) -> np.ndarray:
-    """Return what knots are worth whose corners err by so many px: (N, 8, 8)."""
+    """Return the (N, 8, 8) information of knots whose corners have these errors in px."""
     slopes = to_corners(homographies) / np.broadcast_to(std_px, (len(homographies), 8))[..., None]
     return slopes.transpose(0, 2, 1) @ slopes
 
@@ -68,7 +68,7 @@ def test_smoothing_spline_weights_knots_by_information(fit):
 
 
 def test_smoothing_spline_weights_directions_by_information(fit):
-    """Even knots know x and not y, as above a horizontal edge, and odd ones the reverse."""
+    """Even knots have information on x but not on y, as at a vertical edge, and odd ones the reverse."""
     instants = np.arange(80) * 40.0
     truth = parabola(instants)
     std = np.where((np.arange(80)[:, None] + np.arange(8)) % 2, 1.0, 0.1)
@@ -90,7 +90,7 @@ def test_smoothing_spline_fills_direction_without_information(fit):
 
 
 def test_smoothing_spline_does_not_depend_on_scale_of_information(fit):
-    """The noise is measured, since what locators say of themselves may be off by a factor."""
+    """The noise is estimated, since the information of locators may be wrong by a factor."""
     rng = np.random.default_rng(0)
     instants = np.cumsum(rng.uniform(20, 60, 30))
     std = rng.uniform(0.1, 1, (30, 8))

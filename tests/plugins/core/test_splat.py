@@ -159,16 +159,16 @@ def test_splat_equals_photon_mle_without_trajectory(memory_source: type, frames:
 
 def test_splat_reads_frames_in_blocks(memory_source: type, frames: np.ndarray, rigid: Trajectory, monkeypatch) -> None:
     whole = SplatMerger().merge(memory_source(frames), GROUP, rigid, 1.0)
-    asked: list[FrameSpan] = []
+    spans: list[FrameSpan] = []
 
     class Told(memory_source):
         def frames(self, span: FrameSpan) -> np.ndarray:
-            asked.append(span)
+            spans.append(span)
             return super().frames(span)
 
     monkeypatch.setattr("photonpano_core.splat._READ_BYTES", 7 * HEIGHT * WIDTH)
     parts = SplatMerger().merge(Told(frames), GROUP, rigid, 1.0)
-    assert asked == [FrameSpan(2, 9), FrameSpan(9, 16), FrameSpan(16, 22)]
+    assert spans == [FrameSpan(2, 9), FrameSpan(9, 16), FrameSpan(16, 22)]
     np.testing.assert_array_equal(parts.flux, whole.flux)
 
 

@@ -38,7 +38,7 @@ def test_pair_bound_ignores_pixels_that_one_exposure_did_not_see() -> None:
 
 
 def test_maximum_likelihood_reaches_exposure_bound() -> None:
-    """Maximum likelihood by its own linearisation at the truth: 400 draws know a standard deviation to a few per cent."""
+    """Linearised at the truth; the standard deviation of 400 draws has an error of a few per cent."""
     frames, rng, steps = 2000, np.random.default_rng(0), 1e-4
     p = -np.expm1(-FLUX.astype(float))
     points = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), axis=-1).reshape(-1, 2)

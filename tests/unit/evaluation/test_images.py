@@ -32,7 +32,7 @@ def test_image_score_of_equal_images_is_perfect(encoded):
 def test_image_score_psnr_is_that_of_added_noise(encoded, sigma):
     noise = np.random.default_rng(0).normal(0, sigma, encoded.shape)
     score = image_score(flux_of(encoded + noise), flux_of(encoded), np.ones(encoded.shape, bool), WHITE)
-    # 19,200 independent differences know the variance to 1 %, which is 0.045 dB.
+    # The variance of 19,200 independent differences has an error of 1 %, which is 0.045 dB.
     assert score.psnr_db == pytest.approx(-20 * np.log10(sigma), abs=0.15)
 
 

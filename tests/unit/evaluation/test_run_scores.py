@@ -45,12 +45,12 @@ def test_evaluate_ignores_frames_that_were_not_located(capture):
 
 
 def test_evaluate_renders_oracle_along_true_motion_on_same_canvas(capture):
-    asked = []
+    calls = []
     clean, shape = capture.flux, capture.flux.shape
     noise = np.random.default_rng(0).normal(0, 0.02, shape).astype(np.float32)
 
     def render(trajectory, canvas):
-        asked.append((trajectory, canvas))
+        calls.append((trajectory, canvas))
         weight = capture.weight.copy()
         weight[:, : shape[1] // 2] = 0
         return Panorama(np.where(weight > 0, clean + noise, np.nan), weight, canvas.transform)
@@ -58,7 +58,7 @@ def test_evaluate_renders_oracle_along_true_motion_on_same_canvas(capture):
     capture.flux = clean + 2 * noise
     capture.write()
     score = evaluate(capture.folder, capture.truth, render)
-    [(trajectory, canvas)] = asked
+    [(trajectory, canvas)] = calls
     np.testing.assert_allclose(trajectory.at(np.arange(120)), capture.trajectory["homographies"], atol=1e-5)
     assert canvas.shape == shape
     np.testing.assert_array_equal(canvas.transform, capture.canvas.transform)

@@ -35,10 +35,10 @@ def test_accumulate_returns_source_counts_of_still_capture(memory_source: type) 
 def test_accumulate_adds_chunks_of_still_capture(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 50))
     halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
-    told: list[int] = []
-    photons = accumulate(source, halves, np.eye(3), SHAPE, told.append)
+    advances: list[int] = []
+    photons = accumulate(source, halves, np.eye(3), SHAPE, advances.append)
     np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
-    assert told == [20, 30]
+    assert advances == [20, 30]
 
 
 def test_accumulate_moves_counts_and_weight_by_whole_pixels_without_loss(memory_source: type) -> None:
@@ -117,7 +117,7 @@ def test_estimate_of_still_capture_has_photon_noise(memory_source: type) -> None
     n = 200
     source = memory_source(frames_of(FLUX, n))
     flux, _ = accumulate(source, still(n), np.eye(3), SHAPE).estimate(source.response)
-    # 1,200 pixels tell a standard deviation to 2 %.
+    # With 1,200 pixels the standard deviation has an error of 2 %.
     assert flux.std() == pytest.approx(np.sqrt(np.expm1(FLUX) / n), rel=0.08)
 
 

@@ -1,4 +1,4 @@
-"""Sums that are made once."""
+"""The cache of sums."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from photonpano.merging import CountsCache
 
 @pytest.fixture
 def counted(memory_source: type) -> tuple[object, list[FrameSpan]]:
-    """A source of 20 frames, and the spans that it was asked for."""
+    """A source of 20 frames, and the spans that it summed."""
     source = memory_source(np.random.default_rng(0).random((20, 4, 6)) < 0.5)
-    asked: list[FrameSpan] = []
+    summed: list[FrameSpan] = []
     sums = source.counts
 
     def counts(span: FrameSpan) -> np.ndarray:
-        asked.append(span)
+        summed.append(span)
         if span.start == 7:
             raise InputError("a damaged block")
         return sums(span)
 
     source.counts = counts
-    return source, asked
+    return source, summed
 
 
 def test_counts_cache_computes_each_sum_once(counted: tuple) -> None:
-    source, asked = counted
+    source, summed = counted
     shared = CountsCache(source, 1000)
     first = shared(FrameSpan(0, 5))
     assert shared(FrameSpan(0, 5)) is first
-    assert asked == [FrameSpan(0, 5)]
+    assert summed == [FrameSpan(0, 5)]
     np.testing.assert_array_equal(first, source.frames(FrameSpan(0, 5)).sum(axis=0))
     assert not first.flags.writeable
 
 
 def test_counts_cache_drops_least_recently_used_sum(counted: tuple) -> None:
-    source, asked = counted
+    source, summed = counted
     shared = CountsCache(source, 2 * 4 * 6 * 4)
     for start in (0, 1, 0, 2, 0, 1):
         shared(FrameSpan(start, start + 3))
-    assert [span.start for span in asked] == [0, 1, 2, 1]
+    assert [span.start for span in summed] == [0, 1, 2, 1]
 
 
 def test_counts_cache_computes_sum_once_for_concurrent_threads(counted: tuple) -> None:
-    source, asked = counted
+    source, summed = counted
     shared, together = CountsCache(source, 1000), Barrier(4)
 
     def ask(_: int) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_counts_cache_computes_sum_once_for_concurrent_threads(counted: tuple) -
 
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(ask, range(4)))
-    assert len(asked) == 1
+    assert len(summed) == 1
     assert all(each is found[0] for each in found)
 
 

@@ -49,7 +49,7 @@ class WithUndescribedParts(Config):
 
 
 class DropsTypingErrors(Config):
-    """Passes over keys that it does not know."""
+    """Ignores unknown keys."""
 
     @model_validator(mode="before")
     @classmethod

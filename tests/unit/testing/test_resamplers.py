@@ -15,7 +15,7 @@ class Honest:
     """Groups of 100 frames, one after the other."""
 
     def __init__(self, context):
-        self.asked = itertools.count()
+        self.calls = itertools.count()
 
     def groups(self, n_frames, level):
         if n_frames < 100:
@@ -61,7 +61,7 @@ class NumbersOfNumpy(Honest):
 
 class Forgetful(Honest):
     def groups(self, n_frames, level):
-        return super().groups(n_frames, level)[: -1 if next(self.asked) else None]
+        return super().groups(n_frames, level)[: -1 if next(self.calls) else None]
 
 
 class ShortIsADefect(Honest):
