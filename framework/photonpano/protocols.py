@@ -1,4 +1,4 @@
-"""What a plugin builds: the interfaces of the five components, and nothing else."""
+"""The interfaces of the five components that plugins build."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Source(Protocol):
 
     @property
     def valid(self) -> BoolArray:
-        """(H, W) mask, False for pixels that must not be used (hot, dead, under a filter)."""
+        """(H, W) mask, False for pixels that must not be used (hot, dead, behind a colour filter)."""
         ...
 
     def counts(self, span: FrameSpan) -> Counts:
@@ -55,7 +55,7 @@ class Source(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of files; the source is not used afterwards."""
+        """Release files; the source is not used afterwards."""
         ...
 
     def __enter__(self) -> Source: ...
@@ -65,31 +65,31 @@ class Source(Protocol):
 
 @runtime_checkable
 class PackedSource(Source, Protocol):
-    """A source of binary frames that has them packed: what only moves or counts bits need not unpack them."""
+    """Gives packed frames, so that copying and summing need no unpacking."""
 
     def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
         """Return the frames of a span, eight pixels to a byte.
 
         Returns:
-            (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width: the first pixel is the highest bit, and what fills
-            up the last byte of a row is zero. It belongs to the caller.
+            (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width: the first pixel is the highest bit, and unused bits
+            of the last byte of a row are zero. The caller may write to it.
         """
         ...
 
 
 @runtime_checkable
 class LinearlyCorrectedSource(Source, Protocol):
-    """A source whose sums hold more than the flux, such as dark counts, and which knows how to take it out."""
+    """A source whose sums contain more than the flux, such as dark counts, and that can subtract it."""
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """Return what the sum of some frames would be, on average, if they showed nothing but the flux.
+        """Correct a sum of frames, so that on average it is the sum of frames of the flux alone.
 
-        Mergers do this to the sums of frames before they warp them. It is linear, so that the average is right, and may be
-        negative.
+        Mergers correct sums of frames before they warp them. The correction is linear, so that the average is right; the result
+        may be negative.
 
         Args:
             counts: (H, W), from `counts`.
-            n_frames: how many frames they are of.
+            n_frames: number of frames in the sum.
 
         Returns:
             (H, W) float32.
@@ -99,13 +99,13 @@ class LinearlyCorrectedSource(Source, Protocol):
 
 @runtime_checkable
 class KnowsTruth(Protocol):
-    """A source that knows what it shows, as simulators do: a `Source` with one method more.
+    """A source with ground truth, such as a simulator: a `Source` with one more method.
 
     `photonpano simulate` stores the truth as an .npz archive, for `photonpano evaluate`.
     """
 
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
-        """Return named arrays; others than these may be among them.
+        """Return the ground truth as named arrays; there may be more than the following ones.
 
         Convention:
             Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres.
@@ -118,14 +118,14 @@ class KnowsTruth(Protocol):
 
 
 class Resampler(Protocol):
-    """Chooses which frames are merged at each level (paper, section 4, "Re-sample")."""
+    """Chooses the frames that are merged at each level (paper, section 4, "Re-sample")."""
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
         """Return the groups of a level, in order of their reference instants.
 
         Args:
             n_frames: frames of the capture.
-            level: from 1. At level 1 no motion is known yet.
+            level: number of the level, from 1. At level 1 no motion is known yet.
 
         Raises:
             InputError: the capture is too short for this resampler.
@@ -146,32 +146,32 @@ class Trajectory(Protocol):
 
 
 class Merger(Protocol):
-    """Merges a group into a virtual exposure along the motion known so far (paper, section 4, "Merge")."""
+    """Merges a group into a virtual exposure along the current motion (paper, section 4, "Merge")."""
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge the frames of a group, warped to its reference instant.
 
         Args:
             source: the capture.
-            group: which frames, and the instant they are seen from.
-            trajectory: the motion known so far; None at the first level, where frames are summed as they are.
+            group: the frames, and the instant whose view they are warped to.
+            trajectory: the current motion; None at the first level, where frames are summed without a warp.
             scale: pixels of the exposure per pixel of a frame.
         """
         ...
 
 
 class Locator(Protocol):
-    """Finds the motion between two virtual exposures (paper, section 4, "Locate")."""
+    """Estimates the motion between two virtual exposures (paper, section 4, "Locate")."""
 
     def describe(self, exposure: VirtualExposure) -> Any:
-        """Compute once, for one exposure, what every registration of it needs (features, pyramids).
+        """Compute the features or pyramids of an exposure, once for all its registrations.
 
-        The framework keeps the result as long as pairs of the exposure are due; keep it small, and without the exposure.
+        The framework keeps the result until the last pair of the exposure is registered. Keep it small, without the exposure.
         """
         ...
 
     def register(self, moving: Any, fixed: Any, initial: Homography | None) -> Located | NotLocated:
-        """Estimate where `moving` lies in `fixed`. Never raises for an image without texture.
+        """Estimate where `moving` lies in `fixed`. Return `NotLocated` for an image without texture.
 
         Convention:
             The map takes pixels of `moving` to pixels of `fixed`; points are (x, y), integers are pixel centres. Both images

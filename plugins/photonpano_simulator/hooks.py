@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from photonpano_simulator.source import SimulatorSource
 
 _CHECKED_FRAMES = 5000
-"""Frames of a path that are checked before a run: enough to see that it leaves the scene."""
+"""Frames of a path that are checked before a run, to find out whether it leaves the scene."""
 
 
 def _build(config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> SimulatorSource:

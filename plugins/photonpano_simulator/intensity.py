@@ -1,4 +1,4 @@
-"""A conventional camera: how many photons pixels detect, as grey levels with the noise of reading."""
+"""Simulate a conventional camera: detected photons as grey levels, with read noise."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from photonpano_simulator.config import IntensitySensor
 
 
 class IntensityCamera:
-    """Pixels that are `black_level + (photons + reading) / photons_per_level`, rounded, and cut off at the highest level.
+    """Pixels of level `black_level + (photons + read noise) / photons_per_level`, rounded and clipped at the highest level.
 
     Attributes:
         response: how flux becomes levels.
-        bits: of a level.
-        exposure: share of the frame period during which the shutter is open.
-        valid: (H, W) bool, all true.
+        bits: bits of a level.
+        exposure: fraction of the frame period during which the shutter is open.
+        valid: (H, W) bool, all True.
     """
 
     kind: Literal["intensity"] = "intensity"
@@ -35,13 +35,13 @@ class IntensityCamera:
         """Take a frame.
 
         Args:
-            flux: (H, W) photons that are detected per pixel, on average.
-            rng: the chance of this frame.
+            flux: (H, W) expected number of detected photons per pixel.
+            rng: the random generator of this frame.
         """
         photons = rng.poisson(flux) + self._read_noise * rng.standard_normal(flux.shape, np.float32)
         levels = photons / self.response.photons_per_level + self.response.black_level
         return np.clip(np.rint(levels), 0, self._top).astype(np.uint16)
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
-        """Return nothing more."""
+        """Return the ground truth of the sensor: nothing."""
         return {}

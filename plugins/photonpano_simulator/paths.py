@@ -8,11 +8,13 @@ Convention:
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from photonpano import FloatArray, InputError
 from photonpano.geometry import apply, corners, normalised
-from photonpano_simulator.chance import Draw, generator
+from photonpano.reading import read_array
 from photonpano_simulator.config import (
     FilePath,
     HandShakePath,
@@ -23,10 +25,10 @@ from photonpano_simulator.config import (
     SimulationConfig,
     SplinePath,
 )
-from photonpano_simulator.files import read_homographies
+from photonpano_simulator.sensor import Draw, generator
 
 _DENSE = 100_000
-"""Points of a curve before it is sampled at constant speed: the error is far below a thousandth of a pixel."""
+"""Points of a curve before it is resampled at constant speed; the error is far below 0.001 px."""
 
 
 def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
@@ -38,21 +40,21 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
     path, focal = config.path, config.focal_length_px
     frame = _intrinsics(config.frame_shape, focal)
     if isinstance(path, FilePath):
-        homographies = read_homographies(path.file, config.n_frames)
+        homographies = _read_homographies(path.file, config.n_frames)
     else:
         middle = _middle(scene_shape)
         target = middle if path.centre is None else np.asarray(path.centre, dtype=np.float64)
-        turns = _turns(target - middle + _way(path, config.n_frames), focal)
-        homographies = _intrinsics(scene_shape, focal) @ turns @ np.linalg.inv(frame)
+        rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
+        homographies = _intrinsics(scene_shape, focal) @ rotations @ np.linalg.inv(frame)
     if path.shake is not None:
-        trembling = _trembling(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
-        homographies = homographies @ frame @ trembling @ np.linalg.inv(frame)
+        shaking = _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
+        homographies = homographies @ frame @ shaking @ np.linalg.inv(frame)
     homographies = normalised(homographies)
     _require_inside(homographies, config.frame_shape, scene_shape)
     return homographies
 
 
-def _way(path: PanPath | ScanPath | LoopPath | SplinePath | HandShakePath, n_frames: int) -> FloatArray:
+def _centres(path: PanPath | ScanPath | LoopPath | SplinePath | HandShakePath, n_frames: int) -> FloatArray:
     """Return the centres of the frames relative to the middle of the path: (T, 2) px."""
     match path:
         case PanPath():
@@ -91,7 +93,7 @@ def _raster(path: ScanPath) -> FloatArray:
 
 
 def _spline(path: SplinePath, n_frames: int) -> FloatArray:
-    """Return a cubic spline through points by chance, evenly spaced in time."""
+    """Return a cubic spline through random points, evenly spaced in time."""
     from scipy.interpolate import CubicSpline
 
     knots = generator(path.seed, Draw.PATH).uniform((-1.0, -0.5), (1.0, 0.5), (path.knots, 2))
@@ -106,7 +108,7 @@ def _length(points: FloatArray) -> float:
 
 
 def _at_constant_speed(points: FloatArray, n_frames: int) -> FloatArray:
-    """Sample a curve that is given by dense points at equal distances along it."""
+    """Resample a curve, given by dense points, at equal distances along it."""
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     wanted = np.linspace(0, travelled[-1], n_frames)
     return np.stack([np.interp(wanted, travelled, coordinate) for coordinate in points.T], axis=1)
@@ -122,7 +124,7 @@ def _intrinsics(shape: tuple[int, int], focal: float) -> FloatArray:
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
 
-def _turns(displacements: FloatArray, focal: float) -> FloatArray:
+def _rotations(displacements: FloatArray, focal: float) -> FloatArray:
     """Return rotations, first about x and then about y, that move the centre of the image by (T, 2) px: (T, 3, 3)."""
     x, y = displacements.T
     side = np.hypot(x, focal)
@@ -138,16 +140,16 @@ def _turns(displacements: FloatArray, focal: float) -> FloatArray:
     )
 
 
-def _trembling(shake: Shake, n_frames: int, frame_rate_hz: float, focal: float, rng: np.random.Generator) -> FloatArray:
+def _shake_rotations(shake: Shake, n_frames: int, frame_rate_hz: float, focal: float, rng: np.random.Generator) -> FloatArray:
     """Return the rotations of a shaking camera: (T, 3, 3)."""
     phases = rng.uniform(0, 2 * np.pi, (3, len(shake.frequencies_hz), 1))
-    turns = 2 * np.pi * np.asarray(shake.frequencies_hz)[:, None] * np.arange(n_frames) / frame_rate_hz
-    # Sines of amplitude sqrt(2 / n) have together the root mean square 1.
-    x, y, roll = np.sqrt(2 / len(phases[0])) * np.sin(turns + phases).sum(axis=1)
+    phase = 2 * np.pi * np.asarray(shake.frequencies_hz)[:, None] * np.arange(n_frames) / frame_rate_hz
+    # The sum of n sines of amplitude sqrt(2 / n) has the root mean square 1.
+    x, y, roll = np.sqrt(2 / len(phases[0])) * np.sin(phase + phases).sum(axis=1)
     roll = np.deg2rad(shake.roll_rms_deg) * roll
     zero, one = np.zeros(n_frames), np.ones(n_frames)
     rolls = _stacked([[np.cos(roll), -np.sin(roll), zero], [np.sin(roll), np.cos(roll), zero], [zero, zero, one]])
-    return np.asarray(_turns(shake.rms_px * np.stack([x, y], axis=1), focal) @ rolls)
+    return np.asarray(_rotations(shake.rms_px * np.stack([x, y], axis=1), focal) @ rolls)
 
 
 def _stacked(rows: list[list[FloatArray]]) -> FloatArray:
@@ -160,7 +162,7 @@ def _require_inside(homographies: FloatArray, frame_shape: tuple[int, int], scen
     x, y = np.moveaxis(apply(homographies, frame), -1, 0)
     height, width = scene_shape
     worst = np.stack([-x, x - (width - 1), -y, y - (height - 1)]).max(axis=2)
-    # Behind the camera, coordinates mean nothing.
+    # Coordinates of points behind the camera are meaningless.
     depth = (homographies[:, 2, :2] @ frame.T + homographies[:, 2, 2:]).min(axis=1)
     worst[:, depth <= 0] = np.inf
     side = int(worst.max(axis=1).argmax())
@@ -171,3 +173,21 @@ def _require_inside(homographies: FloatArray, frame_shape: tuple[int, int], scen
             f"{('left', 'right', 'top', 'bottom')[side]}, {progress:.0%} of the way along; "
             "shorten or move the path, or take a larger scene"
         )
+
+
+def _read_homographies(path: Path, n_frames: int) -> FloatArray:
+    """Read (n_frames, 3, 3) homographies from a .npy file, or from `homographies` in an .npz archive.
+
+    Raises:
+        InputError: the file is missing, is something else, or has another number of homographies.
+    """
+    homographies = read_array(path, "a file of homographies", "homographies")
+    if homographies.ndim != 3 or homographies.shape[1:] != (3, 3) or homographies.dtype.kind not in "fiu":
+        raise InputError(f"{path} holds {homographies.dtype} of shape {homographies.shape}; homographies are (n_frames, 3, 3)")
+    if len(homographies) != n_frames:
+        raise InputError(
+            f"{path} holds {len(homographies)} homographies for {n_frames} frames; set n_frames to {len(homographies)}"
+        )
+    if not (np.all(np.isfinite(homographies)) and np.all(homographies[:, 2, 2])):
+        raise InputError(f"{path} holds homographies that are not finite, or whose h33 is 0")
+    return homographies.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Scenes: the flux of a photograph, or of the street that is built in."""
+"""Scenes: the flux of a photograph, or of the built-in street."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from photonpano_simulator.config import PhotoScene, StreetScene
 from photonpano_simulator.street import street
 
 _LUMINANCE = (0.0722, 0.7152, 0.2126)
-"""Shares of blue, green and red, in the order of OpenCV (IEC 61966-2-1)."""
+"""Luminance of blue, green and red, in the order of OpenCV (IEC 61966-2-1)."""
 _LARGEST = 16384
-"""OpenCV's warps take no image with a side of 32768 px; this is also more than a camera gives."""
+"""Largest side of a scene, px. Warps of OpenCV refuse a side of 32768 px."""
 
 
 def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float32]:
@@ -43,7 +43,7 @@ def _photo(path: Path, width: int | None) -> NDArray[np.float32]:
     image = read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path} holds {image.dtype} values; a photograph has 8 or 16 bits: save it as PNG")
-    # A table of all grey levels spares the conversion of every pixel.
+    # Convert a table of all grey levels, and not every pixel.
     linear_of = srgb_to_linear(np.linspace(0, 1, 256**image.dtype.itemsize, dtype=np.float32))
     linear: NDArray[np.float32] = np.zeros(image.shape[:2], np.float32)
     for channel, share in enumerate(_LUMINANCE):

@@ -1,16 +1,36 @@
-"""A single-photon camera: which pixels detect a photon in a frame period."""
+"""Simulate a single-photon camera: the pixels that detect a photon in a frame period."""
 
 from __future__ import annotations
 
+from enum import IntEnum
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano import InputError
 from photonpano.photometry import BinaryResponse
-from photonpano_simulator.chance import Draw, generator
+from photonpano.reading import read_array
 from photonpano_simulator.config import Sensor
-from photonpano_simulator.files import read_mask, read_rates
+
+_MINUS_RANGE = np.float32(2.0**8 - 2.0**32)
+"""The range of the draws, negated: 2^32 - 2^8 is the largest number below 2^32 that float32 represents."""
+
+
+class Draw(IntEnum):
+    """The random quantities of a simulation, each with a generator of its own."""
+
+    PHOTONS = 0
+    HOT_PIXELS = 1
+    SHAKE = 2
+    PATH = 3
+
+
+def generator(seed: int, draw: Draw, index: int = 0) -> np.random.Generator:
+    """Return a generator that depends on these three numbers alone."""
+    # SFC64 is the fastest generator of numpy. The numbers are hashed, not added, so that the streams are independent.
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(draw, index))))
 
 
 class SpadSensor:
@@ -20,7 +40,7 @@ class SpadSensor:
         response: how flux becomes counts.
         dark_rates: (H, W) float32, dark counts per frame period, those of hot pixels included.
         hot: (H, W) bool, the hot pixels.
-        valid: (H, W) bool, false for hot pixels that the capture tells of.
+        valid: (H, W) bool, False for hot pixels if the config masks them.
 
     Raises:
         InputError: a file of rates or of hot pixels cannot be used.
@@ -35,10 +55,10 @@ class SpadSensor:
         rng = generator(seed, Draw.HOT_PIXELS)
         self.hot: NDArray[np.bool_] = rng.random(frame_shape) < config.hot_fraction
         if config.hot_pixels is not None:
-            self.hot |= read_mask(config.hot_pixels, frame_shape)
+            self.hot |= _read_mask(config.hot_pixels, frame_shape)
         self.dark_rates: NDArray[np.float32] = np.full(frame_shape, config.dark_rate, np.float32)
         if config.dark_rates is not None:
-            self.dark_rates += read_rates(config.dark_rates, frame_shape)
+            self.dark_rates += _read_rates(config.dark_rates, frame_shape)
         low, high = np.log(config.hot_rate)
         hot_rates = np.exp(rng.uniform(float(low), float(high), frame_shape)).astype(np.float32)
         self.dark_rates[self.hot] += hot_rates[self.hot]
@@ -46,7 +66,7 @@ class SpadSensor:
         self.valid: NDArray[np.bool_] = ~self.hot if config.mask_hot_pixels else np.ones(frame_shape, np.bool_)
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
-        """Return what else is true: `dark_rates` and `hot_pixels`."""
+        """Return the ground truth of the sensor: `dark_rates` and `hot_pixels`."""
         return {"dark_rates": self.dark_rates, "hot_pixels": self.hot}
 
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -56,14 +76,38 @@ class SpadSensor:
             flux: (H, W) photons that are detected per pixel per frame, dark counts not included; it is overwritten.
             rng: the chance of this frame.
         """
-        # The chance that no photon is detected, less one: -p.
+        # -p: the probability that no photon is detected, minus 1.
         chance = np.expm1(np.subtract(self._minus_dark_rates, flux, out=flux), out=flux)
         threshold = np.multiply(chance, _MINUS_RANGE, out=chance).astype(np.uint32)
-        # Whole numbers of 64 bits are drawn faster than floats; each serves two pixels.
+        # Integers of 64 bits, each for two pixels, are drawn faster than floats.
         n_pixels = flux.size
         draws = rng.integers(0, 2**64, -(-n_pixels // 2), dtype=np.uint64).view(np.uint32)[:n_pixels]
         return draws.reshape(flux.shape) < threshold
 
 
-_MINUS_RANGE = np.float32(2.0**8 - 2.0**32)
-"""The range of the draws, negative: the largest that float32 and uint32 share. It misses 2^32 by what float32 cannot tell."""
+def _read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Read (H, W) rates per frame period.
+
+    Raises:
+        InputError: the file is missing, is something else, or holds rates that are negative or not finite.
+    """
+    rates = read_array(path, "a file of rates")
+    if rates.shape != frame_shape or rates.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path} holds {rates.dtype} of shape {rates.shape}; rates are numbers of the frame's shape {frame_shape}"
+        )
+    if not (np.all(np.isfinite(rates)) and np.all(rates >= 0)):
+        raise InputError(f"{path} holds rates that are negative or not finite")
+    return rates.astype(np.float32)
+
+
+def _read_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read an (H, W) mask.
+
+    Raises:
+        InputError: the file is missing or is something else.
+    """
+    mask = read_array(path, "a mask")
+    if mask.shape != frame_shape or mask.dtype != np.bool_:
+        raise InputError(f"{path} holds {mask.dtype} of shape {mask.shape}; a mask is bool of the frame's shape {frame_shape}")
+    return mask

@@ -1,4 +1,4 @@
-"""Sources `simulator` and `camera-simulator`: frames that are made when they are asked for."""
+"""Sources `simulator` and `camera-simulator`: frames are rendered when they are read."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from numpy.typing import NDArray
 from photonpano import FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.reading import Closing
-from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, SimulatorConfig
 from photonpano_simulator.intensity import IntensityCamera
 from photonpano_simulator.paths import camera_path
 from photonpano_simulator.scenes import scene_flux
-from photonpano_simulator.sensor import SpadSensor
+from photonpano_simulator.sensor import Draw, SpadSensor, generator
 
 
 class SimulatorSource(Closing):
-    """A camera that turns before a scene (paper, section 5, "Simulation Details").
+    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
 
-    A frame depends on the config, the seed and its index alone: spans may be asked for in any order and from any thread.
-    Where it falls between the pixels of the scene, the flux is interpolated linearly; a pixel has no extent.
+    A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread. The flux
+    between the pixels of the scene is interpolated linearly; pixels of the camera have no extent.
 
     Raises:
         InputError: a file cannot be used, or the camera path leaves the scene.
@@ -61,7 +60,7 @@ class SimulatorSource(Closing):
         return frames
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
-        """Return what the frames show.
+        """Return the ground truth of the frames.
 
         Convention:
             Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres.
@@ -86,7 +85,7 @@ class SimulatorSource(Closing):
         return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, index))
 
     def _while_open(self, index: int) -> NDArray[np.float64]:
-        """Return where the frame lies while its shutter is open, (n, 3, 3): evenly in time, about a pixel apart."""
+        """Return homographies of a frame while its shutter is open, (n, 3, 3): evenly spaced in time, about a pixel apart."""
         at = self._homographies[index]
         if not self._sensor.exposure or len(self._homographies) == 1:
             return np.asarray(at[None])
@@ -99,13 +98,13 @@ class SimulatorSource(Closing):
         return np.asarray(at + way * ((np.arange(n) + 0.5) / n - 0.5)[:, None, None])
 
     def _view(self, homography: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the flux that a frame sees."""
+        """Return the flux of the scene in a frame, (H, W)."""
         height, width = self.info.frame_shape
         return cv2.warpPerspective(
             self._scene,
             homography,
             (width, height),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            # The path lies inside the scene, but for the rounding of its last decimal.
+            # The path lies inside the scene, up to rounding errors.
             borderMode=cv2.BORDER_REPLICATE,
         ).astype(np.float32, copy=False)

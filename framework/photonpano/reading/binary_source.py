@@ -1,4 +1,4 @@
-"""What all sources of binary frames do once they have them packed."""
+"""Base class of sources of binary frames."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from photonpano.values import Counts, FrameSpan, StreamInfo
 
 
 class BinarySource(Closing, ABC):
-    """Binary frames, eight pixels to a byte: a `photonpano.PackedSource`. A subclass says where the bytes come from.
+    """Binary frames, eight pixels to a byte: a `photonpano.PackedSource`. A subclass reads the bytes.
 
     Attributes:
         info: frames, size, rate.
         response: that of binary frames.
-        valid: (H, W) mask, true everywhere: files say nothing of bad pixels.
-        layout: how the pixels of a frame lie in its bytes.
-        files: what it reads files with, if it does.
+        valid: (H, W) mask, True everywhere: files do not mark bad pixels.
+        layout: order of the pixels of a frame in its bytes.
+        files: reads pieces of files.
     """
 
     def __init__(self, n_frames: int, layout: FrameLayout, frame_rate_hz: float | None = None) -> None:
@@ -36,14 +36,14 @@ class BinarySource(Closing, ABC):
 
     @abstractmethod
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
-        """Yield the frames of a span that the capture holds, a few at a time.
+        """Yield the frames of a span, a few at a time.
 
         Returns:
-            Which of the frames of the span these are, and their packed rows, (n, rows, bytes of a row), which the next step may
+            The place of these frames in the span, and their packed rows, (n, rows, bytes of a row), which the next step may
             overwrite.
 
         Raises:
-            InputError: they cannot be read.
+            InputError: the frames cannot be read.
         """
 
     def counts(self, span: FrameSpan) -> Counts:
@@ -72,5 +72,5 @@ class BinarySource(Closing, ABC):
         return frames
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self.files.close()

@@ -1,4 +1,4 @@
-"""Arrays in .npy.gz files, unpacked once to a file beside them."""
+"""Unpack .npy.gz files once, to a file beside them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _BLOCK_BYTES = 1024**2
 
 
 def is_gzip(path: Path) -> bool:
-    """Tell by its first bytes whether a file is compressed with gzip."""
+    """Return whether a file is compressed with gzip, by its first bytes."""
     return read_start(path, 2) == b"\x1f\x8b"
 
 
 def unpacked_start(path: Path, n_bytes: int) -> bytes:
-    """Return the first bytes of a file, or of what is in it if it is compressed; none where it cannot be read."""
+    """Return the first bytes of a file, unpacked if it is compressed; none if it cannot be read."""
     if not is_gzip(path):
         return read_start(path, n_bytes)
     try:
@@ -34,10 +34,10 @@ def unpacked_start(path: Path, n_bytes: int) -> bytes:
 
 
 def gzipped_npy_header(path: Path) -> NpyHeader:
-    """Read the header of the array in a .npy.gz file, and no more of it.
+    """Read the header of the array in a .npy.gz file, without its data.
 
     Raises:
-        InputError: it cannot be read, or holds something else.
+        InputError: the file cannot be read, or holds something else.
     """
     try:
         with gzip.open(path) as file:
@@ -50,14 +50,13 @@ def gzipped_npy_header(path: Path) -> NpyHeader:
 
 
 def unpacked(path: Path) -> Path:
-    """Return a .npy file with the content of a .npy.gz file.
+    """Return the path of a .npy file with the content of a .npy.gz file.
 
-    It lies beside it, as `capture.npy.gz.unpacked.npy`, and is made when there is none or when it is older; a warning is
-    logged then.
+    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. If that is missing or older, it is written, and a warning logged.
 
     Raises:
         InputError: the file is damaged, or holds something else.
-        OutputError: the unpacked file cannot be written, or its disk has no room for it.
+        OutputError: the unpacked file cannot be written, or does not fit on its disk.
     """
     promised = gzipped_npy_header(path).file_bytes
     target = path.with_name(f"{path.name}.unpacked.npy")
@@ -73,7 +72,7 @@ def unpacked(path: Path) -> Path:
 
 
 def _unpack(path: Path, target: Path, promised: int) -> None:
-    """Unpack at most what the header promises: a damaged file must not fill the disk."""
+    """Unpack at most as many bytes as the header promises: a damaged file must not fill the disk."""
     size = 0
     with target.open("wb") as out, gzip.open(path) as file:
         while block := _next_block(path, file):

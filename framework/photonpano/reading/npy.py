@@ -1,4 +1,4 @@
-"""Headers of .npy files, read without their data, and without trusting them."""
+"""Read and check headers of .npy files, without their data."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from photonpano.reading.files import reading
 
 
 class NpyHeader(NamedTuple):
-    """What a .npy file says of its array.
+    """The header of a .npy file.
 
     Attributes:
-        shape: the shape.
-        dtype: the type of the values.
-        fortran_order: whether the first index runs fastest.
-        offset: where the data begins, in bytes.
+        shape: the shape of the array.
+        dtype: the type of its values.
+        fortran_order: whether the first index varies fastest.
+        offset: start of the data, in bytes.
     """
 
     shape: tuple[int, ...]
@@ -30,7 +30,7 @@ class NpyHeader(NamedTuple):
 
     @property
     def file_bytes(self) -> int:
-        """The size of a file that holds all of it."""
+        """The size of a complete file."""
         return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
 
@@ -38,7 +38,7 @@ def npy_header(path: Path) -> NpyHeader:
     """Read the header of a .npy file.
 
     Raises:
-        InputError: it cannot be read, or is something else.
+        InputError: the file cannot be read, or is something else.
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder; name the .npy file in it")
@@ -50,7 +50,7 @@ def npy_header(path: Path) -> NpyHeader:
 
 
 def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
-    """Return the header at the beginning of an open file, None if there is none that can be read.
+    """Return the header at the beginning of an open file; None if it is damaged or missing.
 
     Raises:
         OSError: the file cannot be read.
@@ -71,7 +71,7 @@ def require_whole(path: Path, header: NpyHeader) -> None:
     """Refuse a .npy file that is shorter than its header promises.
 
     Raises:
-        InputError: it is.
+        InputError: the file is shorter.
     """
     size = path.stat().st_size
     if size < header.file_bytes:

@@ -1,4 +1,4 @@
-"""A source of binary frames that lie in files as they are, one after the other."""
+"""A source of binary frames that lie one after the other in files."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from photonpano.reading.packed_layout import FrameLayout
 from photonpano.values import FrameSpan
 
 _READ_BYTES = 1024**2
-"""So much is read at a time: a core's cache holds it until it is summed."""
+"""Bytes read at once: they stay in the cache of a core until they are summed."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFile:
-    """Frames, one after the other, in a file.
+    """Consecutive frames in a file.
 
     Attributes:
         path: the file.
-        n_frames: how many of its frames are meant.
-        offset: where the first of them begins, in bytes.
+        n_frames: number of the frames.
+        offset: start of the first of them, in bytes.
     """
 
     path: Path
@@ -38,7 +38,7 @@ class FrameFile:
 class PackedFileSource(BinarySource):
     """Binary frames in one file or in many.
 
-    Files are read a little at a time, since mapped ones would fill the memory of the process.
+    Files are read in pieces, because memory-mapped files would fill the memory of the process.
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class PackedFileSource(BinarySource):
         """Take files in the order of their frames.
 
         Args:
-            files: at least one, with at least one frame each; they must be long enough.
-            layout: how the pixels of a frame lie in its bytes.
-            frame_rate_hz: frames a second, None if unknown.
+            files: at least one, each long enough for its frames, of which it has at least one.
+            layout: order of the pixels of a frame in its bytes.
+            frame_rate_hz: frames per second; None if unknown.
         """
         self._parts = tuple(files)
         self._starts = list(accumulate((file.n_frames for file in files), initial=0))
@@ -76,7 +76,7 @@ class PackedFileSource(BinarySource):
         return self.layout.rows(target.reshape(n_frames, *self.layout.stored_shape))
 
     def _buffer(self, size: int) -> NDArray[np.uint8]:
-        """Return memory of the thread."""
+        """Return a buffer of the thread."""
         buffer: NDArray[np.uint8] | None = getattr(self._buffers, "bytes", None)
         if buffer is None or len(buffer) < size:
             buffer = self._buffers.bytes = np.empty(size, np.uint8)

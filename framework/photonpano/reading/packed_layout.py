@@ -1,4 +1,4 @@
-"""How the pixels of binary frames lie in the bytes of a file."""
+"""The order of the pixels of binary frames in the bytes of a file."""
 
 from __future__ import annotations
 
@@ -17,29 +17,28 @@ Pixels = TypeVar("Pixels", bound=np.generic)
 
 
 class Arrangement(Protocol):
-    """Puts blocks of stored images where they belong."""
+    """Moves blocks of stored images to their places in the image."""
 
     def __call__(self, images: NDArray[Pixels], /) -> NDArray[Pixels]:
-        """Return (..., height, columns) of (..., rows, columns), where a column is a pixel or a byte of eight.
+        """Return (..., height, columns) of (..., rows, columns), where a column is a pixel or a byte of eight pixels.
 
-        What is in a byte stays together. It must not write to what it is given.
+        The pixels of a byte stay together. The argument must not be changed.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class FrameLayout:
-    """How the pixels of a binary frame lie in its bytes.
+    """The order of the pixels of a binary frame in its bytes.
 
-    Whatever is only a matter of order is done once to a sum of frames, and not to each of them.
+    Pixels are reordered once in a sum of frames, and not in each frame.
 
     Attributes:
         frame_shape: (height, width) of the image.
-        stored_shape: the shape of the bytes of a frame. They are its packed rows, unless `to_rows` makes those.
-        bit_order: which bit of a byte its first pixel is.
-        arranged: makes images of stored ones; None if the rows are those of the image.
-        to_rows: makes (n, rows, bytes of a row), packed along the width, of (n, *stored_shape). None if that is how they are
-            stored.
+        stored_shape: the shape of the bytes of a frame: its packed rows, unless there is a `to_rows`.
+        bit_order: "big" if the first pixel is the highest bit of a byte, "little" if it is the lowest.
+        arranged: turns stored images into images; None if their rows are those of the image.
+        to_rows: turns (n, *stored_shape) into (n, rows, bytes of a row), packed along the width; None if frames are stored so.
     """
 
     frame_shape: tuple[int, int]
@@ -58,15 +57,15 @@ class FrameLayout:
         return stored if self.to_rows is None else self.to_rows(stored)
 
     def add_counts(self, rows: NDArray[np.uint8], sums: Counts | None) -> Counts:
-        """Add packed rows to sums of them, which `image` turns into sums of the image."""
+        """Add packed rows to their sums, which `image` turns into sums of the image."""
         return packed_counts(rows, 8 * rows.shape[-1], sums, self.bit_order)
 
     def unpacked(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the frames (n, H, W) that packed rows hold."""
+        """Unpack packed rows to frames (n, H, W)."""
         return self.image(np.unpackbits(rows, axis=-1, bitorder=self.bit_order))
 
     def packed(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the frames (n, H, ceil(W / 8)), packed as numpy does; they may share memory with `rows`."""
+        """Return frames packed as by numpy, (n, H, ceil(W / 8)), which may share memory with `rows`."""
         packed = rows if self.bit_order == "big" else reversed_bits(rows)
         if self.arranged is not None:
             packed = self.arranged(packed)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, SourceContext
-from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor
 from photonpano_simulator.intensity import IntensityCamera
+from photonpano_simulator.sensor import Draw, generator
 from photonpano_simulator.source import SimulatorSource
 
 SHAPE = (200, 301)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from photonpano import InputError
-from photonpano_simulator.chance import Draw, generator
 from photonpano_simulator.config import Sensor
-from photonpano_simulator.sensor import SpadSensor
+from photonpano_simulator.sensor import Draw, SpadSensor, generator
 
 SHAPE = (60, 81)
 
