@@ -159,7 +159,7 @@ class Recognised:
 
     Attributes:
         keys: the keys that open it, the path among them; they are what a spec would say under `with`.
-        because: a clause that completes "it is taken for ...: ", with what decided, such as "8,388,608 bytes a file".
+        because: a clause that completes "it was recognised as ...: ", with what decided, such as "8,388,608 bytes a file".
     """
 
     keys: Mapping[str, Any]

@@ -107,8 +107,8 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
     spec.problems += found.problems
     here = {f"{keys}.{key}": replace(spec.place(f"{keys}.path"), where=f"{keys}.{key}") for key in found.data}
     spec.places = here | spec.places
-    spec.remark = f" ({path.name} is taken for {entry.name}: {answer.because})"
-    spec.decisions.append(Decision(where, entry.name, f"{path.name} is taken for it: {answer.because}"))
+    spec.remark = f" ({path.name} was recognised as {entry.name}: {answer.because})"
+    spec.decisions.append(Decision(where, entry.name, f"{path.name} was recognised: {answer.because}"))
     others = {key: value for key, value in written.items() if key not in AutoConfig.model_fields}
     return section | {"use": entry.name, "with": found.data | others}
 

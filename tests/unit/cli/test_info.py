@@ -29,7 +29,7 @@ def test_info_prints_facts_and_valid_spec(cube: Path, invoke: Callable[..., Any]
     result = invoke("info", "cube.npy", "--with", "frame_rate_hz=96800")
     assert (result.exit_code, result.stderr) == (0, "")
     rows = rows_of(result.stdout)
-    assert rows["source"] == "packed-npy (cube.npy is taken for it: uint8 of shape (200, 96, 20) in a .npy file)"
+    assert rows["source"] == "packed-npy (cube.npy was recognised: uint8 of shape (200, 96, 20) in a .npy file)"
     assert rows["capture"] == "200 binary frames of 96x160 at 96,800 Hz"
     assert rows["duration"] == "2.07 ms"
     flux, _, unit = rows["flux"].partition(" ")

@@ -74,7 +74,7 @@ def test_unrecognised_capture_exits_2_and_lists_known_endings(
         (
             {"keys": ["width=wide"]},
             "--with width: expected an integer of at least 1 or null, got 'wide' "
-            "(cube.npy is taken for packed-npy: uint8 of shape (20, 8, 2) in a .npy file)",
+            "(cube.npy was recognised as packed-npy: uint8 of shape (20, 8, 2) in a .npy file)",
         ),
         ({"keys": ["width"]}, "--with width: expected KEY=VALUE, such as frame_rate_hz=96800"),
         ({"corrections": ["rot9"]}, "--correct: there is no correction 'rot9'; did you mean "),
@@ -104,7 +104,7 @@ def test_unreadable_capture_names_recognised_source(folder: Path, invoke: Callab
     result = invoke("info", "film.mp4")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr.endswith(
-        "export or copy it again (source video: film.mp4 is taken for it: by its first bytes it is an MP4 or MOV file)\n"
+        "export or copy it again (source video: film.mp4 was recognised: by its first bytes it is an MP4 or MOV file)\n"
     )
 
 
@@ -113,7 +113,7 @@ def test_refused_capture_names_recognised_source(folder: Path, invoke: Callable[
     (folder / "pictures" / "a.png").write_bytes(b"no picture")
     result = invoke("info", "pictures")
     assert result.exit_code == 2
-    assert result.stderr.endswith("(pictures is taken for image-folder: it holds 1 .png file)\n")
+    assert result.stderr.endswith("(pictures was recognised as image-folder: it holds 1 .png file)\n")
 
 
 def test_missing_library_of_recognised_source_names_no_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +129,7 @@ def test_check_and_explain_give_reason_of_automatic_source(cube: Path, invoke: C
     Path("scan.yaml").write_text(
         "version: 1\nsource: {use: auto, with: {path: cube.npy}}\nresample: {with: {group_size: 5}}\nlevels: 1\n"
     )
-    because = "cube.npy is taken for it: uint8 of shape (20, 8, 2) in a .npy file"
+    because = "cube.npy was recognised: uint8 of shape (20, 8, 2) in a .npy file"
     assert invoke("check", "scan.yaml").stdout == (
         f"scan.yaml: ok, 1 level on packed-npy: 20 binary frames of 8x16\nsource is packed-npy: {because}\n"
     )

@@ -52,7 +52,7 @@ def test_auto_is_the_source_that_recognises_the_path(folder, catalog):
     plan = parsed(folder, catalog, path="cube.npy", frame_rate_hz=96800)
     named = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy"), "frame_rate_hz": 96800}}
     assert plan.document == parse_spec({"version": 1, "source": named}, directory=folder, catalog=catalog).document
-    assert plan.decisions == (Decision("source", "packed-npy", "cube.npy is taken for it: its name ends in .npy"),)
+    assert plan.decisions == (Decision("source", "packed-npy", "cube.npy was recognised: its name ends in .npy"),)
 
 
 def test_a_source_that_is_named_is_no_decision(folder, catalog):
@@ -147,7 +147,7 @@ def test_one_that_returns_something_else_is_named(folder, catalog):
 
 def test_a_wrong_key_is_told_at_its_place_with_whom_it_was_given_to(folder, catalog):
     said = told(folder, catalog, "source:\n  use: auto\n  with:\n    path: cube.npy\n    frame_rate: 5\n    width: 3\n")
-    because = "(cube.npy is taken for packed-npy: its name ends in .npy)"
+    because = "(cube.npy was recognised as packed-npy: its name ends in .npy)"
     assert said.splitlines() == [
         f"scan.yaml:6:5: source.with.frame_rate: unknown key; did you mean 'frame_rate_hz'? {because}",
         f"scan.yaml:7:5: source.with.width: unknown key; known: frame_rate_hz and path {because}",
@@ -184,5 +184,5 @@ def test_a_source_that_lacks_a_library_says_so(folder, catalog):
     said = told(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
     assert said == (
         "scan.yaml:2:15: source.use: the source 'needy' needs no_such_library, which is not installed: pip install "
-        '"photonpano[heavy]" (in a checkout: pip install ".[heavy]") (cube.dat is taken for needy: it is heavy)'
+        '"photonpano[heavy]" (in a checkout: pip install ".[heavy]") (cube.dat was recognised as needy: it is heavy)'
     )
