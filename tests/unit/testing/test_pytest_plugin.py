@@ -58,7 +58,7 @@ def test_pytest_plugin_imports_pytest_only():
         "print(*sorted(set(sys.modules) - before))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    package = ["photonpano", "photonpano.lazy", "photonpano.testing", "photonpano.testing.pytest_plugin"]
+    package = ["lazy_loader", "photonpano", "photonpano.testing", "photonpano.testing.pytest_plugin"]
     assert done.stdout.split() == package
 
 

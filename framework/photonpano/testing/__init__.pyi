@@ -1,0 +1,10 @@
+from .captures import KnownMotion as KnownMotion
+from .captures import MemorySource as MemorySource
+from .captures import photographed as photographed
+from .captures import recorded as recorded
+from .interpolators import InterpolatorConformance as InterpolatorConformance
+from .locators import LocatorConformance as LocatorConformance
+from .mergers import MergerConformance as MergerConformance
+from .resamplers import ResamplerConformance as ResamplerConformance
+from .scenes import Scene as Scene
+from .sources import SourceConformance as SourceConformance
