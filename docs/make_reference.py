@@ -2,8 +2,8 @@
 
     python docs/make_reference.py
 
-What stands between `<!-- generated: WHAT -->` and `<!-- end -->` is written anew; all else is left as it is. A test fails
-while a page is out of date.
+The script rewrites the text between `<!-- generated: WHAT -->` and `<!-- end -->`, and nothing else. A test fails if a page is
+out of date.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from photonpano.specs.settings import LevelSettings
 REFERENCE = Path(__file__).parent / "reference"
 BLOCK = re.compile(r"(?<=<!-- generated: )(?P<what>[^>]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
 COMPUTED = {"directory": "`runs/` and the name of the spec"}
-"""Defaults that no model holds."""
+"""Defaults that are computed, and so are not in the model."""
 
 
 def main() -> None:
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def updated(text: str) -> str:
-    """Return a page with its generated parts as they should be."""
+    """Return a page with its generated parts up to date."""
     return BLOCK.sub(lambda match: f"{match['what']} -->\n{generated(match['what'])}\n", text)
 
 
@@ -73,7 +73,7 @@ def generated(what: str) -> str:
 
 
 def config_table(config: type[BaseModel]) -> str:
-    """Return the keys of a config."""
+    """Return a table of the keys of a config."""
     rows = []
     for row in config_rows(config):
         default = "required" if row.default is None else f"`{row.default}`"
@@ -83,7 +83,7 @@ def config_table(config: type[BaseModel]) -> str:
 
 
 def components() -> str:
-    """Return what this distribution offers."""
+    """Return a table of the components of this distribution."""
     rows = [
         [f"`{KINDS[entry.kind].section}`", f"[`{entry.name}`](#{entry.name})", entry.contribution.summary]
         for entry in discover().rows
@@ -93,7 +93,7 @@ def components() -> str:
 
 
 def corrections() -> str:
-    """Return all corrections, and what they do."""
+    """Return a table of all corrections."""
     rows = []
     for name, model in CORRECTIONS.items():
         shown = f"[`{name}`](#{name})" if model.model_fields else f"`{name}`"
@@ -102,7 +102,7 @@ def corrections() -> str:
 
 
 def command(names: Sequence[str]) -> str:
-    """Return what a command is called with."""
+    """Return a table of the arguments and options of a command."""
     node: Any = typer.main.get_command(app)
     for name in names:
         node = node.commands[name]
@@ -121,7 +121,7 @@ def command(names: Sequence[str]) -> str:
 
 
 def functions(names: Sequence[str]) -> str:
-    """Return how functions of `photonpano` are called, and what they do."""
+    """Return a table of functions of `photonpano`."""
     rows = []
     for name in names:
         function = getattr(photonpano, name)
