@@ -42,11 +42,11 @@ SpecPath = Annotated[Path, AfterValidator(_relative_to_spec)]
 
 @dataclass(frozen=True, slots=True)
 class SourceContext:
-    """What the framework tells a source when it is built.
+    """The run for which a source is built.
 
     Attributes:
         seed: the seed of the run; all randomness derives from it.
-        threads: how many threads the component may use.
+        threads: the number of threads that the component may use.
     """
 
     seed: int = 0
@@ -58,22 +58,22 @@ def _unread() -> CaptureSummary:
 
 
 def _not_recorded(what: str, value: DecisionValue, reason: str) -> None:
-    """Forget a choice: nothing is recorded where nothing runs."""
+    """Record nothing: the default `decide` of a context."""
 
 
 @dataclass(frozen=True, slots=True)
 class StageContext:
-    """What the framework tells every other component when it is built.
+    """The run for which a resampler, merger, locator or interpolator is built.
 
     Attributes:
         stream: the capture's frames, size and rate.
         response: the camera's response.
         seed: the seed of the run; all randomness derives from it.
-        threads: how many threads the component may use.
-        capture: returns how bright the capture is and how fast it moves; measured when a run first asks. Raises
-            `CaptureUnreadError` where a spec is only explained: ask for it when the component works, not when it is built.
-        decide: records something that the spec leaves open and the component chose: what, its value (a number, a text, true
-            or false), and a clause with the reason. It ends up in `run.json` and in the report.
+        threads: the number of threads that the component may use.
+        capture: returns the flux and the speed of the capture, which are measured at the first call. Raises
+            `CaptureUnreadError` where a spec is only explained: call it when the component works, not when it is built.
+        decide: records a choice that the spec leaves to the component: what was chosen, its value (a number, a text, true
+            or false), and a clause with the reason. `run.json` and the report list it.
     """
 
     stream: StreamInfo
@@ -121,7 +121,7 @@ class Contribution:
         summary: one line for lists.
         config: the closed, frozen model of the keys under `with`.
         build: makes the component from an instance of `config` and the context; heavy libraries are imported here, not before.
-        check: finds problems of a config; the subclasses say of which.
+        check: finds problems of a config; see the subclasses.
         requires: libraries that may be missing, and how to install them.
         api_version: the version of the contract that the plugin was made for. A published plugin writes the number, so that a
             photonpano with another contract refuses it with a clear message.
@@ -155,11 +155,11 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True)
 class Recognised:
-    """What a source takes for its own when it is shown a path.
+    """The answer of a source that recognises a capture.
 
     Attributes:
-        keys: the keys that open it, the path among them; they are what a spec would say under `with`.
-        because: a clause that completes "it was recognised as ...: ", with what decided, such as "8,388,608 bytes a file".
+        keys: the keys that open it, the path among them, as a spec would have them under `with`.
+        because: the reason, as a clause after "it was recognised as ...: ", such as "8,388,608 bytes a file".
     """
 
     keys: Mapping[str, Any]
@@ -175,11 +175,11 @@ class SourceContribution(Contribution):
     """Offers a source.
 
     Attributes:
-        check: problems of a config that can be told without reading the capture, such as a missing file.
-        recognise: tells whether a path is a capture of this source, for specs that leave the choice to `auto`. It looks at
-            names, sizes and first bytes, imports nothing heavy, and raises nothing.
-        suffixes: how the names of its files end, in small letters, such as ".npy": if nobody recognises a path, only sources
-            are heard of whose files it could be. Empty for any.
+        check: finds problems of a config without reading the capture, such as a missing file.
+        recognise: returns the keys of a capture if it is one of this source, for specs that leave the choice to `auto`. It
+            reads names, sizes and first bytes, imports nothing heavy, and raises nothing.
+        suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
+            the message has the problems of the sources with its ending.
     """
 
     kind: ClassVar[str] = "source"
@@ -194,7 +194,7 @@ class StageContribution(Contribution):
     """Offers a component of one of the four stages.
 
     Attributes:
-        check: problems of a config for a capture that looks like this; reads no data, imports nothing heavy.
+        check: finds problems of a config with a capture, from its description; reads no data, imports nothing heavy.
     """
 
     check: Callable[[Any, StreamInfo], Sequence[str]] = no_problems

@@ -1,4 +1,4 @@
-"""The errors that users meet: each message says what, where, and what to do.
+"""The errors that users meet: each message has what happened, where, and what to do.
 
 Everything raised on purpose derives from `PhotonpanoError`; anything else that escapes is a defect.
 """
@@ -34,7 +34,7 @@ class OutputError(PhotonpanoError):
 
 
 class CaptureUnreadError(PhotonpanoError):
-    """A component asked for what only the frames of a capture tell, where none are read."""
+    """A component needs a measurement of the capture, where no frames are read."""
 
 
 class PluginError(PhotonpanoError):

@@ -236,14 +236,14 @@ def photonpano_run_started(directory: Path, spec: Mapping[str, Any]) -> None:
 def photonpano_stage_finished(
     directory: Path, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]
 ) -> None:
-    """Watch a stage end. Merging and locating alternate, so all four stages of a level are told when the level is done.
+    """Watch a stage end. Merging and locating alternate, so the hook is called for all four stages when the level is done.
 
     Args:
-        directory: the run folder, which tells runs apart.
+        directory: the run folder, by which runs can be distinguished.
         level: from 1; None for the panorama.
         stage: "resample", "merge", "locate" or "interpolate"; at the end of the run "render".
         seconds: how long it took.
-        summary: what it made. resample: `groups`; merge: `exposures`; locate: `pairs`, how many of them `failed`, and `located`
+        summary: what it made. resample: `groups`; merge: `exposures`; locate: `pairs`, the number of them that `failed`, and `located`
             exposures; interpolate: `change_px` (None at level 1) and `std_px` (None if not known), as in `run.json`; render:
             `height` and `width` of the panorama.
 

@@ -1,4 +1,4 @@
-"""Collect what one plugin offers, apart from all others."""
+"""Call the hooks of one plugin, and check what they return."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PREFIX = f"{hookspecs.PROJECT}_"
 HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
 """All hooks, in the order in which they are specified."""
 OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
-"""Those that offer nothing: they are told what happens in a run."""
+"""The hooks that offer nothing: a run calls them, so that a plugin can watch it."""
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:
@@ -51,7 +51,7 @@ def require_same_contract(contribution: Contribution) -> None:
     """Refuse a contribution that was made for another version of the contract.
 
     Raises:
-        PluginError: says which version, and what to upgrade.
+        PluginError: the message has both versions, and what to upgrade.
     """
     made_for = contribution.api_version
     if made_for == API_VERSION:
@@ -63,7 +63,7 @@ def require_same_contract(contribution: Contribution) -> None:
 
 
 def _registered(plugin: object) -> pluggy.PluginManager:
-    """Register a plugin with a manager of its own, so that nothing it does wrong touches another."""
+    """Register a plugin with a manager of its own, so that its mistakes affect no other plugin."""
     manager = pluggy.PluginManager(hookspecs.PROJECT)
     manager.add_hookspecs(hookspecs)
     _check_names(plugin, manager)
@@ -76,7 +76,7 @@ def _registered(plugin: object) -> pluggy.PluginManager:
 
 
 def _check_names(plugin: object, manager: pluggy.PluginManager) -> None:
-    """Refuse functions that look like hooks and are none: pluggy would pass over them in silence."""
+    """Refuse functions with the name of a hook that are none, which pluggy would ignore."""
     for name in dir(plugin):
         if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
             continue

@@ -28,7 +28,7 @@ class TolerantJsonSchema(GenerateJsonSchema):
     """Describes what JSON Schema can express, and leaves the rest open, so that one odd field spoils nothing else."""
 
     def tagged_union_schema(self, schema: core_schema.TaggedUnionSchema) -> dict[str, Any]:
-        """Require the key that tells the alternatives apart, as validation does whatever its default."""
+        """Require the key that distinguishes the alternatives, as validation does whatever its default."""
         described = super().tagged_union_schema(schema)
         if "discriminator" in described:
             described["required"] = [described["discriminator"]["propertyName"]]
@@ -62,7 +62,7 @@ def alternatives(schema: Schema, root: Schema) -> list[Schema]:
 
 
 def discriminator(schema: Schema, root: Schema) -> tuple[str | None, list[str]]:
-    """Return the key that tells the alternatives of a union of mappings apart, and its values; None if there is none."""
+    """Return the key that distinguishes the alternatives of a union of mappings, and its values; None if there is none."""
     found = resolved(schema, root).get("discriminator", {})
     return found.get("propertyName"), list(found.get("mapping", ()))
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def resolved_corrections(data: Any, spec: WrittenSpec) -> tuple[Correction, ...]:
-    """Resolve the section `corrections`.
+    """Resolve the section `corrections`; corrections with problems are left out.
 
     Args:
         data: a list; None counts as an empty one.

@@ -1,4 +1,4 @@
-"""The JSON Schema of specs, for editors: names are completed, keys explained, values checked while they are typed."""
+"""The JSON Schema of specs, with which editors complete names, explain keys and check values."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Schema: TypeAlias = dict[str, Any]
 SECTION = ["object", "null"]
 """A section may be left empty."""
 FALLBACK = "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}"
-"""What editors say of the fallback of a locator."""
+"""The description of the fallback of a locator."""
 
 
 def json_schema(catalog: Catalog) -> Schema:

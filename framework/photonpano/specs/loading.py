@@ -63,7 +63,7 @@ def parse_spec(
     Args:
         spec: the spec; a `Plan.document` is one.
         directory: what relative paths in it count from.
-        name: names the run folder, `runs/NAME`, of a spec that does not say.
+        name: the name of the run folder, `runs/NAME`, unless the spec has an `output.directory`.
         overrides: values to change, such as `run.seed=1`.
         output: the run folder, relative to the current folder, in place of the spec's `output.directory`.
         catalog: what can be chosen; by default what the installed plugins offer.

@@ -10,7 +10,7 @@ from photonpano.contributions import Config, SpecPath
 
 
 class LevelSettings(Config):
-    """What a level says of itself, beside the stages that it overrides."""
+    """The settings of a level, beside the stages that it overrides."""
 
     scale: Literal["auto"] | Annotated[float, Field(ge=0.05, le=4)] = Field(
         "auto",
