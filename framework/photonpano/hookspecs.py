@@ -243,7 +243,7 @@ def photonpano_stage_finished(
         level: from 1; None for the panorama.
         stage: "resample", "merge", "locate" or "interpolate"; at the end of the run "render".
         seconds: how long it took.
-        summary: what it made. resample: `groups`; merge: `exposures`; locate: `pairs`, the number of them that `failed`, and `located`
+        summary: its results. resample: `groups`; merge: `exposures`; locate: `pairs`, `failed` pairs and `located`
             exposures; interpolate: `change_px` (None at level 1) and `std_px` (None if not known), as in `run.json`; render:
             `height` and `width` of the panorama.
 

@@ -1,4 +1,4 @@
-"""The examples of the hooks are what a plugin author copies: they run, register, and can be run in a pipeline."""
+"""The examples in the docstrings of the hooks, which plugin authors copy, work."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ KINDS = {
 }
 
 
-WATCHED = {
+OBSERVED = {
     "photonpano_run_started": "runs/scan: begins with simulator, seed 3\n",
     "photonpano_stage_finished": "level 2: locate took 1.5 s\n",
     "photonpano_run_finished": "runs/scan: done\n",
 }
-"""What the examples of the hooks that watch runs print, of `TOLD`."""
-TOLD: dict[str, dict[str, Any]] = {
+"""The output of the examples of the observation hooks, called with `ARGUMENTS`."""
+ARGUMENTS: dict[str, dict[str, Any]] = {
     "photonpano_run_started": {"spec": {"source": {"use": "simulator"}, "run": {"seed": 3}}},
     "photonpano_stage_finished": {"level": 2, "stage": "locate", "seconds": 1.46, "summary": {}},
     "photonpano_run_finished": {"record": {}, "error": None},
@@ -49,35 +49,32 @@ def example_of(hook: str) -> types.ModuleType:
     return module
 
 
-def test_every_hook_offers_a_kind_or_watches_runs_and_is_tested_here() -> None:
-    assert set(HOOKS) == {*KINDS, *WATCHED}
+def test_every_hook_is_tested_here() -> None:
+    assert set(HOOKS) == {*KINDS, *OBSERVED}
     assert {hook: kind for hook, (kind, _) in KINDS.items()} == {kind.hook: kind.name for kind in registry.KINDS.values()}
-    assert set(WATCHED) == set(OBSERVATION_HOOKS)
+    assert set(OBSERVED) == set(OBSERVATION_HOOKS)
 
 
 @pytest.mark.parametrize("hook", KINDS)
-def test_a_hook_takes_nothing_and_shows_a_complete_example(hook: str) -> None:
+def test_component_hook_has_no_arguments_and_complete_example(hook: str) -> None:
     assert not inspect.signature(HOOKS[hook]).parameters
     (contribution,) = contributions_of(example_of(hook))
     assert (contribution.kind, contribution.name) == KINDS[hook]
 
 
-@pytest.mark.parametrize("hook", WATCHED)
-def test_a_hook_that_watches_explains_its_arguments_and_shows_a_complete_example(
-    hook: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("hook", OBSERVED)
+def test_observation_hook_has_documented_arguments_and_complete_example(hook: str, capsys: pytest.CaptureFixture[str]) -> None:
     docstring = inspect.getdoc(HOOKS[hook]) or ""
     arguments = list(inspect.signature(HOOKS[hook]).parameters)
     assert re.findall(r"^    (\w+): ", docstring.partition("Args:\n")[2].partition("Example:")[0], re.MULTILINE) == arguments
     observation = observation_of(example_of(hook))
-    assert set(TOLD[hook]) | {"directory"} == set(arguments)
-    getattr(observation, hook)(directory=Path("runs/scan"), **TOLD[hook])
-    assert capsys.readouterr().err == WATCHED[hook]
+    assert set(ARGUMENTS[hook]) | {"directory"} == set(arguments)
+    getattr(observation, hook)(directory=Path("runs/scan"), **ARGUMENTS[hook])
+    assert capsys.readouterr().err == OBSERVED[hook]
 
 
 @pytest.mark.parametrize("section", ["merge", "interpolate"])
-def test_examples_of_stages_do_their_work(section: str, small_spec: dict[str, Any], tmp_path: Path) -> None:
-    """The other two give two groups, and none located: see below."""
+def test_stage_example_locates_all_exposures(section: str, small_spec: dict[str, Any], tmp_path: Path) -> None:
     hook, name = {"merge": ("photonpano_mergers", "naive-sum"), "interpolate": ("photonpano_interpolators", "nearest")}[section]
     catalog = discover().including(example_of(hook))
     plan = parse_spec(small_spec | {section: {"use": name}, "levels": 1}, output=tmp_path / "run", catalog=catalog)
@@ -86,7 +83,7 @@ def test_examples_of_stages_do_their_work(section: str, small_spec: dict[str, An
     assert record["levels"][0]["located"] == 6
 
 
-def test_the_example_of_a_merger_knows_nothing_of_masked_pixels(memory_source: type) -> None:
+def test_merger_example_masks_invalid_pixels(memory_source: type) -> None:
     frames, valid = np.ones((10, 4, 6)), np.ones((4, 6), bool)
     valid[1, 2] = False
     (contribution,) = contributions_of(example_of("photonpano_mergers"))
@@ -96,7 +93,7 @@ def test_the_example_of_a_merger_knows_nothing_of_masked_pixels(memory_source: t
     np.testing.assert_array_equal(exposure.weight, np.where(valid, 10, 0))
 
 
-def test_an_example_that_takes_no_scale_is_refused_where_there_is_one(small_spec: dict[str, Any], tmp_path: Path) -> None:
+def test_merger_example_at_half_scale_breaks_contract(small_spec: dict[str, Any], tmp_path: Path) -> None:
     catalog = discover().including(example_of("photonpano_mergers"))
     spec = small_spec | {"merge": {"use": "naive-sum"}, "levels": [{"scale": 0.5}]}
     with pytest.raises(PluginError) as caught:
@@ -107,7 +104,7 @@ def test_an_example_that_takes_no_scale_is_refused_where_there_is_one(small_spec
     )
 
 
-def test_the_example_of_a_resampler_gives_two_groups() -> None:
+def test_resampler_example_gives_two_groups() -> None:
     (contribution,) = contributions_of(example_of("photonpano_resamplers"))
     groups = contribution.build(contribution.config(), None).groups(100, 1)
     assert [str(group) for group in groups] == ["frames 0 to 49", "frames 50 to 99"]
@@ -120,7 +117,7 @@ class TestHalves(ResamplerConformance):
     hook_module = "photonpano.hookspecs"
 
 
-def test_the_example_of_a_locator_finds_nothing_and_says_so() -> None:
+def test_locator_example_returns_not_located() -> None:
     (contribution,) = contributions_of(example_of("photonpano_locators"))
     locator = contribution.build(contribution.config(), None)
     assert locator.register(locator.describe(None), locator.describe(None), None).reason == "this example looks at nothing"

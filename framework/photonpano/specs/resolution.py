@@ -156,22 +156,41 @@ class _Resolver:
             name: such as "locate".
             data: the section.
             where: its path.
-            base: what a level goes on from: a section without `use` updates the keys of that.
+            base: for a section of a level, that of all levels: without `use`, the section updates the keys of this.
         """
-        spec, kind = self.spec, KIND_OF[name]
+        spec = self.spec
         content = spec.mapping(data, where, " such as {use: NAME}")
         if content is None:
             return _Stage()
+        if "use" in content:
+            base = None
+        section = self.spelled_out(name, content, where, base)
+        if section is None:
+            return _Stage()
+        n_problems = len(spec.problems)
+        choice = self.component(KIND_OF[name], section, where)
+        if base is not None:  # the problems of the keys that a level inherits are reported once
+            reported = {(each.where.removeprefix(name), each.message) for each in spec.problems[:n_problems]}
+            new = spec.problems[n_problems:]
+            spec.problems[n_problems:] = [x for x in new if (x.where.removeprefix(where), x.message) not in reported]
+        if name != "locate":
+            return _Stage(section, choice)
+        inherited = base is not None and content.get("fallback") is None
+        if base is not None and inherited and choice == base.choice:
+            return _Stage(section, choice, base.fallbacks)
+        return _Stage(section, choice, self.fallbacks(section["fallback"], where, choice, inherited))
+
+    def spelled_out(self, name: str, content: dict[str, Any], where: str, base: _Stage | None) -> dict[str, Any] | None:
+        """Return a section with what it inherits, defaults and aliases filled in, and fallbacks as a list; None if it cannot be."""
+        spec, kind = self.spec, KIND_OF[name]
         section = dict(content)
-        inherits = base is not None and "use" not in content
-        if base is not None and inherits:
+        if base is not None:
             if base.section is None:
-                return _Stage()
-            given_keys = {key: value for key, value in content.items() if value is not None}
-            section = base.section | given_keys | {"with": _updated(base.section.get("with"), content.get("with"))}
-            for key in ("use", "with", "fallback"):
-                if key not in given_keys or key == "with":
-                    spec.places = spec.places_under(f"{name}.{key}", f"{where}.{key}") | spec.places
+                return None
+            own = {key: value for key, value in content.items() if value is not None}
+            section = base.section | own | {"with": _updated(base.section.get("with"), content.get("with"))}
+            for key in {"use", "with", "fallback"} - (own.keys() - {"with"}):
+                spec.places = spec.places_under(f"{name}.{key}", f"{where}.{key}") | spec.places
         elif "use" not in content and name in DEFAULTS:
             section["use"] = DEFAULTS[name]
         known = ("use", "with", "fallback") if name == "locate" else ("use", "with")
@@ -179,27 +198,18 @@ class _Resolver:
         if alias := self.alias(kind, section.get("use")):
             expanded = alias.expand(section, where, spec)
             if expanded is None or self.is_alias(kind, expanded, where):
-                return _Stage()
+                return None
             section = expanded
-        n_problems = len(spec.problems)
-        choice = self.component(kind, section, where)
-        if base is not None and inherits:
-            # What is wrong with the keys that a level goes on from is not reported again.
-            known_problems = {(each.where.removeprefix(name), each.message) for each in spec.problems[:n_problems]}
-            new = spec.problems[n_problems:]
-            spec.problems[n_problems:] = [x for x in new if (x.where.removeprefix(where), x.message) not in known_problems]
+        fallback = section.get("fallback")
         if name != "locate":
-            return _Stage(section, choice)
-        if section.get("fallback") is None:
+            return section
+        if fallback is None:
             default = "use" not in content and DEFAULT_FALLBACK in self.catalog.names(kind.name)
             section["fallback"] = [DEFAULT_FALLBACK] if default else []
-        elif not isinstance(section["fallback"], list):
-            section["fallback"] = [section["fallback"]]
+        elif not isinstance(fallback, list):
+            section["fallback"] = [fallback]
             spec.places = spec.places_under(f"{where}.fallback", f"{where}.fallback.0") | spec.places
-        inherited = inherits and content.get("fallback") is None
-        if base is not None and inherited and choice == base.choice:
-            return _Stage(section, choice, base.fallbacks)
-        return _Stage(section, choice, self.fallbacks(section["fallback"], where, choice, inherited))
+        return section
 
     def fallbacks(self, items: list[Any], where: str, first: Choice | None, inherited: bool) -> tuple[Choice, ...]:
         """Resolve the locators to which lost pairs are offered.

@@ -58,7 +58,7 @@ def test_including_a_broken_plugin_is_an_error():
         Catalog().including(plugin)
 
 
-def test_including_what_watches_runs():
+def test_including_plugin_with_observation_hooks_adds_observer():
     plugin = ModuleType("my_hooks")
     plugin.photonpano_run_started = hookimpl(lambda: None)
     catalog = Catalog().including(plugin, MERGER).including(locator("direct"))
@@ -86,7 +86,7 @@ def test_including_a_contribution_for_another_contract_is_an_error():
         ("source", "cube", "there is no source 'cube'"),
     ],
 )
-def test_unknown_name_says_what_is_near(kind, name, expected, catalog):
+def test_unknown_name_suggests_nearest_names(kind, name, expected, catalog):
     assert message(catalog, kind, name) == expected
 
 
@@ -108,7 +108,7 @@ def test_unknown_name_of_a_catalog_with_disabled_plugins():
     )
 
 
-def test_missing_library_says_how_to_install_it():
+def test_missing_library_names_extra_for_index_and_checkout():
     catalog = Catalog().including(locator("loftr", KORNIA), locator("both", KORNIA, Requirement("no.such.module", "other>=2")))
     assert catalog.find("locator", "loftr").unavailable == (
         "the locator 'loftr' needs no_such_kornia, which is not installed: "

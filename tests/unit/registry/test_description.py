@@ -59,7 +59,7 @@ LOCATOR = LocatorContribution(
 )
 
 
-def test_rows_say_type_default_and_bounds():
+def test_config_rows_have_type_default_and_bounds():
     assert config_rows(LocatorConfig) == (
         ConfigRow("weights", "path", None, "", "a local file"),
         ConfigRow("ratio", "number", "0.8", "above 0 and below 1", "nearest to second match"),
@@ -101,7 +101,7 @@ class Empty(Config):
     pass
 
 
-def test_component_without_keys():
+def test_component_without_keys_has_no_rows():
     bare = LocatorContribution(name="bare", summary="A toy", config=Empty, build=unbuilt)
     assert (config_rows(Empty), snippet(bare)) == ((), "locate:\n  use: bare\n")
 
@@ -168,7 +168,7 @@ class Elaborate(Config):
     many: Inner | Near = Inner()
 
 
-def test_defaults_that_are_computed_or_mappings_among_alternatives():
+def test_config_rows_of_computed_defaults_and_unions():
     rows = config_rows(Elaborate)
     assert [(row.key, row.default) for row in rows][:3] == [
         ("when", "computed"),
@@ -188,7 +188,7 @@ class Nest(Config):
     inner: "Nest | None" = None
 
 
-def test_configs_that_contain_themselves():
+def test_config_rows_of_recursive_config_end():
     tree, nest = config_rows(Tree), config_rows(Nest)
     assert tree == (ConfigRow("children", "list of mappings", "[]", "", ""),)
     assert nest[1] == ConfigRow("inner.inner", "mapping or null", "null", "", "")

@@ -1,4 +1,4 @@
-"""Plugins as they come: whole, broken, and in each other's way."""
+"""Discovery of plugins: working, broken, disabled, and with conflicting names."""
 
 import pytest
 
@@ -128,7 +128,7 @@ def test_distribution_without_metadata_is_still_used(install):
     assert {(row.origin.plugin, row.origin.version) for row in of_toys(discover().rows)} == {("unknown", "unknown")}
 
 
-def test_one_contribution_instead_of_a_list_will_do(install):
+def test_hook_may_return_single_contribution(install):
     install("alpha", "1.2", "@hookimpl\ndef photonpano_sources(): return source('single')")
     assert discover().find("source", "single").origin.plugin == "alpha"
 
@@ -189,7 +189,7 @@ def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     assert disabled == ["colmap", "core", "direct", "framework", "kornia", "opencv", "sensors", "simulator"]
 
 
-def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
+def test_unknown_name_mentions_disabled_plugins(install, monkeypatch):
     install("alpha", "1.2", GOOD)
     install("beta", "2.0", GOOD.replace("toy", "mine"))
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "beta")
@@ -202,7 +202,7 @@ def test_a_name_of_a_disabled_plugin_says_so(install, monkeypatch):
     )
 
 
-def test_disabling_one_of_two_settles_whose_a_name_is(install, monkeypatch):
+def test_disabling_one_of_two_plugins_resolves_name_conflict(install, monkeypatch):
     install("alpha", "1.2", GOOD)
     install("beta", "2.0", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "alpha")
@@ -216,7 +216,7 @@ def test_disabling_one_of_two_settles_whose_a_name_is(install, monkeypatch):
         ("zzz,alpha, yyy", "names 'zzz' and 'yyy', which are no installed plugins; known: {known}"),
     ],
 )
-def test_unknown_names_of_disabled_plugins_are_told(words, message, install, monkeypatch, caplog):
+def test_disabling_unknown_plugin_is_logged(words, message, install, monkeypatch, caplog):
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     discover()
@@ -225,7 +225,7 @@ def test_unknown_names_of_disabled_plugins_are_told(words, message, install, mon
 
 
 @pytest.mark.parametrize("words", ["", " , ", "alpha"])
-def test_nothing_is_told_where_nothing_is_wrong(words, install, monkeypatch, caplog):
+def test_disabling_known_plugin_logs_nothing(words, install, monkeypatch, caplog):
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     assert len(of_toys(discover().disabled)) == (words == "alpha")

@@ -1,4 +1,4 @@
-"""`use: auto` is written for the source that recognises the path, and means that source."""
+"""`use: auto` resolves to the source that recognises the path."""
 
 import logging
 
@@ -40,8 +40,8 @@ def parsed(folder, catalog, **keys):
     return parse_spec({"version": 1, "source": {"use": "auto", "with": keys}}, directory=folder, catalog=catalog)
 
 
-def told(folder, catalog, text):
-    """Return what is said of a spec, without the folder."""
+def message_of(folder, catalog, text):
+    """Return the problems of a spec, without the folder."""
     (folder / "scan.yaml").write_text(f"version: 1\n{text}")
     with pytest.raises(SpecError) as caught:
         load_spec(folder / "scan.yaml", catalog=catalog)
@@ -55,19 +55,19 @@ def test_auto_is_the_source_that_recognises_the_path(folder, catalog):
     assert plan.decisions == (Decision("source", "packed-npy", "cube.npy was recognised: its name ends in .npy"),)
 
 
-def test_a_source_that_is_named_is_no_decision(folder, catalog):
+def test_auto_resolved_document_records_no_decision_again(folder, catalog):
     again = parse_spec(parsed(folder, catalog, path="cube.npy").document, catalog=catalog)
     assert again.decisions == ()
 
 
-def test_what_was_recognised_is_laid_under_what_is_written(folder, catalog):
+def test_written_keys_override_recognised_keys(folder, catalog):
     plan = parsed(folder, catalog.including(HALVES), path="recording", rows=16)
     assert plan.source.config == HalvesConfig(path=folder / "recording", order="right", rows=16)
     assert set(plan.places) >= {"source.with.path", "source.with.order", "source.with.rows"}
 
 
 def fussy(name, *suffixes):
-    """Offer a source that recognises nothing and has something against everything."""
+    """Offer a source that recognises nothing and has a problem with every path."""
     return SourceContribution(
         name=name,
         summary="Toy",
@@ -85,17 +85,16 @@ FUSSY = [fussy("any"), fussy("bins", ".bin"), fussy("dats", ".dat", ".data")]
     ("path", "looks", "heard"),
     [("cube.dat", "a file of 5 bytes", ["any", "dats"]), ("recording", "a folder of left.bin", ["any", "bins"])],
 )
-def test_nobody_recognises_it(folder, catalog, path, looks, heard):
-    """Those speak whose files it could be, or who do not say what theirs are called."""
-    said = told(folder, catalog.including(*FUSSY), f"source: {{use: auto, with: {{path: {path}}}}}")
+def test_unrecognised_path_lists_problems_of_sources_with_its_ending(folder, catalog, path, looks, heard):
+    said = message_of(folder, catalog.including(*FUSSY), f"source: {{use: auto, with: {{path: {path}}}}}")
     first, *others = said.splitlines()
     assert first == f"scan.yaml:2:34: source.with.path: no source recognises {path}, {looks}; name the one that reads it"
     assert others == [f"  {name}: {path} is not mine" for name in heard]
 
 
-def test_nobody_has_files_that_are_called_so(folder, catalog):
+def test_unrecognised_ending_lists_known_endings(folder, catalog):
     (folder / "cube.txt").touch()
-    said = told(folder, catalog.including(*FUSSY[1:]), "source: {use: auto, with: {path: cube.txt}}")
+    said = message_of(folder, catalog.including(*FUSSY[1:]), "source: {use: auto, with: {path: cube.txt}}")
     assert said.splitlines()[1:] == ["  the names of files of captures end in .bin, .dat and .data"]
 
 
@@ -107,26 +106,26 @@ def test_nobody_has_files_that_are_called_so(folder, catalog):
         (["d", "c", "b", "a"], "a folder of a, b, c and more"),
     ],
 )
-def test_folders_are_told_by_what_is_in_them(folder, catalog, names, looks):
+def test_unrecognised_folder_is_described_by_its_files(folder, catalog, names, looks):
     (folder / "odd").mkdir()
     for name in names:
         (folder / "odd" / name).touch()
-    assert f"no source recognises odd, {looks}; " in told(folder, catalog, "source: {use: auto, with: {path: odd}}")
+    assert f"no source recognises odd, {looks}; " in message_of(folder, catalog, "source: {use: auto, with: {path: odd}}")
 
 
-def test_several_recognise_it(folder, catalog):
+def test_path_recognised_by_several_sources_is_an_error(folder, catalog):
     def greedy(path):
         return Recognised({"path": path}, "it is there")
 
     also = SourceContribution(name="greedy", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=greedy)
-    said = told(folder, catalog.including(also), "source: {use: auto, with: {path: cube.npy}}")
+    said = message_of(folder, catalog.including(also), "source: {use: auto, with: {path: cube.npy}}")
     assert said == (
         "scan.yaml:2:34: source.with.path: cube.npy is recognised by greedy (it is there) and packed-npy "
         "(its name ends in .npy); name the right one"
     )
 
 
-def test_one_that_raises_is_named_and_does_not_stop_the_others(folder, catalog, caplog):
+def test_recognise_that_raises_is_logged_and_other_sources_are_tried(folder, catalog, caplog):
     def raises(path):
         raise LookupError("not today")
 
@@ -135,18 +134,18 @@ def test_one_that_raises_is_named_and_does_not_stop_the_others(folder, catalog, 
         assert parsed(folder, catalog.including(sulky), path="cube.npy").source.contribution.name == "packed-npy"
     complaint = f"recognise of the source 'sulky' of {__name__} unreleased raised LookupError: not today"
     assert caplog.messages == [complaint]
-    assert complaint in told(folder, catalog.including(sulky), "source: {use: auto, with: {path: cube.dat}}")
+    assert complaint in message_of(folder, catalog.including(sulky), "source: {use: auto, with: {path: cube.dat}}")
 
 
-def test_one_that_returns_something_else_is_named(folder, catalog):
+def test_recognise_that_returns_wrong_type_is_named(folder, catalog):
     odd = SourceContribution(name="odd", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=lambda _: {})
-    said = told(folder, catalog.including(odd), "source: {use: auto, with: {path: cube.dat}}")
+    said = message_of(folder, catalog.including(odd), "source: {use: auto, with: {path: cube.dat}}")
     complaint = f"recognise of the source 'odd' of {__name__} unreleased returned a dict, expected a Recognised or None"
     assert said.splitlines()[1:] == [f"  {complaint}"]
 
 
-def test_a_wrong_key_is_told_at_its_place_with_whom_it_was_given_to(folder, catalog):
-    said = told(folder, catalog, "source:\n  use: auto\n  with:\n    path: cube.npy\n    frame_rate: 5\n    width: 3\n")
+def test_wrong_key_of_recognised_source_names_source_and_reason(folder, catalog):
+    said = message_of(folder, catalog, "source:\n  use: auto\n  with:\n    path: cube.npy\n    frame_rate: 5\n    width: 3\n")
     because = "(cube.npy was recognised as packed-npy: its name ends in .npy)"
     assert said.splitlines() == [
         f"scan.yaml:6:5: source.with.frame_rate: unknown key; did you mean 'frame_rate_hz'? {because}",
@@ -168,11 +167,11 @@ def test_a_wrong_key_is_told_at_its_place_with_whom_it_was_given_to(folder, cata
         ("source: {use: auto, path: cube.npy}", "scan.yaml:2:21: source.path: unknown key; it belongs under `with`"),
     ],
 )
-def test_what_is_wrong_with_the_path(folder, catalog, text, said):
-    assert told(folder, catalog, text).splitlines()[-1] == said
+def test_auto_with_wrong_path_is_an_error_at_its_place(folder, catalog, text, said):
+    assert message_of(folder, catalog, text).splitlines()[-1] == said
 
 
-def test_a_source_that_lacks_a_library_says_so(folder, catalog):
+def test_recognised_source_without_its_library_names_the_extra(folder, catalog):
     needy = SourceContribution(
         name="needy",
         summary="Toy",
@@ -181,7 +180,7 @@ def test_a_source_that_lacks_a_library_says_so(folder, catalog):
         recognise=lambda path: Recognised({"path": path}, "it is heavy"),
         requires=(Requirement("no_such_library", "photonpano[heavy]"),),
     )
-    said = told(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
+    said = message_of(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
     assert said == (
         "scan.yaml:2:15: source.use: the source 'needy' needs no_such_library, which is not installed: pip install "
         '"photonpano[heavy]" (in a checkout: pip install ".[heavy]") (cube.dat was recognised as needy: it is heavy)'

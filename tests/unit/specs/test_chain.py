@@ -36,19 +36,19 @@ def test_chain_of_backends_equals_locator_with_fallbacks(written, meant, catalog
     )
 
 
-def test_a_level_goes_on_from_the_first_of_a_chain_and_keeps_the_others(catalog):
+def test_level_inherits_first_locator_and_fallbacks_of_chain(catalog):
     levels = [{"locate": {"with": {"max_steps": 9}}}, {"locate": {"fallback": []}}]
     assert document(catalog, locate=chain("direct", CLEAR), levels=levels) == document(
         catalog, locate={"use": "direct", "fallback": CLEAR}, levels=levels
     )
 
 
-def test_one_word_is_enough(catalog):
+def test_chain_without_keys_equals_defaults(catalog):
     plan = parse_spec(MINIMAL, overrides=["locate.use=chain-of-backends"], catalog=catalog)
     assert plan.document == document(catalog)
 
 
-def test_places_are_found_by_the_paths_of_what_a_chain_means(catalog):
+def test_places_of_chain_have_paths_of_resolved_document(catalog):
     spec = (
         "version: 1\nsource: {use: simulator}\nlocate:\n  use: chain-of-backends\n  with:\n    backends:\n"
         "      - {use: direct, with: {max_steps: 5}}\n      - opencv-sift\n"
@@ -59,7 +59,7 @@ def test_places_are_found_by_the_paths_of_what_a_chain_means(catalog):
     assert [(places[path].line, places[path].column) for path in wanted] == [(7, 9), (7, 10), (7, 30), (8, 9), (10, 15)]
 
 
-def test_a_default_that_is_not_on_offer_is_an_error_where_the_chain_is_named(catalog):
+def test_default_chain_with_uninstalled_locator_is_an_error_at_its_name(catalog):
     rows = tuple(entry for entry in catalog.rows if entry.name != "opencv-sift")
     with pytest.raises(SpecError) as caught:
         parse_spec("version: 1\nsource: {use: simulator}\nlocate: {use: chain-of-backends}", catalog=type(catalog)(rows))

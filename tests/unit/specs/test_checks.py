@@ -1,4 +1,4 @@
-"""What components say about a capture."""
+"""The checks of components, of their configs and of a capture."""
 
 import pytest
 from pydantic import Field
@@ -11,12 +11,12 @@ SHORT = StreamInfo(n_frames=100, height=8, width=16, frame_rate_hz=None)
 TOO_LARGE = "a group of {} frames does not fit into the capture, which has 100"
 
 
-def test_nothing_to_say_about_a_capture_that_fits(catalog):
+def test_check_stream_of_suitable_capture_finds_nothing(catalog):
     plan = parse_spec("version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 100}}", catalog=catalog)
     assert check_stream(plan, SHORT) == []
 
 
-def test_levels_repeat_nothing_and_stand_at_their_overrides(catalog, tmp_path):
+def test_check_stream_reports_shared_problem_once_and_override_at_its_level(catalog, tmp_path):
     path = tmp_path / "scan.yaml"
     path.write_text(
         "version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 200}}\nrender: {reference: 100}\n"
@@ -30,14 +30,14 @@ def test_levels_repeat_nothing_and_stand_at_their_overrides(catalog, tmp_path):
     ]
 
 
-def test_levels_until_converged_are_checked_once(catalog):
+def test_check_stream_reports_levels_until_converged_once(catalog):
     spec = "version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 200}}\nlevels: until-converged"
     assert [str(problem) for problem in check_stream(parse_spec(spec, catalog=catalog), SHORT)] == [
         f"3:1: resample: {TOO_LARGE.format(200)}"
     ]
 
 
-def test_fallbacks_are_checked_where_they_are_written(catalog):
+def test_check_stream_reports_fallbacks_where_they_are_written(catalog):
     class Sized(Config):
         at_least: int = Field(description="frames")
 
@@ -58,12 +58,12 @@ def test_fallbacks_are_checked_where_they_are_written(catalog):
     ]
 
 
-def test_default_stage_that_is_written_nowhere(catalog):
+def test_check_stream_reports_default_stage_by_its_path(catalog):
     problems = check_stream(parse_spec({"version": 1, "source": {"use": "simulator"}}, catalog=catalog), SHORT)
     assert [str(problem) for problem in problems] == [f"resample: {TOO_LARGE.format(500)}"]
 
 
-def test_base_that_no_level_uses_is_not_checked(catalog):
+def test_check_stream_skips_stage_that_all_levels_override(catalog):
     levels = [{"resample": {"with": {"group_size": 50}}}]
     plan = parse_spec({"version": 1, "source": {"use": "simulator"}, "levels": levels}, catalog=catalog)
     assert check_stream(plan, SHORT) == []

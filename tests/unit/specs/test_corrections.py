@@ -19,14 +19,14 @@ def spec(*corrections: Any) -> dict[str, Any]:
     return {"version": 1, "source": {"use": "simulator"}, "corrections": list(corrections)}
 
 
-def test_files_count_from_the_folder_of_the_spec(catalog: Catalog, tmp_path: Path) -> None:
+def test_correction_paths_are_relative_to_spec(catalog: Catalog, tmp_path: Path) -> None:
     np.save(tmp_path / "bad.npy", np.zeros((2, 2), bool))
     plan = parse_spec(spec({"mask": {"file": "bad.npy"}}), directory=tmp_path, catalog=catalog)
     assert plan.document["corrections"] == [{"mask": {"file": str(tmp_path / "bad.npy")}}]
     assert parse_spec(plan.document, catalog=catalog).corrections == plan.corrections
 
 
-def test_files_that_are_missing_are_told_with_their_place(catalog: Catalog, tmp_path: Path) -> None:
+def test_missing_correction_file_is_an_error_at_its_place(catalog: Catalog, tmp_path: Path) -> None:
     path = tmp_path / "scan.yaml"
     path.write_text(
         "version: 1\n"
@@ -45,7 +45,7 @@ def test_files_that_are_missing_are_told_with_their_place(catalog: Catalog, tmp_
     )
 
 
-def test_settings_can_be_overridden(catalog: Catalog) -> None:
+def test_override_changes_correction_settings(catalog: Catalog) -> None:
     written = spec("rot90", {"crop": {"rows": [0, 4]}})
     changed = parse_spec(written, overrides=["corrections.1.crop.rows=[2, null]"], catalog=catalog)
     assert changed.corrections == (CORRECTIONS["rot90"](), Crop(rows=(2, None)))
@@ -54,7 +54,7 @@ def test_settings_can_be_overridden(catalog: Catalog) -> None:
     assert replaced.document["corrections"] == ["rot90"]
 
 
-def test_a_spec_needs_none(catalog: Catalog) -> None:
+def test_spec_without_corrections_has_none(catalog: Catalog) -> None:
     plan = parse_spec({"version": 1, "source": {"use": "simulator"}}, catalog=catalog)
     assert plan.corrections == ()
     assert list(plan.document)[:3] == ["version", "source", "corrections"]

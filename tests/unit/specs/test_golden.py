@@ -46,7 +46,7 @@ def test_bad_spec_gives_exactly_these_messages(path, catalog, monkeypatch):
 
 
 @pytest.mark.parametrize("path", GOOD, ids=name)
-def test_good_spec_resolves_to_a_document_that_is_the_same_spec(path, catalog, validator):
+def test_good_spec_resolves_to_document_that_resolves_to_itself(path, catalog, validator):
     plan = load_spec(path, catalog=catalog)
     again = parse_spec(json.loads(json.dumps(plan.document)), catalog=catalog)
     assert again.document == plan.document

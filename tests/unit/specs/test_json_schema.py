@@ -1,4 +1,4 @@
-"""What editors are told."""
+"""The JSON Schema for editors."""
 
 import jsonschema
 import pytest
@@ -71,16 +71,16 @@ def is_valid(spec, catalog):
         ({"corrections": {"rot90": None}}, False),
     ],
 )
-def test_schema_binds_the_keys_to_the_component(change, valid, catalog):
+def test_json_schema_binds_keys_to_component(change, valid, catalog):
     assert is_valid(SPEC | change, catalog) == valid
 
 
-def test_field_that_no_schema_can_express_leaves_the_rest_checked(catalog):
+def test_json_schema_of_inexpressible_field_checks_other_fields(catalog):
     catalog = Catalog(catalog.rows).including(ODD)
     assert is_valid(SPEC | {"merge": {"use": "odd", "with": {"even": 4}}}, catalog)
     assert not is_valid(SPEC | {"merge": {"use": "odd", "with": {"even": 3}}}, catalog)
 
 
-def test_schema_of_an_empty_catalog_is_a_schema():
+def test_json_schema_of_empty_catalog_is_valid_schema():
     jsonschema.Draft202012Validator.check_schema(json_schema(Catalog()))
     assert not is_valid(SPEC, Catalog())

@@ -37,7 +37,7 @@ def test_levels_without_overrides_share_their_choices(catalog):
     assert plan.levels[0].locate is plan.levels[1].locate
 
 
-def test_until_converged_is_as_many_equal_levels_as_there_may_be(catalog):
+def test_until_converged_is_eight_equal_levels(catalog):
     plan = parse_spec(MINIMAL | {"levels": "until-converged"}, catalog=catalog)
     assert plan.until_converged
     assert plan.levels == (plan.levels[0],) * 8
@@ -157,14 +157,14 @@ def test_output_counts_from_the_current_folder(catalog, tmp_path, monkeypatch):
     assert load_spec(path, catalog=catalog).output.directory == tmp_path / "specs" / "elsewhere"
 
 
-def test_python_values_that_are_nearly_plain(catalog, tmp_path):
+def test_parse_spec_accepts_numpy_numbers_tuples_and_paths(catalog, tmp_path):
     source = {"use": "simulator", "with": {"flux": np.float32(0.5), "frames": np.int64(7), "size": (3, 4)}}
     plan = parse_spec({"version": 1, "source": source, "output": {"directory": tmp_path}}, catalog=catalog)
     assert (plan.source.config.flux, plan.source.config.frames, plan.source.config.size) == (0.5, 7, (3, 4))
     assert plan.output.directory == tmp_path
 
 
-def test_problems_of_python_data_say_the_path_alone(catalog):
+def test_problems_of_python_data_have_no_lines(catalog):
     spec = {"version": 1, "source": {"use": "simulator", "with": {"flux": np.zeros(2)}}, 5: 6, "run": {"seed": -1}}
     assert messages(spec, catalog=catalog) == [
         "source.with.flux: expected plain data (text, numbers, lists, mappings), got a ndarray",
@@ -173,7 +173,7 @@ def test_problems_of_python_data_say_the_path_alone(catalog):
     ]
 
 
-def test_text_is_yaml(catalog):
+def test_parse_spec_reads_text_as_yaml(catalog):
     plan = parse_spec("version: 1\nsource: {use: simulator}", directory="/captures", name="night", catalog=catalog)
     assert plan.output.directory == Path("/captures/runs/night")
     assert messages("version: 1\nsource: {use: 3}", catalog=catalog) == [
@@ -181,7 +181,7 @@ def test_text_is_yaml(catalog):
     ]
 
 
-def test_files_that_are_no_specs(catalog, tmp_path, monkeypatch):
+def test_load_spec_of_other_file_is_an_error(catalog, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("folder.yaml").mkdir()
     Path("null.yaml").write_text("---\n...\n")
@@ -205,14 +205,14 @@ def test_files_that_are_no_specs(catalog, tmp_path, monkeypatch):
     }
 
 
-def test_file_that_may_not_be_read(catalog, tmp_path, monkeypatch):
+def test_load_spec_of_unreadable_file_is_an_error(catalog, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("loop.yaml").symlink_to("loop.yaml")
     with pytest.raises(SpecError, match=r"^loop\.yaml: cannot be read: "):
         load_spec("loop.yaml", catalog=catalog)
 
 
-def test_byte_order_mark_and_windows_lines_do_no_harm(catalog, tmp_path):
+def test_load_spec_accepts_byte_order_mark_and_windows_line_ends(catalog, tmp_path):
     path = tmp_path / "scan.yaml"
     path.write_bytes(b"\xef\xbb\xbfversion: 1\r\nsource: {use: simulator}\r\nrun: {seed: x}\r\n")
     with pytest.raises(SpecError, match=r"scan\.yaml:3:13: run\.seed"):

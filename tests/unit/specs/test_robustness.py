@@ -48,7 +48,7 @@ junk = st.recursive(
 
 @settings(deadline=None)  # the machine may be busy
 @given(path=st.sampled_from(list(paths(SPEC))), value=junk)
-def test_any_value_anywhere(catalog, path, value):
+def test_any_value_in_spec_gives_plan_or_problems(catalog, path, value):
     spec = replaced(SPEC, path, value)
     problems = []
     try:

@@ -57,7 +57,7 @@ def read(text):
         ("{a: &x 1, b: &x 2, c: *x}", {"a": 1, "b": 2, "c": 2}),
     ],
 )
-def test_value(text, value):
+def test_yaml_scalar_gives_value(text, value):
     plain = read(text).data
     assert plain == value
     assert type(plain) is type(value)
@@ -81,7 +81,7 @@ def test_places_of_values_and_keys():
     }
 
 
-def test_keys_that_are_merged_in_have_the_places_where_they_are_written():
+def test_merged_keys_have_places_where_they_are_written():
     places = read("a: &x {p: {r: 1}, q: {r: 2}}\nb: {<<: *x, q: {s: 3}}").places
     assert {where: place.line for where, place in places.items() if where.startswith("b.")} == {
         "b.p": 1,
@@ -101,14 +101,14 @@ documents = st.recursive(
 
 @settings(deadline=None)  # the machine may be busy
 @given(documents)
-def test_reads_what_json_writes(document):
+def test_yaml_reader_reads_json(document):
     """JSON is YAML, up to whole floats such as 1e16, which are read as integers."""
     assert read(json.dumps(document, ensure_ascii=False)).data == document
 
 
 @settings(deadline=None)  # the machine may be busy
 @given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))
-def test_any_text_is_a_value_or_a_problem(text):
+def test_any_text_gives_value_or_problem(text):
     problems = []
     spec = read_yaml(text, Place(), problems)
     if (spec is None or spec.data is None) and not problems:
