@@ -181,7 +181,7 @@ class _Resolver:
         return _Stage(section, choice, self.fallbacks(section["fallback"], where, choice, inherited))
 
     def spelled_out(self, name: str, content: dict[str, Any], where: str, base: _Stage | None) -> dict[str, Any] | None:
-        """Return a section with what it inherits, defaults and aliases filled in, and fallbacks as a list; None if it cannot be."""
+        """Return a section with inherited keys, defaults and aliases filled in, and a list of fallbacks; None if that fails."""
         spec, kind = self.spec, KIND_OF[name]
         section = dict(content)
         if base is not None:
