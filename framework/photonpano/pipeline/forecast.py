@@ -13,7 +13,7 @@ from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels
 from photonpano.protocols import Source
-from photonpano.record.memory import peak_memory_bytes
+from photonpano.record.run_json import peak_memory_bytes
 from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count

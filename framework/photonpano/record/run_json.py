@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import json
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -16,7 +17,6 @@ from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
-from photonpano.record.memory import peak_memory_bytes
 from photonpano.record.schema import (
     DecisionRecord,
     FailureRecord,
@@ -260,6 +260,20 @@ def uncertain_frames(std_px: FloatArray) -> list[str]:
         f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "
         f"{UNCERTAIN_PX:g} px in {', '.join(named)}{more}"
     ]
+
+
+def peak_memory_bytes() -> int | None:
+    """Return the largest resident size of this process so far; None where the system does not report it."""
+    status = Path("/proc/self/status")
+    # On Linux, getrusage returns the size of the parent process if that was larger.
+    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="ascii", errors="replace"))):
+        return 1024 * int(found[1])
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _pair(groups: Sequence[Group], edge: Edge) -> PairRecord:
