@@ -12,7 +12,6 @@ from photonpano.contributions import SpecPath
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
 from photonpano.reading import read_arrays
-from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -86,8 +85,7 @@ def measure_dark(source: Source, advance: Callable[[int], object] | None = None)
     """
     info = source.info
     counts = np.zeros(info.frame_shape, np.uint64)
-    for start in range(0, info.n_frames, _AT_ONCE):
-        span = FrameSpan(start, min(start + _AT_ONCE, info.n_frames))
+    for span in info.span.blocks(_AT_ONCE):
         counts += source.counts(span)
         if advance is not None:
             advance(len(span))

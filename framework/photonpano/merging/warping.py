@@ -18,7 +18,7 @@ def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.f
         to_image: (3, 3), pixels of the grid to pixels of the image.
         total: (H, W) the grid.
     """
-    seen = np.empty(total.shape[1], np.float32)
+    sampled = np.empty(total.shape[1], np.float32)
     for y in range(total.shape[0]):
         row = total[y]
         first, inside, outside, last = _parts(image.shape, to_image, y, total.shape[1])
@@ -29,11 +29,11 @@ def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.f
         x = inside
         while x < outside:
             run = run_from(to_image, x, y, outside - x, image.shape[0], image.shape[1])
-            sample_run(image, run, seen[x : x + run.size])
+            sample_run(image, run, sampled[x : x + run.size])
             x += run.size
-        between, found = row[inside:outside], seen[inside:outside]
-        for t in range(len(between)):
-            between[t] += found[t]
+        totals, values = row[inside:outside], sampled[inside:outside]
+        for t in range(len(totals)):
+            totals[t] += values[t]
 
 
 @compiled

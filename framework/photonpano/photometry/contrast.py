@@ -18,15 +18,15 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
     At 1 and below, single pixels are mostly noise, and registration needs larger structures. 0 if there is no contrast.
     """
     flux, weight = _some_rows(exposure.flux), _some_rows(exposure.weight)
-    known = weight > 0
-    if not known.any():
+    seen = weight > 0
+    if not seen.any():
         return 0.0
-    values = np.where(known, exposure.response.stabilised(flux, weight), np.float32(0))
-    sums, counts = _block_sums(values), _block_sums(known.astype(np.float32))
+    values = np.where(seen, exposure.response.stabilised(flux, weight), np.float32(0))
+    sums, counts = _block_sums(values), _block_sums(seen.astype(np.float32))
     full = counts == _BLOCK**2
     if np.count_nonzero(full) < 2:
         return 0.0
-    noise = float(exposure.response.stabilised_std(np.median(weight[known], keepdims=True)).item())
+    noise = float(exposure.response.stabilised_std(np.median(weight[seen], keepdims=True)).item())
     variance = float(np.var(sums[full] / _BLOCK**2)) - noise**2 / _BLOCK**2
     return float(np.sqrt(max(variance, 0.0))) / noise
 

@@ -1,9 +1,9 @@
 """Frozen values that stages exchange; this package imports numpy only."""
 
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
-from photonpano.values.capture import CaptureSummary, Decision, DecisionValue
+from photonpano.values.capture import CaptureSummary, Decision, DecisionValue, StreamInfo
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
-from photonpano.values.frames import FrameSpan, Group, StreamInfo, true_spans
+from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.motion import Edge, Located, NotLocated
 
 __all__ = [

@@ -1,12 +1,69 @@
-"""Summary of a capture, and decisions that follow from it."""
+"""Properties of a capture, its summary, and the decisions that follow from it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from photonpano.errors import InputError
+from photonpano.values.frames import FrameSpan
 
 DecisionValue: TypeAlias = bool | int | float | str
 """Values of decisions that can be recorded."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInfo:
+    """Properties of a capture that are known before any frame is read.
+
+    Attributes:
+        n_frames: number of frames.
+        height: rows of a frame.
+        width: columns of a frame.
+        frame_rate_hz: frames per second; None if the capture does not give it.
+        kind: "binary" if a pixel is 0 or 1, "intensity" if it is a grey value or a sum of binary frames.
+        bit_depth: bits of a pixel.
+    """
+
+    n_frames: int
+    height: int
+    width: int
+    frame_rate_hz: float | None
+    kind: Literal["binary", "intensity"] = "binary"
+    bit_depth: int = 1
+
+    def __str__(self) -> str:
+        kind = "binary" if self.kind == "binary" else f"{self.bit_depth}-bit"
+        rate = "" if self.frame_rate_hz is None else f" at {self.frame_rate_hz:,.15g} Hz"
+        return f"{self.n_frames:,} {kind} frames of {self.height}x{self.width}{rate}"
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.height, self.width
+
+    @property
+    def span(self) -> FrameSpan:
+        """All frames."""
+        return FrameSpan(0, self.n_frames)
+
+    def spread(self, places: int, frames: int) -> list[FrameSpan]:
+        """Return `places` evenly spaced spans of `frames` frames; the whole capture in one span if it is shorter than that."""
+        if self.n_frames <= places * frames:
+            return [self.span]
+        starts = np.linspace(0, self.n_frames - frames, places).astype(int).tolist()
+        return [FrameSpan(start, start + frames) for start in starts]
+
+    def require(self, span: FrameSpan) -> None:
+        """Raise if a span reaches beyond the capture.
+
+        Raises:
+            InputError: the span reaches beyond the last frame.
+        """
+        if span.stop > self.n_frames:
+            raise InputError(f"{span} were requested, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,8 +73,8 @@ class IntensitySource(Closing, ABC):
             raise InputError(f"{span} are too many to be summed at {self.info.bit_depth} bits; use groups of {most} at most")
         counts = np.zeros(self.info.frame_shape, np.uint32)
         step = max(1, _PART_BYTES // (counts.size * (1 if self._one_byte else 2)))
-        for start in range(span.start, span.stop, step):
-            levels = self._levels_of(FrameSpan(start, min(start + step, span.stop)))
+        for block in span.blocks(step):
+            levels = self._levels_of(block)
             flat = levels.reshape(len(levels), -1)
             if self._table is None:
                 add_levels(flat, counts.reshape(-1))
