@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from photonpano import Located, NotLocated, VirtualExposure
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised
 from photonpano.locating import blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
 from photonpano_colmap.configs import PycolmapTwoViewConfig
@@ -33,8 +33,8 @@ class Features:
         shape: (height, width) of the exposure.
     """
 
-    points: NDArray[np.float64]
-    sizes: NDArray[np.float64]
+    points: FloatArray
+    sizes: FloatArray
     keypoints: pycolmap.FeatureKeypoints
     descriptors: pycolmap.FeatureDescriptors
     shape: tuple[int, int]
@@ -84,7 +84,7 @@ class TwoViewLocator:
             shape=(image.shape[0], image.shape[1]),
         )
 
-    def register(self, moving: Features, fixed: Features, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+    def register(self, moving: Features, fixed: Features, initial: Homography | None) -> Located | NotLocated:
         """Match and fit; see `photonpano.Locator`.
 
         Returns:
@@ -111,7 +111,7 @@ class TwoViewLocator:
         pairs = self._matcher().match(moving.keypoints, moving.descriptors, fixed.keypoints, fixed.descriptors)
         return np.asarray(pairs, np.intp).reshape(-1, 2)
 
-    def _matched_nearby(self, moving: Features, fixed: Features, initial: NDArray[np.float64]) -> NDArray[np.intp]:
+    def _matched_nearby(self, moving: Features, fixed: Features, initial: Homography) -> NDArray[np.intp]:
         """Return the indices of matches near the positions that a motion predicts: (K, 2)."""
         geometry = pycolmap.TwoViewGeometry()
         geometry.config = pycolmap.TwoViewGeometryConfiguration.PLANAR

@@ -68,7 +68,7 @@ class Aligned:
         """Return how well the images agree. Overwrites the buffers, so it can be called once."""
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
-        geometry = _geometry(self.template.image.shape)
+        shape = (self.template.image.shape[0], self.template.image.shape[1])
         information, std_px = information_of(
             self.template,
             self.buffers,
@@ -77,8 +77,8 @@ class Aligned:
             self.weights,
             noise_ratio,
             _PRIOR,
-            geometry.generators,
-            geometry.to_corners(ALL_PARAMETERS),
+            np.array(generators(shape)),
+            _to_corners(shape, ALL_PARAMETERS),
         )
         return Quality(information=information, noise_ratio=noise_ratio, overlap=self.overlap, std_px=std_px)
 
@@ -103,17 +103,17 @@ def align(
         tolerance_px: converged when a step moves no corner further.
         max_steps: step limit.
     """
-    shape = template.image.shape
-    geometry, buffers = _geometry(shape), _buffers(shape)
+    shape = (template.image.shape[0], template.image.shape[1])
+    buffers = _buffers(shape)
     status, homography, pixels, squares, weights = descent.descend(
         template,
         fixed,
         homography,
         prior_mean,
         _PRIOR,
-        geometry.unit,
+        np.array(unit_coordinates(shape)),
         np.array(free),
-        geometry.to_corners(free),
+        _to_corners(shape, free),
         tolerance_px,
         max_steps,
         buffers,
@@ -121,29 +121,19 @@ def align(
     if status == descent.CONVERGED:
         return Aligned(template, homography, pixels, squares, weights, buffers)
     if status == descent.DIVERGED:
-        return NotLocated(f"the alignment diverges: {why_implausible(homography, (shape[0], shape[1]), 0.0)}")
+        return NotLocated(f"the alignment diverges: {why_implausible(homography, shape, 0.0)}")
     if status == descent.NO_TEXTURE:
         return NotLocated(NO_TEXTURE)
     return NotLocated(f"the alignment has not converged after {max_steps} steps")
 
 
-class _Geometry:
-    """Arrays that depend on the shape of a layer only, in a form that compiled functions take."""
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        homogeneous = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
-        self.unit, self.generators = np.array(unit_coordinates(shape)), np.array(generators(shape))
-        self._to_corners = slopes(homogeneous, self.generators @ homogeneous)
-        self._of_parameters: dict[tuple[int, ...], FloatArray] = {}
-
-    def to_corners(self, free: tuple[int, ...]) -> FloatArray:
-        """Return the derivatives of the corners with respect to some of p1..p8: (8, len(free))."""
-        if free not in self._of_parameters:
-            self._of_parameters[free] = np.ascontiguousarray(self._to_corners[:, list(free)])
-        return self._of_parameters[free]
+@cache
+def _to_corners(shape: tuple[int, int], free: tuple[int, ...]) -> FloatArray:
+    """Return the derivatives of the corners of an image with respect to some of p1..p8: (8, len(free))."""
+    homogeneous = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
+    return np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous)[:, list(free)])
 
 
-_geometry = cache(_Geometry)
 _of_thread = local()
 
 

@@ -11,7 +11,7 @@ from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled, match_adalam, m
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from photonpano import Located, NotLocated, VirtualExposure
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
 from photonpano.locating import Matches, blur_against_noise, stabilised_8_bit
 from photonpano_kornia.configs import KorniaFeaturesConfig
@@ -37,12 +37,12 @@ class SiftFeatures:
     shape: tuple[int, int]
 
     @property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> FloatArray:
         """(N, 2) positions; in kornia's features pixel centres are integers."""
         return self.frames[:, :, 2].astype(np.float64)
 
     @property
-    def sizes(self) -> NDArray[np.float64]:
+    def sizes(self) -> FloatArray:
         """(N,) diameters of the keypoints in px."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.frames[:, :, :2].astype(np.float64)))))
 
@@ -73,7 +73,7 @@ class FeatureLocator:
                 frames[0, filled].cpu().numpy(), descriptors[0, filled].half().cpu().numpy(), (mask.shape[0], mask.shape[1])
             )
 
-    def register(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+    def register(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Located | NotLocated:
         """Match and fit; see `photonpano.Locator`.
 
         Returns:
@@ -84,14 +84,14 @@ class FeatureLocator:
         with one_thread(), torch.inference_mode():
             return motion_of(self._attempts(moving, fixed, initial), moving.shape, self._config, self._seed, evidence)
 
-    def _attempts(self, moving: SiftFeatures, fixed: SiftFeatures, initial: NDArray[np.float64] | None) -> Iterator[Matches]:
+    def _attempts(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Iterator[Matches]:
         """Match near the positions that the current motion predicts, then in the whole image."""
         for guide in [initial, None] if initial is not None else [None]:
             pairs = self._matched(moving, fixed, guide)
             here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
             yield Matches(here, there, guide is not None, moving.sizes[pairs[:, 0]])
 
-    def _matched(self, moving: SiftFeatures, fixed: SiftFeatures, guide: NDArray[np.float64] | None) -> NDArray[np.intp]:
+    def _matched(self, moving: SiftFeatures, fixed: SiftFeatures, guide: Homography | None) -> NDArray[np.intp]:
         """Return the pairs of indices (K, 2) of keypoints that match."""
         if min(len(moving.frames), len(fixed.frames)) < 2:
             return np.zeros((0, 2), dtype=np.intp)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from photonpano import Located, NotLocated, VirtualExposure
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
 from photonpano.locating import Matches, blur_against_noise, stabilised_8_bit
 from photonpano_kornia.configs import KorniaLoftrConfig
@@ -55,7 +55,7 @@ class LoftrLocator:
             image[~seen] = np.uint8(image[seen].mean())
         return Picture(image, seen)
 
-    def register(self, moving: Picture, fixed: Picture, initial: NDArray[np.float64] | None) -> Located | NotLocated:
+    def register(self, moving: Picture, fixed: Picture, initial: Homography | None) -> Located | NotLocated:
         """Match and fit; see `photonpano.Locator`.
 
         Returns:
@@ -72,16 +72,14 @@ class LoftrLocator:
             shape = (moving.image.shape[0], moving.image.shape[1])
             return motion_of(self._attempts(here, there, initial), shape, self._config, self._seed, {})
 
-    def _attempts(
-        self, here: NDArray[np.float64], there: NDArray[np.float64], initial: NDArray[np.float64] | None
-    ) -> Iterator[Matches]:
+    def _attempts(self, here: FloatArray, there: FloatArray, initial: Homography | None) -> Iterator[Matches]:
         """Return the matches near the positions that the current motion predicts, then all."""
         if initial is not None:
             near = np.linalg.norm(apply(initial, here) - there, axis=1) <= self._config.search_px
             yield Matches(here[near], there[near], guided=True)
         yield Matches(here, there, guided=False)
 
-    def _matched(self, moving: Picture, fixed: Picture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _matched(self, moving: Picture, fixed: Picture) -> tuple[FloatArray, FloatArray]:
         """Return the matched points of both images, (N, 2) each, that are not masked in either."""
         images = (images_on(self._device, each.image) / 255 for each in (moving, fixed))
         answer = self._network(dict(zip(("image0", "image1"), images, strict=True)))
@@ -91,7 +89,7 @@ class LoftrLocator:
         return here[counts], there[counts]
 
 
-def _seen_at(seen: NDArray[np.bool_], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _seen_at(seen: NDArray[np.bool_], points: FloatArray) -> NDArray[np.bool_]:
     """Return which points (N, 2) lie on unmasked pixels: (N,) bool; a point outside of the image takes the nearest pixel."""
     columns, rows = (np.clip(np.rint(points[:, axis]).astype(int), 0, seen.shape[1 - axis] - 1) for axis in (0, 1))
     return np.asarray(seen[rows, columns])

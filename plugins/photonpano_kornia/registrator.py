@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from kornia.filters import spatial_gradient
 from kornia.geometry.transform import HomographyWarper
-from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from photonpano import Homography, Located, NotLocated, VirtualExposure
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import (
     corner_displacements,
     corners,
@@ -48,7 +47,7 @@ _ROUNDS = 3
 """Largest number of descents on a layer; the weights of pixels are updated between them."""
 
 
-def unit_square(shape: tuple[int, int]) -> NDArray[np.float64]:
+def unit_square(shape: tuple[int, int]) -> FloatArray:
     """Return the map from pixels to the coordinates of kornia's warper: (3, 3).
 
     Convention:
@@ -205,7 +204,7 @@ class _Descent:
         root, failed = torch.linalg.cholesky_ex(torch.stack(rows))
         return None if failed else root
 
-    def _corner_px(self, basis: NDArray[np.float64]) -> float:
+    def _corner_px(self, basis: FloatArray) -> float:
         """Return the largest displacement of a corner by a unit step of one of the whitened parameters, in px."""
         unit_corners = corners(self._moving.shape) @ self._unit[:2, :2].T + self._unit[:2, 2]
         moved = jacobian(np.eye(3), unit_corners)[..., self._free] @ basis

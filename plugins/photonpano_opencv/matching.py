@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from photonpano import FloatArray
+
 
 def unit_descriptors(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return RootSIFT (Arandjelovic and Zisserman 2012): square roots, so that the scalar product is Hellinger's kernel."""
@@ -39,7 +41,7 @@ def match_everywhere(moving: NDArray[np.float32], fixed: NDArray[np.float32], ra
 def match_nearby(
     moving: NDArray[np.float32],
     fixed: NDArray[np.float32],
-    predicted: NDArray[np.float64],
+    predicted: FloatArray,
     points: NDArray[np.float32],
     radius_px: float,
     ratio: float,

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano import Homography, Located, NotLocated, VirtualExposure
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply, normalised, translation
 from photonpano.locating import NO_TEXTURE, TRANSLATION, View, blur_against_noise, motion_from_images, shift_between, view_of
 from photonpano_opencv.configs import PhaseCorrelationConfig
@@ -48,7 +47,7 @@ class PhaseCorrelationLocator:
         return motion_from_images(moving, fixed, homography, config, free=TRANSLATION, efficiency=_EFFICIENCY)
 
 
-def _shift_of(motion: Homography, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _shift_of(motion: Homography, shape: tuple[int, int]) -> FloatArray:
     """Return the translation that moves the centre of an image as a motion does."""
     centre = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
     return translation(*(apply(motion, centre) - centre)[0])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
+from photonpano.values import Homography
 
 Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
@@ -41,7 +42,7 @@ class Run(NamedTuple):
 
 @compiled
 def visible_columns(
-    to_image: NDArray[np.float64], y: int, left: float, right: float, top: float, bottom: float, width: int
+    to_image: Homography, y: int, left: float, right: float, top: float, bottom: float, width: int
 ) -> tuple[int, int]:
     """Return the half-open range of pixels of a grid row that map into a rectangle of the image, border included.
 
@@ -78,7 +79,7 @@ def visible_columns(
 
 
 @compiled
-def run_from(to_image: NDArray[np.float64], x: int, y: int, most: int, height: int, width: int) -> Run:
+def run_from(to_image: Homography, x: int, y: int, most: int, height: int, width: int) -> Run:
     """Return the run of pixels of a grid row that starts at (x, y).
 
     Args:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
+from photonpano.values import Homography
 
 MAX_AREA_CHANGE = 2.0
 """Largest ratio of the areas of two overlapping images of one camera."""
@@ -17,7 +17,7 @@ of the ratio of opposite sides."""
 
 
 @compiled
-def violation(homography: NDArray[np.float64], height: int, width: int) -> tuple[int, float]:
+def violation(homography: Homography, height: int, width: int) -> tuple[int, float]:
     """Return why a homography between two images of one camera is impossible, and the number that decides; `PLAUSIBLE` if not.
 
     Args:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
+from photonpano.values import FloatArray, Homography
 
 REWEIGHTINGS = 4
 """Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error."""
@@ -26,8 +27,8 @@ class Fit:
         residual_px: standard deviation of a coordinate of a keypoint of median size, in px.
     """
 
-    homography: NDArray[np.float64]
-    information: NDArray[np.float64]
+    homography: Homography
+    information: FloatArray
     residual_px: float
 
     def corner_std_px(self, shape: tuple[int, int]) -> float:
@@ -45,7 +46,7 @@ def fit_homography(
     moving: NDArray[np.floating],
     fixed: NDArray[np.floating],
     sizes: NDArray[np.floating],
-    start: NDArray[np.float64],
+    start: Homography,
     rounding_px: float = 0.0,
 ) -> Fit:
     """Fit a homography to matches by robust least squares, weighted by the inverse sizes of the keypoints.
@@ -81,21 +82,17 @@ def fit_homography(
     return Fit(from_parameters(p), information, float(spread))
 
 
-def _residuals(
-    p: NDArray[np.float64], here: NDArray[np.float64], there: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _residuals(p: FloatArray, here: FloatArray, there: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the weighted residuals along x and y: (2 N,)."""
     return ((apply(from_parameters(p), here) - there) * weights[:, None]).ravel()
 
 
-def _derivatives(
-    p: NDArray[np.float64], here: NDArray[np.float64], there: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _derivatives(p: FloatArray, here: FloatArray, there: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the derivatives of the residuals: (2 N, 8)."""
     del there
     return (jacobian(from_parameters(p), here) * weights[:, None, None]).reshape(-1, 8)
 
 
-def _spread(residuals: NDArray[np.float64]) -> float:
+def _spread(residuals: FloatArray) -> float:
     """Return the standard deviation, from the median so that it is robust against outliers."""
     return max(1.4826 * float(np.median(np.abs(residuals))), MIN_NOISE_PX)

@@ -39,7 +39,7 @@ def consensus_of(
     limits: PointLimits,
     evidence: Mapping[str, float],
 ) -> tuple[Matches, Homography, dict[str, float]] | NotLocated:
-    """Return the first matches that agree on a homography beyond chance, the homography, and the evidence.
+    """Return the first matches that agree on a homography beyond chance, the homography, and the evidence. Raises nothing.
 
     Args:
         attempts: at least one set of matches; a later one is computed only if those before it fail.

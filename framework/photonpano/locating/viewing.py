@@ -28,7 +28,7 @@ class View:
 
     Attributes:
         image: (H, W) float32, on the scale on which photon noise is uniform, blurred; 0 inside of masked areas.
-        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 where nothing was seen.
+        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 at masked pixels.
         blur_px: standard deviation of the blur, in px of the exposure.
         pixel: side of a pixel, in px of the exposure.
     """
@@ -45,7 +45,7 @@ class View:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(H, W) mask of the pixels that were seen."""
+        """(H, W) bool, False at masked pixels."""
         return self.weight > 0
 
     @cached_property

@@ -67,7 +67,9 @@ def few(moving: np.ndarray, fixed: np.ndarray, initial: np.ndarray | None = None
 def test_too_few_keypoints_are_rejected_with_their_numbers(count: int, matcher: str) -> None:
     points = np.random.default_rng(0).uniform((0, 0), (175, 119), (count, 2))
     for initial in (None, STILL):
-        assert few(points, points, initial, matcher=matcher).endswith(" matches, fewer than min_inliers = 12")
+        assert few(points, points, initial, matcher=matcher).endswith(
+            f" matches, fewer than min_inliers = 12 ({count} and {count} keypoints)"
+        )
 
 
 def test_matches_that_agree_by_chance_are_rejected() -> None:
