@@ -74,7 +74,8 @@ def _mat5_variable(path: Path) -> Iterator[_Variable]:
 @contextmanager
 def _hdf_variable(path: Path) -> Iterator[_Variable]:
     if importlib.util.find_spec("h5py") is None:
-        raise InputError(f"{path} is a file of MATLAB 7.3, which takes h5py: pip install photonpano[hdf5]")
+        install = 'pip install "photonpano[hdf5]" (in a checkout: pip install ".[hdf5]")'
+        raise InputError(f"{path} is a file of MATLAB 7.3: reading it needs h5py, which is not installed: {install}")
     import h5py
 
     with h5py.File(path) as file:

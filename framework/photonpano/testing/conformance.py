@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from photonpano.contributions import Contribution
+from photonpano.contributions import Contribution, install_command
 from photonpano.registry import KINDS
 
 HEAVY = frozenset(
@@ -87,7 +87,7 @@ class Conformance:
         """Skip a test if a library that the contribution requires is not installed."""
         for requirement in self.contribution.requires:
             if importlib.util.find_spec(requirement.module) is None:
-                pytest.skip(f"{self.contribution.name} needs {requirement.module}: pip install {requirement.install}")
+                pytest.skip(f"{self.contribution.name} needs {requirement.module}: {install_command([requirement])}")
 
     def test_contribution_has_the_kind_of_this_class(self) -> None:
         """Specs look up components by kind."""
