@@ -26,7 +26,7 @@ from photonpano.reading import (
 _CHANNELS = 3
 _GREEN = 1
 _SAMPLE_BYTES = 64 * 1024
-"""So much of the data is looked at to tell packed frames from others."""
+"""Bytes of the data that are read to distinguish packed frames from unpacked ones."""
 
 
 class PackedNpyConfig(Config):
@@ -50,7 +50,7 @@ def _open(config: PackedNpyConfig) -> PackedFileSource:
     """Open a capture.
 
     Raises:
-        InputError: a file is missing or is not what the config says.
+        InputError: the file is missing, or does not agree with the config.
         OutputError: a compressed file cannot be unpacked.
     """
     header, layout = _read(config)
@@ -60,7 +60,7 @@ def _open(config: PackedNpyConfig) -> PackedFileSource:
 
 
 def _read(config: PackedNpyConfig) -> tuple[NpyHeader, FrameLayout]:
-    """Return the header of the capture and the layout of its frames, which are all there."""
+    """Return the header of the capture and the layout of its frames; raise if frames are missing."""
     header, layout = _layout(config)
     if not is_gzip(config.path):
         require_whole(config.path, header)

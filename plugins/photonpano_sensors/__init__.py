@@ -1,1 +1,1 @@
-"""Captures as cameras and their programs write them."""
+"""Sources of captures in the formats of cameras and their programs."""

@@ -19,26 +19,26 @@ class BinConfig(Config):
 
 
 def opened(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> PackedFileSource:
-    """Open a capture; see `frame_files` for what is refused."""
+    """Open a capture. Raises what `frame_files` raises."""
     return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
 
 
 def checked(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Sequence[str]:
-    """Return what opening a capture would raise."""
+    """Return the message of the error that opening the capture would raise, if any."""
     return objections(frame_files, config.path, layout, footer_bytes)
 
 
 def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[FrameFile]:
-    """Return the files of a capture and how many frames their sizes say they hold.
+    """Return the files of a capture with the number of frames that follows from their sizes.
 
     Args:
         path: a file, or a folder.
-        layout: how a frame lies in its bytes.
-        footer_bytes: how many bytes may follow the frames of a file.
+        layout: order of the pixels of a frame in its bytes.
+        footer_bytes: number of bytes that may follow the frames of a file.
 
     Raises:
-        InputError: there is none; one holds no whole number of frames; or one but the last has another size than the first,
-            or the last is longer, so that frames are missing or the order is wrong.
+        InputError: there is no file; the size of a file is not a whole number of frames; or a file has another size than the
+            first, unless it is the last and shorter: frames are missing, or the order is wrong.
     """
     files = files_in(path, ".bin")
     sizes = [file.stat().st_size for file in files]
@@ -48,7 +48,7 @@ def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[
         if not n_frames or rest not in (0, footer_bytes):
             allowed = f", with or without {footer_bytes} more" if footer_bytes else ""
             raise InputError(
-                f"{file} has {size:,} bytes, which is no whole number of frames of {layout.stored_bytes:,} bytes{allowed}; "
+                f"{file} has {size:,} bytes, which is not a whole number of frames of {layout.stored_bytes:,} bytes{allowed}; "
                 "it is cut short, or of another camera: copy it again, or choose another source"
             )
         found.append(FrameFile(file, n_frames))
@@ -62,7 +62,7 @@ def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[
 
 
 def sizes_of(path: Path) -> list[int]:
-    """Return the sizes of the .bin files at a path, in order, in bytes; none where there are none."""
+    """Return the sizes in bytes of the .bin files at a path, in order; an empty list if there are none."""
     try:
         files = files_in(path, ".bin")
         return [file.stat().st_size for file in files if file.suffix.lower() == ".bin"]

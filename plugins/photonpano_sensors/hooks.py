@@ -19,6 +19,6 @@ if TYPE_CHECKING:
 
 @hookimpl
 def photonpano_sources() -> Iterator[SourceContribution]:
-    """Offer captures as cameras and their programs write them."""
+    """Offer sources of captures in the formats of cameras and their programs."""
     yield from (SWISSSPAD_HALF, SWISSSPAD_FULL, SPAD512, SPAD512_SPARSE, MAT_PARTS, VISIONSIM, UBICEPT_H5)
     yield from INTENSITY_SOURCES

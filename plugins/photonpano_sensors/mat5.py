@@ -1,7 +1,7 @@
-"""An array in a MATLAB file of version 5 to 7, read a little at a time.
+"""Read an array in a MATLAB file of version 5 to 7, in pieces.
 
-The format is that of MathWorks, "MAT-File Level 5 File Format". scipy.io reads it as well, but whole, and a damaged file can
-end the process.
+The format is described in MathWorks, "MAT-File Level 5 File Format". scipy.io reads it too, but only whole arrays, and it ends
+the process for some damaged files.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _HEADER_BYTES = 128
 _MATRIX, _COMPRESSED = 14, 15
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _NUMBERS = range(6, 16)
-"""Classes of arrays of numbers; the others are cells, structures, objects, text and sparse matrices."""
+"""Classes of numeric arrays; the others are cells, structures, objects, text and sparse matrices."""
 _COMPLEX = 0x0800
 _MOST_BYTES = 1024
-"""Names and dimensions are shorter."""
+"""Upper limit of the size of a name or of dimensions."""
 _BLOCK_BYTES = 256 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class Mat5Array:
-    """An array of numbers whose values come next in a stream.
+    """A numeric array whose values come next in a stream.
 
     Attributes:
-        shape: its dimensions, the first of which runs fastest.
-        dtype: the type of the values in the file.
-        stream: what they are read from.
+        shape: its dimensions; the first varies fastest.
+        dtype: type of the values in the file.
+        stream: the stream of the values.
     """
 
     shape: tuple[int, ...]
@@ -47,17 +47,17 @@ class Mat5Array:
     stream: Stream
 
     def read(self, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Read the next values, as many as fill the shape, the first dimension of which runs slowest."""
+        """Read the next values as an array of this shape, whose first dimension varies slowest."""
         size = math.prod(shape) * self.dtype.itemsize
         return np.frombuffer(_exactly(self.stream, size), self.dtype).reshape(shape)
 
 
 @contextmanager
 def mat5_array(path: Path, name: str) -> Iterator[Mat5Array | None]:
-    """Open a file at the values of an array; None if it has none of that name.
+    """Open a file at the values of an array; None if it has no array of that name.
 
     Raises:
-        Exception: nearly anything, where the file is damaged or another.
+        Exception: of nearly any type, if the file is damaged or not a MATLAB file.
     """
     with path.open("rb") as file:
         order = {b"IM": "<", b"MI": ">"}[_exactly(file, _HEADER_BYTES)[126:]]
@@ -76,7 +76,7 @@ def mat5_array(path: Path, name: str) -> Iterator[Mat5Array | None]:
 
 
 def _array(stream: Stream, order: str, name: bytes) -> Mat5Array | None:
-    """Read the beginning of an array; None if it has another name."""
+    """Read the header of an array; None if it has another name."""
     flags, _ = struct.unpack(f"{order}II", _element(stream, order))
     shape = tuple(np.frombuffer(_element(stream, order), f"{order}i4").tolist())
     if _element(stream, order) != name:
@@ -91,7 +91,7 @@ def _array(stream: Stream, order: str, name: bytes) -> Mat5Array | None:
 
 
 def _tag(stream: Stream, order: str) -> tuple[int, int, bytes | None]:
-    """Return type and size of an element, and its bytes if there are at most four: they are in the tag then."""
+    """Return type and size of an element, and its bytes if there are at most four: they are part of the tag then."""
     head = _exactly(stream, 8)
     first, second = struct.unpack(f"{order}II", head)
     return (first & 0xFFFF, first >> 16, head[4:]) if first >> 16 else (first, second, None)
@@ -113,17 +113,17 @@ def _exactly(stream: Stream, size: int) -> bytes:
 
 
 class _Inflated(io.RawIOBase):
-    """What a compressed element of a file holds."""
+    """The unpacked content of a compressed element."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         self._file, self._left, self._zlib = file, size, zlib.decompressobj()
 
     def readable(self) -> bool:
-        """Say that it can be read."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Unpack as much as there is, or fits into a buffer; 0 at the end."""
+        """Unpack bytes into a buffer, and return their number; 0 at the end."""
         while not self._zlib.eof:
             packed = self._zlib.unconsumed_tail or self._file.read(min(self._left, _BLOCK_BYTES))
             if not self._zlib.unconsumed_tail:

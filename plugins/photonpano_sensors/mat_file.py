@@ -1,4 +1,4 @@
-"""Frames in one MATLAB file: of version 5 to 7, or of 7.3, which is HDF5."""
+"""Read frames from one MATLAB file: of version 5 to 7, or of version 7.3, which is HDF5."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _DAMAGED = "cannot be read as a MATLAB file: it is damaged or something else; co
 
 
 class _Variable(NamedTuple):
-    """The variable of an open file: its shape as MATLAB has it, and what reads its frames, in order: (n, width, height)."""
+    """The variable of an open file: its shape in MATLAB, and a function that reads the next frames, (n, width, height)."""
 
     shape: tuple[int, ...]
     read: Callable[[int, int], NDArray[Any]]
 
 
 class MatFrames:
-    """The frames of a file, found without reading them.
+    """The frames of a file, which are not read yet.
 
     Attributes:
         shape: (frames, height, width).
@@ -82,7 +82,7 @@ def _hdf_variable(path: Path) -> Iterator[_Variable]:
         if _VARIABLE not in file:
             raise _missing(path)
         values = file[_VARIABLE]
-        # MATLAB's dimensions are there in reverse.
+        # HDF5 has the dimensions of MATLAB in reverse order.
         yield _Variable(values.shape[::-1], lambda start, stop: values[start:stop] if values.ndim == 3 else values[()][None])
 
 
@@ -91,7 +91,7 @@ def _missing(path: Path) -> InputError:
 
 
 def _frame_order(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """Return (frames, height, width) of MATLAB's (height, width, frames), whose last dimension it drops if it is 1."""
+    """Return (frames, height, width) of (height, width, frames), whose last dimension MATLAB drops if it is 1."""
     if len(shape) not in (2, 3) or min(shape) < 1:
         raise InputError(f"{path} has {_VARIABLE} of shape {shape}; frames are (height, width, frames)")
     height, width, n_frames = (*shape, 1)[:3]

@@ -20,7 +20,7 @@ from photonpano_sensors.mat_file import MatFrames
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
 _MOST_PARTS = 4
-"""Parts that are kept, eight pixels to a byte: files are compressed, and so can only be read from the beginning."""
+"""Parts kept in memory, eight pixels to a byte: compressed files can only be read from the beginning."""
 
 
 class MatPartsConfig(Config):
@@ -39,7 +39,7 @@ class _Info(BaseModel):
 
 
 class MatPartsSource(BinarySource):
-    """Frames of MATLAB files. A part is read whole when one of its frames is asked for, and the last few are kept.
+    """Frames of MATLAB files. A part is read whole when one of its frames is read, and the last four parts are kept.
 
     Raises:
         InputError: a part is missing or damaged, differs from the others in size, or holds something else.
@@ -62,21 +62,21 @@ class MatPartsSource(BinarySource):
         self._packed = lru_cache(_MOST_PARTS)(lambda path: MatFrames(path).packed())
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
-        """Yield the frames of a span, a part at a time: see `BinarySource`."""
+        """Yield the frames of a span, one part after the other: see `BinarySource`."""
         for path, (first, last) in zip(self._paths, pairwise(self._starts), strict=True):
             start, stop = max(span.start, first), min(span.stop, last)
             if start < stop:
-                with self._lock:  # so that threads do not all read the same part
+                with self._lock:  # otherwise several threads would read the same part
                     packed = self._packed(path)
                 yield slice(start - span.start, stop - span.start), packed[start - first : stop - first]
 
     def close(self) -> None:
-        """Let go of what was read."""
+        """Release the parts that were read."""
         self._packed.cache_clear()
 
 
 def _parts(folder: Path) -> list[Path]:
-    """Return the parts in order, none missing."""
+    """Return the parts in order; raise if one is missing."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; name the folder of part_1.mat and so on")
     numbers = {int(match[1]) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))}
@@ -98,7 +98,7 @@ def _info(folder: Path) -> _Info | None:
 
 
 def _require_agreement(folder: Path, n_frames: Sequence[int]) -> None:
-    """Refuse an info.json that counts other frames, be it those of the capture or those of each part but the last."""
+    """Refuse an info.json whose no_frames is neither that of the capture nor that of each part but the last."""
     info = _info(folder)
     if info is None or info.no_frames == sum(n_frames):
         return
@@ -114,7 +114,7 @@ def _size(shape: tuple[int, int, int]) -> str:
 
 
 def _check(config: MatPartsConfig) -> Sequence[str]:
-    """Look which parts there are; to read one takes seconds."""
+    """Check the names of the parts; reading one takes seconds."""
     return objections(_parts, config.path)
 
 

@@ -11,7 +11,7 @@ from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
 LAYOUT = FrameLayout((512, 512), (512, 64))
 FOOTER_BYTES = 4
 _FILE_SIZES = {1000 * LAYOUT.stored_bytes: "1000 frames", 256 * LAYOUT.stored_bytes + FOOTER_BYTES: "256 frames and a footer"}
-"""Sizes by which a file is recognised; 256 frames without a footer are as long as the files of SwissSPAD2."""
+"""Sizes by which a file is recognised. 256 frames without a footer have the size of files of SwissSPAD2."""
 
 
 class Spad512Config(BinConfig):

@@ -1,4 +1,4 @@
-"""Source `spad512-sparse`: the addresses of the pixels that are lit, for the dark."""
+"""Source `spad512-sparse`: addresses of lit pixels, a compact format for dark scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _END = _PIXELS
 """The address that ends a frame."""
 _WORD = np.dtype("<u4")
 _MOST_FRAMES = 32
-"""Frames that are unpacked at a time."""
+"""Frames unpacked at once."""
 _BLOCK_WORDS = 1024**2
 
 
@@ -61,7 +61,7 @@ class Spad512SparseSource(BinarySource):
             yield place, np.packbits(frames).reshape(-1, _SIZE, _SIZE // 8)
 
     def _lit(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.int64]]]:
-        """Yield which frames of the span these are, and the places of their lit pixels in (n, H, W), each once."""
+        """Yield the place of some frames in the span, and the indices of their lit pixels in (n, H, W), each once."""
         for path, ends, offset in zip(self._paths, self._ends, self._starts, strict=False):
             for first in range(max(0, span.start - offset), min(len(ends), span.stop - offset), _MOST_FRAMES):
                 stop = min(first + _MOST_FRAMES, len(ends), span.stop - offset)
@@ -73,15 +73,15 @@ class Spad512SparseSource(BinarySource):
 
 
 def _places(words: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Return the places of lit pixels in (n, H, W), of addresses that end with an `_END`."""
+    """Return the indices of lit pixels in (n, H, W), from addresses that end with an `_END`."""
     end = words == _END
     places = (np.cumsum(end) * _PIXELS + words)[~end]
-    # A pixel that is named twice in a frame is lit once.
+    # A pixel that is listed twice in a frame is lit once.
     return places if np.all(np.diff(places) > 0) else np.unique(places)
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a capture, after all that can be told without reading them."""
+    """Return the files of a capture, once their sizes and last words are checked."""
     files = files_in(path, ".bin")
     for file in files:
         size = file.stat().st_size
@@ -99,7 +99,7 @@ def _words(path: Path, start: int, n_words: int = 1) -> NDArray[np.uint32]:
 
 
 def _frame_ends(path: Path) -> NDArray[np.int64]:
-    """Return how many words of a file there are to the end of each frame."""
+    """Return the number of words of a file up to the end of each frame."""
     found, start = [], 0
     while len(words := _words(path, start, _BLOCK_WORDS)):
         if words.max() > _END:

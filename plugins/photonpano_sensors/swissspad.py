@@ -17,11 +17,12 @@ Pixels = TypeVar("Pixels", bound=np.generic)
 _ZONES = 4
 _FILE_BYTES = 512 * 256 * 64
 """Bytes of a file, of 512 frames of the half array or 256 of the full one."""
-_SAMPLES = 64
-"""So many full-array frames of the file, or pairs of half-array ones, are looked at to tell the two apart."""
-_BRIGHTEST = 0.9
-"""Brighter pixels count as if they were as bright as this share of all: hot ones must not outweigh the scene."""
+_COMPARED = 64
+"""To distinguish the arrays, 64 frames of the full array, or pairs of the half array, are compared."""
+_CLIP_QUANTILE = 0.9
+"""Brightness is clipped at this quantile, because hot pixels must not outweigh the scene."""
 _STANDARD_ERRORS = 5.0
+"""Difference of the two correlations, in standard errors, from which the array is decided."""
 
 
 class SwissSpadHalfConfig(BinConfig):
@@ -33,7 +34,7 @@ class SwissSpadFullConfig(BinConfig):
 
 
 def _joined(images: NDArray[Pixels]) -> NDArray[Pixels]:
-    """Join the zones of the full array: each gives a quarter of the columns of the top half, then of the bottom half.
+    """Join the zones of the full array: each holds a quarter of the columns of the top half, then of the bottom half.
 
     The bottom half is read out from the outside to the inside, as the top half is.
     """
@@ -64,24 +65,27 @@ def _recognise(path: Path, array: Literal["half", "full"]) -> Recognised | None:
 
 
 def _array_of(path: Path) -> tuple[Literal["half", "full"] | None, str]:
-    """Tell whose file it is, from what neighbours are like, and say why.
+    """Decide which array a file is of, by the correlation of pixels, and give the reason.
 
-    A frame of the full array is as long as two of the half. If they are two, then pixels of the first and the second half of
-    the bytes are the same pixels at nearly the same time, and nothing is more alike. If they are one, these are 128 rows
-    apart, and pixels two rows apart are more alike. (Not one row: odd and even rows may differ by themselves.)
+    A frame of the full array has the size of two frames of the half array. In a file of the half array, the two halves of these
+    bytes are the same pixels at nearly the same time, which correlate most. In a file of the full array they are 128 rows
+    apart, and pixels two rows apart correlate more. (Not one row, because odd and even rows may differ systematically.)
     """
-    frames = np.memmap(path, np.uint8, "r").reshape(-1, *FULL.stored_shape)[:: _FILE_BYTES // FULL.stored_bytes // _SAMPLES]
+    frames = np.memmap(path, np.uint8, "r").reshape(-1, *FULL.stored_shape)[:: _FILE_BYTES // FULL.stored_bytes // _COMPARED]
     sums = np.unpackbits(frames, axis=-1, bitorder="little").sum(axis=0, dtype=np.float64)
-    first, second = np.split(np.minimum(sums, np.quantile(sums, _BRIGHTEST)), 2)
-    halves, rows = _alikeness(first, second), _alikeness(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]]))
+    first, second = np.split(np.minimum(sums, np.quantile(sums, _CLIP_QUANTILE)), 2)
+    halves, rows = (
+        _correlation(first, second),
+        _correlation(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]])),
+    )
     numbers = f"correlations of {np.tanh(halves):.2f} between the halves of their frames, {np.tanh(rows):.2f} between rows"
     if abs(halves - rows) < _STANDARD_ERRORS * np.sqrt(2 / first.size):
-        return None, f"which the half and the full array have; {numbers} do not tell which"
+        return None, f"which the half and the full array have; {numbers} do not decide it"
     return ("half", numbers) if halves > rows else ("full", numbers)
 
 
-def _alikeness(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return the correlation on Fisher's scale, where its standard error is 1 / sqrt(pixels)."""
+def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Return the Fisher transform of the correlation, whose standard error is 1 / sqrt(pixels)."""
     if not first.std() or not second.std():
         return 0.0
     return float(np.arctanh(min(np.corrcoef(first.ravel(), second.ravel())[0, 1], 0.999999)))

@@ -33,10 +33,10 @@ class UbiceptConfig(Config):
 
 
 class UbiceptSource(Closing):
-    """Sums of binary frames, read one by one. The library reads one at a time, whatever the number of threads.
+    """Sums of binary frames. The HDF5 library reads one at a time, whatever the number of threads.
 
     Raises:
-        InputError: the file is missing or damaged, holds no frames, or does not say of how many binary frames they are sums.
+        InputError: the file is missing or damaged, holds no frames, or lacks the number of binary frames of a sum.
     """
 
     def __init__(self, config: UbiceptConfig) -> None:
@@ -62,17 +62,17 @@ class UbiceptSource(Closing):
             )
         if first.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self._path} holds {first.dtype} values; sums of binary frames are uint8 or uint16")
-        said = json.loads(first.attrs.get("metadata", "{}"))
-        binary_frames = config.binary_frames or _binary_frames(said)
+        metadata = json.loads(first.attrs.get("metadata", "{}"))
+        binary_frames = config.binary_frames or _binary_frames(metadata)
         if binary_frames is None:
-            raise InputError(f"{self._path} does not say of how many binary frames each frame is the sum; set binary_frames")
+            raise InputError(f"{self._path} does not contain the number of binary frames of each sum; set binary_frames")
         height, width = first.shape[:2]
         self._dtype = first.dtype
         self.info = StreamInfo(
             n_frames=len(self._names),
             height=int(height),
             width=int(width),
-            frame_rate_hz=config.frame_rate_hz or _frame_rate_hz(said, binary_frames),
+            frame_rate_hz=config.frame_rate_hz or _frame_rate_hz(metadata, binary_frames),
             kind="intensity",
             bit_depth=binary_frames.bit_length(),
         )
@@ -116,7 +116,7 @@ class UbiceptSource(Closing):
         return values
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
 
@@ -130,16 +130,16 @@ def _is_frame(name: str, item: object) -> bool:
     return isinstance(item, h5py.Dataset) and _is_number(name.rpartition("/")[2])
 
 
-def _binary_frames(said: dict[str, Any]) -> int | None:
-    """Return how many binary frames the metadata of a frame says it is the sum of."""
+def _binary_frames(metadata: dict[str, Any]) -> int | None:
+    """Return the number of binary frames of a sum, from the metadata of a frame; None if unknown."""
     key = "num_integrated_binary_frames"
-    number = said.get("polycam_metadata", {}).get(key, said.get(key))
+    number = metadata.get("polycam_metadata", {}).get(key, metadata.get(key))
     return int(number) if number is not None and 1 <= int(number) <= 65535 else None
 
 
-def _frame_rate_hz(said: dict[str, Any], binary_frames: int) -> float | None:
-    """Return the rate of the sums, if the metadata tells that of the binary frames."""
-    for node in said.get("node_history", [])[:1]:
+def _frame_rate_hz(metadata: dict[str, Any], binary_frames: int) -> float | None:
+    """Return the rate of the sums, from the rate of the binary frames in the metadata; None if unknown."""
+    for node in metadata.get("node_history", [])[:1]:
         rate = node.get("schedule", {}).get("base_schedule", {}).get("binary_frame_rate_fps")
         if rate is not None and 0 < float(rate) < float("inf"):
             return float(rate) / binary_frames
@@ -147,7 +147,7 @@ def _frame_rate_hz(said: dict[str, Any], binary_frames: int) -> float | None:
 
 
 def _check(config: UbiceptConfig) -> Sequence[str]:
-    """Look whether it is HDF5; what is in it takes a library."""
+    """Check for HDF5 by the first bytes; the content needs a library that may be missing."""
     if not config.path.is_file():
         return (missing_file(config.path),)
     if read_start(config.path, len(_HDF)) != _HDF:
@@ -158,7 +158,7 @@ def _check(config: UbiceptConfig) -> Sequence[str]:
 def _recognise(path: Path) -> Recognised | None:
     if not path.name.lower().endswith(_SUFFIX) or _check(UbiceptConfig(path=path)):
         return None
-    return Recognised({"path": str(path)}, f"an HDF5 file that is called {_SUFFIX}")
+    return Recognised({"path": str(path)}, f"an HDF5 file whose name ends in {_SUFFIX}")
 
 
 UBICEPT_H5 = SourceContribution(

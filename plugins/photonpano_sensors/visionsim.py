@@ -20,7 +20,7 @@ _GREEN = 1
 
 
 class VisionsimConfig(Config):
-    """A capture that visionsim has simulated."""
+    """A capture simulated by visionsim."""
 
     path: SpecPath = Field(description=f"the {_TRANSFORMS} beside the .npy file, or their folder")
     channel: int | None = Field(None, ge=0, le=2, description="channel of a colour capture: 0, 1 or 2")
@@ -30,7 +30,7 @@ class VisionsimConfig(Config):
 
 
 class _Part(BaseModel):
-    """What may be said of all frames, or of each."""
+    """Keys that describe all frames, or one."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -40,7 +40,7 @@ class _Part(BaseModel):
 
 
 class _Transforms(_Part):
-    """A transforms.json, as far as it says how frames are stored. The poses in it are not used."""
+    """The keys of a transforms.json that describe how frames are stored. Its poses are not used."""
 
     h: int = Field(ge=1)
     w: int = Field(ge=1)
@@ -56,13 +56,13 @@ def _open(config: VisionsimConfig) -> PackedFileSource:
 
 
 def _read(config: VisionsimConfig) -> tuple[list[FrameFile], FrameLayout, float | None]:
-    """Return all that can be told without the frames."""
+    """Return the files, the layout and the frame rate, without reading frames."""
     path = config.path / _TRANSFORMS if config.path.is_dir() else config.path
     transforms = read_json(path, _Transforms)
     frames = [_completed(each, transforms, path) for each in transforms.frames]
     packing = {each.bitpack_dim for each in frames}
     if len(packing) > 1:
-        raise InputError(f"{path} says that some frames are packed otherwise than others, which this source cannot read")
+        raise InputError(f"{path} describes frames that are packed along different dimensions, which this source cannot read")
     if (transforms.c == 3) != (config.channel is not None):
         raise InputError(f"{path} says that frames have c: {transforms.c}; " + _CHANNEL_REMEDIES[transforms.c])
     layout = _layout(transforms, packing.pop(), config.channel, path)
@@ -73,12 +73,12 @@ _CHANNEL_REMEDIES = {1: "leave out the channel", 3: "choose a channel: 0, 1 or 2
 
 
 def _completed(frame: _Part, transforms: _Transforms, path: Path) -> _Part:
-    """Return a frame with what is said of all."""
+    """Return a frame, completed by the keys that describe all frames."""
     packing = frame.bitpack_dim or transforms.bitpack_dim
     if transforms.bitpack is False:
         packing = None
     elif transforms.bitpack and packing is None:
-        raise InputError(f"{path} says that frames are packed, and not along which dimension; add bitpack_dim: 1 or 2")
+        raise InputError(f"{path} says that frames are packed, but not along which dimension; add bitpack_dim: 1 or 2")
     file = frame.file_path or transforms.file_path
     if file is None:
         raise InputError(f"{path} names no file_path; add that of the .npy file")
@@ -88,7 +88,7 @@ def _completed(frame: _Part, transforms: _Transforms, path: Path) -> _Part:
 
 
 def _files(frames: Sequence[_Part], transforms: _Transforms, layout: FrameLayout, folder: Path) -> list[FrameFile]:
-    """Return runs of frames that follow each other in a file."""
+    """Return runs of consecutive frames in a file."""
     runs: list[tuple[Path, int, int]] = []
     for index, frame in enumerate(frames):
         assert frame.file_path is not None, "it was completed"
@@ -103,7 +103,7 @@ def _files(frames: Sequence[_Part], transforms: _Transforms, layout: FrameLayout
         header = headers[file]
         if start + n_frames > header.n_frames:
             raise InputError(
-                f"{folder / _TRANSFORMS} speaks of frame {start + n_frames - 1} of {file}, which has {header.n_frames}; "
+                f"{folder / _TRANSFORMS} lists frame {start + n_frames - 1} of {file}, which has {header.n_frames}; "
                 "write it again"
             )
         found.append(FrameFile(header.path, n_frames, header.offset + start * layout.stored_bytes))
@@ -129,7 +129,7 @@ def _header(path: Path, transforms: _Transforms, layout: FrameLayout) -> FrameFi
 
 
 def _layout(transforms: _Transforms, packed_dim: int | None, channel: int | None, path: Path) -> FrameLayout:
-    """Return how frames lie in the file; `channel` and `path` are for colour and for errors."""
+    """Return the layout of frames in the file. `channel` selects one of three; `path` is for error messages."""
     height, width, last = transforms.h, transforms.w, channel or 0
 
     def along_width(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Headers of Photron cameras: .cih, which is text, and .cihx, which holds XML among other bytes."""
+"""Read headers of Photron cameras: .cih, which is text, and .cihx, which contains XML among other bytes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from photonpano.reading import reading
 from photonpano_sensors.intensity.levels import Encoding
 
 _MOST_BYTES = 4 * 1024**2
-"""Headers are a few kB; whatever is larger is something else."""
+"""Headers have a few kB; larger files are something else."""
 _BITS = (8, 12, 16)
 _COUNT = re.compile(r"\d{1,9}")
 _RATE = re.compile(r"\d{1,9}(\.\d{1,9})?")
@@ -28,20 +28,20 @@ _KEYS = {
     "rate": ("Record Rate(fps)", "recordInfo/recordRate"),
     "step": ("Save Step", "frameInfo/skipFrame"),
 }
-"""What the headers call what they tell."""
+"""The keys of .cih and .cihx files."""
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the header of a recording tells.
+    """The header of a recording.
 
     Attributes:
         n_frames: frames in the .mraw file.
         height: rows of a frame.
         width: columns of a frame.
-        bits: of a pixel in the file: 8, 12 or 16.
-        encoding: what the levels mean; fewer bits than those of the file where the camera has fewer.
-        frame_rate_hz: frames a second in the file, of which some may have been left out when it was saved.
+        bits: bits of a pixel in the file: 8, 12 or 16.
+        encoding: meaning of the levels; it has fewer bits than the file if the camera has.
+        frame_rate_hz: frames per second in the file, without frames that were skipped when it was saved.
     """
 
     n_frames: int
@@ -61,7 +61,7 @@ def read_header(path: Path) -> Header:
     """Read a .cih or .cihx file.
 
     Raises:
-        InputError: it is missing, is something else, or tells of frames that cannot be read.
+        InputError: the file is missing or something else, or describes frames that cannot be read.
     """
     with reading(path), path.open("rb") as file:
         content = file.read(_MOST_BYTES + 1)
@@ -71,7 +71,7 @@ def read_header(path: Path) -> Header:
 
 
 def _of_text(content: bytes) -> Callable[[str], str | None]:
-    """Return what finds the value of a .cih file."""
+    """Return a function that looks up a value of a .cih file."""
     lines = (line.partition(":") for line in content.decode("utf-8", errors="replace").splitlines())
     values: dict[str, str] = {}
     for key, _, value in lines:
@@ -80,9 +80,9 @@ def _of_text(content: bytes) -> Callable[[str], str | None]:
 
 
 def _of_xml(path: Path, content: bytes) -> Callable[[str], str | None]:
-    """Return what finds the value of a .cihx file.
+    """Return a function that looks up a value of a .cihx file.
 
-    What stands before `<cih>` is cut off, a document type included: so there are no entities that could be expanded.
+    Everything before `<cih>` is cut off, including a document type: so no entities can be expanded.
     """
     start, end = content.find(b"<cih>"), content.rfind(b"</cih>")
     if not 0 <= start < end:
@@ -100,7 +100,7 @@ def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
     def value(what: str) -> str:
         found = (value_of(what) or "").strip()
         if not found:
-            raise InputError(f"{path} does not tell {_KEYS[what][name]!r}; is it the header of a recording, and whole?")
+            raise InputError(f"{path} lacks {_KEYS[what][name]!r}; check that it is the header of a recording, and complete")
         return found
 
     def count(what: str) -> int:
@@ -120,7 +120,7 @@ def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
         raise InputError(f"{path}: pixels of {bits} bits cannot be read, only of 8, 12 or 16{colour}")
     height, width = count("height"), count("width")
     if height * width * bits % 8:
-        raise InputError(f"{path}: frames of {height}x{width} pixels of {bits} bits are no whole number of bytes")
+        raise InputError(f"{path}: frames of {height}x{width} pixels of {bits} bits are not a whole number of bytes")
     effective = count("effective bits")
     if effective > bits:
         raise InputError(f"{path}: pixels of {bits} bits cannot hold {effective} effective ones")
@@ -131,7 +131,7 @@ def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
     if side not in ("lower", "higher"):
         raise InputError(f"{path}: {_KEYS['effective side'][name]!r} must be Lower or Higher, got {side:.40}")
     white = 2**effective - 1
-    # However few are effective, levels of more than a byte stay so.
+    # Levels of more than a byte keep two bytes, even if at most 8 bits are effective.
     low = Encoding(max(effective, min(bits, 9)), 0.0, white)
     encoding = low if side == "lower" else Encoding(bits, 0.0, white << (bits - effective))
     return Header(count("frames"), height, width, bits, encoding, rate_hz / max(every, 1) or None)

@@ -1,4 +1,4 @@
-"""What specs may say under `with`; light enough to be imported when plugins are listed."""
+"""Configs of the sources of grey levels, without heavy imports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Gamma = Annotated[float, Field(gt=0, le=10)]
 
 
 class ResponseConfig(Config):
-    """How a camera turns photons into the grey levels of its file."""
+    """How a camera converts photons to the grey levels of its file."""
 
     curve: Literal["linear", "srgb"] | Gamma = Field(
         "linear",
@@ -53,7 +53,7 @@ class ResponseConfig(Config):
 
 
 class IntensityConfig(Config):
-    """What all captures of grey levels share."""
+    """Keys of all sources of grey levels."""
 
     path: SpecPath = Field(description="the capture")
     frame_rate_hz: float | None = Field(

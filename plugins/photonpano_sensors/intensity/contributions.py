@@ -1,4 +1,4 @@
-"""The sources of grey levels, offered without importing what they need."""
+"""Contributions of the sources of grey levels, without heavy imports."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _build_video(config: VideoConfig, context: SourceContext) -> Source:
 
 
 def _check_video(config: VideoConfig) -> Sequence[str]:
-    """Look at the file's name alone: to index its packets takes as long as to read it."""
+    """Check the name of the file only: indexing its packets takes as long as reading it."""
     if found := objections(refuse_mdat, config.path):
         return found
     return () if is_file(config.path) else (missing_file(config.path),)

@@ -1,4 +1,4 @@
-"""Frames of a video, decoded as rarely as can be."""
+"""Decode frames of a video, each as rarely as possible."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class _Decoder:
 
     Attributes:
         next: the frame that is decoded next.
-        turn: held by the thread that decodes.
-        users: how many threads decode, or wait for their turn.
+        turn: lock of the thread that decodes.
+        users: number of threads that decode, or wait for the lock.
     """
 
     def __init__(self, index: VideoIndex, threads: int) -> None:
-        """Open the video for itself.
+        """Open the video once more.
 
         Raises:
-            InputError: it is no longer there.
+            InputError: the file is missing.
         """
         self._index = index
         self._container = open_video(index.path)
@@ -43,18 +43,18 @@ class _Decoder:
         self.users = 0
 
     def comes_to(self, frame: int) -> bool:
-        """Tell whether decoding on is the way to a frame, rather than beginning at the key frame before it."""
+        """Return whether a frame is reached by decoding on, without seeking to the key frame before it."""
         return self._index.key_before(frame) <= self.next <= frame
 
     def begin_before(self, frame: int) -> None:
-        """Have the next frame be the key frame before a frame; whoever decodes then does the seeking."""
+        """Make the key frame before a frame the next one; the next call of `decode` seeks to it."""
         self.next, self._seeks = self._index.key_before(frame), True
 
     def decode(self) -> tuple[int, Levels]:
-        """Decode the next frame, and return its place and its levels.
+        """Decode the next frame, and return its index and its levels.
 
         Raises:
-            InputError: it is damaged or missing.
+            InputError: the frame is damaged or missing.
         """
         due = self.next
         try:
@@ -64,18 +64,18 @@ class _Decoder:
         except av.FFmpegError:
             frame = None
         if frame is None or frame.is_corrupt or self._place(frame) > due:
-            self.next = len(self._index.times)  # whoever comes next has to begin anew
+            self.next = len(self._index.times)  # the next call has to seek
             raise InputError(f"frame {due} of {self._index.path} is damaged or missing; export or copy it again")
         self.next = due + 1
         return due, _luma(frame, self._index)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._container.close()
 
     def _seek(self, key: int) -> None:
         self._seeks = False
-        # An index may be so coarse, or so wrong, that seeking leads past the key frame.
+        # If the index of the file is coarse or wrong, seeking may end behind the key frame.
         for start in (key, 0):
             self._container.seek(int(self._index.times[start]), stream=self._stream)
             self._frames = self._container.decode(self._stream)
@@ -85,30 +85,30 @@ class _Decoder:
                 return
 
     def _place(self, frame: VideoFrame) -> int:
-        """Return which frame it is; -1 if it does not say, or is none of the index."""
+        """Return the index of a frame; -1 if its time is missing or not in the index."""
         times = self._index.times
         place = len(times) if frame.pts is None else int(np.searchsorted(times, frame.pts))
         return place if place < len(times) and times[place] == frame.pts else -1
 
 
 class DecodedFrames:
-    """The frames of a video, those decoded last kept up to a number of bytes. May be used from several threads.
+    """The frames of a video, of which the last decoded ones are cached. Safe from several threads.
 
-    Groups overlap, and the threads that merge them go along the video side by side. What one of them has decoded the others
-    find here. Who needs more takes the decoder that comes to it next, even if that is at work for somebody else,
-    who will soon be done; only where none does, one that nobody uses begins anew at a key frame.
+    Groups overlap, and the threads that merge them move along the video together, so they share a cache. A thread that needs a
+    further frame takes the decoder that reaches it next, and waits if another thread uses it. If no decoder reaches the frame,
+    an idle one seeks to a key frame.
 
     Attributes:
-        n_decoded: how many frames were decoded so far.
+        n_decoded: number of frames decoded so far.
     """
 
     def __init__(self, index: VideoIndex, threads: int, capacity_bytes: int) -> None:
         """Prepare to decode.
 
         Args:
-            index: of the video.
-            threads: how many threads are expected to ask for frames at once.
-            capacity_bytes: how much is kept.
+            index: the index of the video.
+            threads: number of threads that read frames at once.
+            capacity_bytes: size of the cache.
         """
         self._index = index
         self._threads = threads
@@ -119,10 +119,10 @@ class DecodedFrames:
         self.n_decoded = 0
 
     def __getitem__(self, frame: int) -> Levels:
-        """Return a frame, (H, W), which is not to be written to.
+        """Return a frame, (H, W), read-only.
 
         Raises:
-            InputError: it is damaged or missing.
+            InputError: the frame is damaged or missing.
         """
         while True:
             with self._lock:
@@ -140,12 +140,12 @@ class DecodedFrames:
                 return levels
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         for decoder in self._decoders:
             decoder.close()
 
     def _decoded(self, decoder: _Decoder, frame: int) -> Levels | None:
-        """Decode until a frame; None if somebody else decoded it with this decoder, and it is no longer kept."""
+        """Decode up to a frame; None if another thread has decoded it with this decoder, and it has left the cache."""
         while decoder.next <= frame:
             place, levels = decoder.decode()
             with self._lock:
@@ -157,7 +157,7 @@ class DecodedFrames:
             return self._known(frame)
 
     def _decoder_for(self, frame: int) -> _Decoder:
-        """Return the decoder that comes to a frame next, or one that will begin at the key frame before it."""
+        """Return the decoder that reaches a frame next, or one that seeks to the key frame before it."""
         coming = [decoder for decoder in self._decoders if decoder.comes_to(frame)]
         idle = [decoder for decoder in self._decoders if not decoder.users]
         if coming:
@@ -168,7 +168,7 @@ class DecodedFrames:
         else:
             chosen = _Decoder(self._index, self._threads)
             chosen.begin_before(frame)
-        # The one that nobody has used for the longest time comes first.
+        # The least recently used decoder comes first.
         self._decoders = [decoder for decoder in self._decoders if decoder is not chosen] + [chosen]
         return chosen
 

@@ -1,4 +1,4 @@
-"""From the levels of a file to levels that are linear in flux, so that sums of frames are."""
+"""Convert the levels of a file to levels that are linear in flux, so that frames can be summed."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _MOST = 2**16 - 1
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """What a file says of its levels.
+    """The encoding of the levels of a file.
 
     Attributes:
-        bits: of a level.
-        black: the level of no light.
-        white: the level above which nothing is told.
+        bits: bits of a level.
+        black: the level without light.
+        white: the level at which a pixel saturates.
     """
 
     bits: int
@@ -39,11 +39,11 @@ class Encoding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLevels:
-    """How levels of a file become linear ones, and what those mean.
+    """The conversion of levels of a file to linear levels, and their response.
 
     Attributes:
-        bits: of a linear level.
-        table: (2^b,) uint16, the linear level of each level of a file of b bits; None where they are linear already.
+        bits: bits of a linear level.
+        table: (2^b,) uint16, the linear level of each level of a file of b bits; None if these are linear already.
         response: how flux becomes linear levels.
     """
 
@@ -53,13 +53,13 @@ class LinearLevels:
 
 
 def linear_levels(config: ResponseConfig, encoding: Encoding) -> LinearLevels:
-    """Return how the levels of a file become linear.
+    """Return the conversion of the levels of a file to linear levels.
 
-    Levels below black stay below: the curve goes on through black as it comes from it, so that noise in the dark is not cut off
-    at one side. Quantisation counts as noise of the reading, that of the levels in the middle of the range.
+    The curve is continued below black, point-symmetrically, so that noise in the dark is not clipped. Quantisation noise, that
+    of the levels in the middle of the range, is added to the read noise.
 
     Raises:
-        InputError: black and white contradict the bits, or the file of the curve cannot be used.
+        InputError: black and white do not suit the bits, or the file of the curve cannot be used.
     """
     black = encoding.black if config.black_level is None else config.black_level
     white = encoding.white if config.white_level is None else config.white_level
@@ -82,13 +82,13 @@ def linear_levels(config: ResponseConfig, encoding: Encoding) -> LinearLevels:
     lowest = min(float(light[0]), 0.0)
     scale = _MOST / (max(float(light[-1]), 1.0) - lowest)
     table = np.rint((light - lowest) * scale).astype(np.uint16)
-    # Whole levels, so that the sum of a black frame tells exactly no light.
+    # Integers, so that the flux of a black frame is exactly 0.
     zero, one = round(-lowest * scale), round((1 - lowest) * scale)
     return LinearLevels(16, table, IntensityResponse(config.saturation_photons / (one - zero), zero, one, read_noise))
 
 
 def _light(config: ResponseConfig, encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the light of encoded levels that are 0 at black and 1 at white, on any scale if it comes from a file."""
+    """Return the light of encoded levels that are 0 at black and 1 at white; in arbitrary units if it comes from a file."""
     if config.curve_file is not None:
         return _measured(config.curve_file, len(encoded))
     size = np.abs(encoded)

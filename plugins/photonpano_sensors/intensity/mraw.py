@@ -19,7 +19,7 @@ class FastcamMrawSource(IntensitySource):
     """Frames of 8, 12 or 16 bits in one .mraw file, described by the .cih or .cihx file beside it.
 
     Raises:
-        InputError: a file is missing, the header tells of frames that cannot be read, or of more than there are.
+        InputError: a file is missing, or the header describes frames that cannot be read, or more than there are.
     """
 
     def __init__(self, config: FastcamMrawConfig) -> None:
@@ -29,7 +29,7 @@ class FastcamMrawSource(IntensitySource):
         self._files = OpenFiles()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._files.close()
 
     def _read(self, span: FrameSpan, levels: Levels) -> None:
@@ -44,13 +44,13 @@ class FastcamMrawSource(IntensitySource):
 
 
 def open_recording(path: Path) -> tuple[Path, Header]:
-    """Return the .mraw file of a recording and what its header tells.
+    """Return the .mraw file of a recording and its header.
 
     Args:
         path: the .mraw file or its header.
 
     Raises:
-        InputError: a file is missing, the header cannot be used, or the .mraw file is shorter than it says.
+        InputError: a file is missing, the header cannot be used, or the .mraw file is shorter than the header promises.
     """
     refuse_mdat(path)
     if not path.exists():
@@ -60,7 +60,7 @@ def open_recording(path: Path) -> tuple[Path, Header]:
         header_path = header_beside(path)
         if header_path is None:
             raise InputError(
-                f"{path} has no .cihx or .cih file beside it, which tells size and bits of its frames; copy it too"
+                f"{path} has no .cihx or .cih file beside it, with the size and the bits of its frames; copy it too"
             )
         mraw = path
     elif suffix in (".cih", ".cihx"):
@@ -69,7 +69,7 @@ def open_recording(path: Path) -> tuple[Path, Header]:
             raise InputError(f"{path} has no .mraw file beside it, which holds the frames; copy it from the camera too")
         mraw = beside
     else:
-        raise InputError(f"{path} is no recording of a FASTCAM: name its .cih, .cihx or .mraw file")
+        raise InputError(f"{path} is not a recording of a FASTCAM: name its .cih, .cihx or .mraw file")
     header = read_header(header_path)
     needed, size = header.n_frames * header.frame_bytes, mraw.stat().st_size
     if size < needed:

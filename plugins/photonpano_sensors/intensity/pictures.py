@@ -1,4 +1,4 @@
-"""Source `image-folder`: a picture for each frame, or a TIFF file with a page for each."""
+"""Source `image-folder`: a picture for each frame, or a TIFF file with a page for each frame."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Image = NDArray[np.generic]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}
-"""What the colour types of PNG other than grey stand for."""
+"""The colour types of PNG other than grey."""
 _DAMAGED = (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, struct.error)
-"""What tifffile raises when it is given anything."""
+"""Errors that tifffile raises for damaged files."""
 
 
 class _Form(NamedTuple):
-    """What all frames of a capture have in common."""
+    """Size and bits, which all frames of a capture share."""
 
     height: int
     width: int
@@ -45,8 +45,8 @@ class _Pictures(Protocol):
     """Frames that are pictures.
 
     Attributes:
-        n_frames: how many.
-        form: that of each.
+        n_frames: number of frames.
+        form: size and bits of each.
     """
 
     n_frames: int
@@ -57,15 +57,15 @@ class _Pictures(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of files."""
+        """Close files."""
         ...
 
 
 class ImageFolderSource(IntensitySource):
-    """Pictures of grey levels of 8 or 16 bits, each read when it is asked for.
+    """Pictures of grey levels of 8 or 16 bits.
 
     Raises:
-        InputError: there is none, one cannot be read or is not grey, or they differ in size or bits.
+        InputError: there is no picture, one cannot be read or is not grey, or pictures differ in size or bits.
     """
 
     def __init__(self, config: ImageFolderConfig) -> None:
@@ -75,7 +75,7 @@ class ImageFolderSource(IntensitySource):
         super().__init__(config, shape, None, Encoding.full(form.bits))
 
     def close(self) -> None:
-        """Let go of files."""
+        """Close files."""
         self._pictures.close()
 
     def _read(self, span: FrameSpan, levels: Levels) -> None:
@@ -101,7 +101,7 @@ class _Folder:
         return levels
 
     def close(self) -> None:
-        """Do nothing: files are open while they are read."""
+        """Do nothing: no file stays open."""
 
 
 class _Pages:
@@ -133,17 +133,19 @@ class _Pages:
 
 
 def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
-    """Return the form that all have.
+    """Return the form that all frames have.
 
     Raises:
-        InputError: they differ.
+        InputError: the frames differ.
     """
     first: tuple[str, _Form] | None = None
     for name, form in forms:
         if first is None:
             first = name, form
         elif form != first[1]:
-            raise InputError(f"{name} has {form}, and {first[0]} has {first[1]}; frames are alike: remove what is none")
+            raise InputError(
+                f"{name} has {form}, and {first[0]} has {first[1]}; all frames must have one size: remove other pictures"
+            )
     assert first is not None
     return first[1]
 

@@ -1,4 +1,4 @@
-"""What the sources of grey levels take for their own, told by names and first bytes."""
+"""Recognise captures of grey levels by their names and first bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TIFF = re.compile(rb"II[\x2a\x2b]\0|MM\0[\x2a\x2b]")
 
 
 def recognise_video(path: Path) -> Recognised | None:
-    """Take files that begin as videos do."""
+    """Recognise videos by their first bytes."""
     start = read_start(path, _START_BYTES)
     for name, pattern in _CONTAINERS:
         if pattern.match(start):
@@ -31,7 +31,7 @@ def recognise_video(path: Path) -> Recognised | None:
 
 
 def recognise_mraw(path: Path) -> Recognised | None:
-    """Take headers and frames of Photron cameras; those of an Infinicam as well, of which opening says what to do."""
+    """Recognise headers and frames of Photron cameras, including those of an Infinicam: opening these says what to do."""
     suffix = path.suffix.lower()
     if not is_file(path):
         return None
@@ -45,7 +45,7 @@ def recognise_mraw(path: Path) -> Recognised | None:
 
 
 def recognise_pictures(path: Path) -> Recognised | None:
-    """Take folders of pictures, and TIFF files."""
+    """Recognise folders of pictures, and TIFF files."""
     if _TIFF.match(read_start(path, _START_BYTES)):
         return Recognised({"path": path}, "by its first bytes it is a TIFF file")
     found = pictures_in(path)
@@ -55,10 +55,10 @@ def recognise_pictures(path: Path) -> Recognised | None:
 
 
 def refuse_mdat(path: Path) -> None:
-    """Say what to do with the raw files of an Infinicam.
+    """Refuse raw files of an Infinicam, with a sentence about what to do.
 
     Raises:
-        InputError: the path is one, or the header of one.
+        InputError: the path is such a file, or its header.
     """
     header_of = _beside(path, ".mdat") if path.suffix.lower() in (".cih", ".cihx") and not mraw_beside(path) else None
     if path.suffix.lower() == ".mdat" or header_of is not None:
@@ -79,7 +79,7 @@ def mraw_beside(header: Path) -> Path | None:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Return the pictures of a folder in natural order; none if it is no folder that can be read."""
+    """Return the pictures of a folder in natural order; none if the folder cannot be read."""
     try:
         pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURES]
     except OSError:
@@ -93,7 +93,7 @@ def _beside(path: Path, suffix: str) -> Path | None:
 
 
 def is_file(path: Path) -> bool:
-    """Tell whether there is such a file, as far as the system lets us see."""
+    """Return whether there is such a file; False if the system refuses to answer."""
     try:
         return path.is_file()
     except OSError:

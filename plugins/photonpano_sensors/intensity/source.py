@@ -1,4 +1,4 @@
-"""What all sources of grey levels share: linear levels, sums, and reading in parts."""
+"""Base class of sources of grey levels: linear levels, and sums that are read in parts."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from photonpano_sensors.intensity.levels import Encoding, linear_levels
 from photonpano_sensors.intensity.summing import Levels, add_levels, add_linear
 
 _PART_BYTES = 4 * 1024**2
-"""So much is held at a time while frames are summed."""
+"""Bytes of the frames that are read at once for a sum."""
 _MOST_COUNT = 2**32 - 1
 
 
 class IntensitySource(Closing, ABC):
     """Grey levels that are linear in flux: a `photonpano.Source`.
 
-    A pixel that saturates counts with the saturation level, so that its flux is the least that it was: a sum does not tell in
-    which of its frames a pixel saturated.
+    A saturated pixel counts with the saturation level, so its flux is a lower bound: in a sum, saturated frames cannot be
+    separated from others.
     """
 
     def __init__(
@@ -31,10 +31,10 @@ class IntensitySource(Closing, ABC):
         """Prepare to read.
 
         Args:
-            config: what the spec says.
+            config: the keys of the spec.
             shape: frames, height and width of the capture.
-            frame_rate_hz: what the file says, used unless the spec says something else.
-            encoding: what the file says of its levels.
+            frame_rate_hz: frame rate of the file, used unless the spec has one.
+            encoding: encoding of the levels of the file.
 
         Raises:
             InputError: the response of the spec does not suit the levels.
@@ -49,10 +49,10 @@ class IntensitySource(Closing, ABC):
 
     @abstractmethod
     def _read(self, span: FrameSpan, levels: Levels) -> None:
-        """Fill an array (n, H, W) with the levels of a span that is known to be there, as the file has them.
+        """Fill an array (n, H, W) with the levels of a span as they are in the file; the span is within the capture.
 
         Raises:
-            InputError: they cannot be read.
+            InputError: the levels cannot be read.
         """
 
     def frames(self, span: FrameSpan) -> Levels:
@@ -65,7 +65,7 @@ class IntensitySource(Closing, ABC):
         """Sum the frames of a span: (H, W) uint32.
 
         Raises:
-            InputError: there are so many that the sum might not fit.
+            InputError: the sum of so many frames might not fit into uint32.
         """
         self.info.require(span)
         most = _MOST_COUNT // (2**self.info.bit_depth - 1)

@@ -1,4 +1,4 @@
-"""Loops over grey levels: sums, and levels of 12 bits unpacked."""
+"""Compiled loops over grey levels: sum them, and unpack levels of 12 bits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from photonpano.compiling import compiled
 Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 _BLOCK = 4096
-"""So many pixels are summed at a time: their sums stay in the fastest cache."""
+"""Pixels summed at once: their sums stay in the L1 cache."""
 
 
 @compiled
@@ -28,7 +28,7 @@ def add_levels(frames: Levels, total: NDArray[np.uint32]) -> None:
 
 @compiled
 def add_linear(frames: Levels, table: NDArray[np.uint16], total: NDArray[np.uint32]) -> None:
-    """Add what a table says of the levels of frames."""
+    """Add the values of a table for the levels of frames."""
     for start in range(0, len(total), _BLOCK):
         block = total[start : start + _BLOCK]
         for index in range(len(frames)):

@@ -10,11 +10,11 @@ from photonpano_sensors.intensity.summing import Levels
 from photonpano_sensors.intensity.video_index import index_of
 
 _KEPT_BYTES = 256 * 1024**2
-"""Decoded frames are kept up to this."""
+"""Size of the cache of decoded frames."""
 
 
 class VideoSource(IntensitySource):
-    """Frames of a video in the order in which they are shown. Of colours, the luma is taken.
+    """Frames of a video in the order in which they are shown; of colours, the luma.
 
     Raises:
         InputError: the file is missing, is not a video, or ends early.
@@ -26,7 +26,7 @@ class VideoSource(IntensitySource):
         self.decoded = DecodedFrames(index, context.threads, _KEPT_BYTES)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self.decoded.close()
 
     def _read(self, span: FrameSpan, levels: Levels) -> None:

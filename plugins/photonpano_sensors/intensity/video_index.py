@@ -1,4 +1,4 @@
-"""Which frames a video holds, told from its packets without decoding any."""
+"""List the frames of a video from its packets, without decoding them."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import refuse_mdat
 
 _LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")
-"""Formats of pixels whose first plane is the luma, as it stands."""
+"""Pixel formats whose first plane is the luma."""
 _FULL_RANGE = re.compile(r"yuvj|gray")
 _JPEG_RANGE = 2
-"""What FFmpeg calls levels that are all used."""
+"""The colour range of FFmpeg in which all levels are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoIndex:
-    """What the packets of a video tell.
+    """The frames of a video, from its packets.
 
     Attributes:
         path: the file.
-        times: (n,) when each frame is shown, in units of the stream, increasing.
-        keys: (k,) the frames from which decoding can start; the first is 0.
+        times: (n,) time of each frame, in units of the stream, increasing.
+        keys: (k,) frames at which decoding can start; the first is 0.
         height: rows of a frame.
         width: columns of a frame.
-        pixel_format: what frames are converted to, whose first plane is the luma.
-        encoding: what the levels of the luma mean.
-        frame_rate_hz: at which the video is played.
+        pixel_format: format that frames are converted to; its first plane is the luma.
+        encoding: encoding of the luma.
+        frame_rate_hz: frame rate at which the video is played.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class VideoIndex:
     frame_rate_hz: float | None
 
     def key_before(self, frame: int) -> int:
-        """Return the frame at which decoding has to start for a frame."""
+        """Return the key frame at which decoding has to start for a frame."""
         return int(self.keys[np.searchsorted(self.keys, frame, side="right") - 1])
 
 
@@ -66,29 +66,29 @@ def index_of(path: Path) -> VideoIndex:
         stream = container.streams.video[0]
         context = stream.codec_context
         try:
-            # An empty packet ends the stream; others are of frames that editing has cut away. None is kept: they hold the film.
-            told = [
+            # An empty packet ends the stream; discarded ones are of frames that were cut. None is kept: they hold the film.
+            found = [
                 (packet.dts if packet.pts is None else packet.pts, packet.is_keyframe)
                 for packet in container.demux(stream)
                 if packet.size and not packet.is_discard
             ]
         except av.FFmpegError as error:
             raise InputError(f"{path} is damaged: {error.strerror}; export or copy it again") from error
-        times = np.array([time for time, _ in told], dtype=np.float64)
+        times = np.array([time for time, _ in found], dtype=np.float64)
         if not len(times):
             raise InputError(f"{path} has no frames; export or copy it again")
         if np.isnan(times).any() or len(np.unique(times)) < len(times):
-            raise InputError(f"{path} does not tell when each frame is shown; export it again, as MP4 or AVI")
+            raise InputError(f"{path} lacks the times of its frames; export it again, as MP4 or AVI")
         if len(times) < stream.frames:
             raise InputError(
                 f"{path} is cut short: it promises {stream.frames} frames and holds {len(times)}; export or copy it again"
             )
         order = np.argsort(times)
-        keys = np.flatnonzero(np.array([key for _, key in told])[order])
+        keys = np.flatnonzero(np.array([key for _, key in found])[order])
         if not len(keys) or keys[0]:
             raise InputError(f"{path} does not begin with a frame that stands alone; export it again")
         if context.format is None or not context.width * context.height:
-            raise InputError(f"{path}: the size of its frames cannot be told; export it again")
+            raise InputError(f"{path}: the size of its frames is missing; export it again")
         pixel_format = _pixel_format(context.format)
         rate = stream.average_rate
         return VideoIndex(
@@ -105,7 +105,7 @@ def index_of(path: Path) -> VideoIndex:
 
 @contextmanager
 def opened(path: Path) -> Iterator[InputContainer]:
-    """Open a video for a while.
+    """Open a video within a block.
 
     Raises:
         InputError: see `open_video`.
@@ -118,10 +118,10 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def open_video(path: Path) -> InputContainer:
-    """Open a file that has a video stream.
+    """Open a file with a video stream.
 
     Raises:
-        InputError: it is missing, or has none.
+        InputError: the file is missing, or has no video stream.
     """
     try:
         container = av.open(str(path), metadata_errors="replace")
@@ -140,11 +140,11 @@ def open_video(path: Path) -> InputContainer:
 
 
 def _pixel_format(stored: VideoFormat) -> str:
-    """Return the format that frames are converted to: their own where its first plane is the luma."""
+    """Return the format that frames are converted to: their own if its first plane is the luma."""
     if _LUMA_FIRST.fullmatch(stored.name):
         return stored.name
     if "yuv" in stored.name or "yvu" in stored.name or "uyv" in stored.name:
-        # Luma and colours take turns: set apart, the levels stay as they are.
+        # Luma and colours alternate: converted to planes, the levels stay as they are.
         return "yuv422p"
     return "gray16le" if stored.components[0].bits > 8 else "gray"
 

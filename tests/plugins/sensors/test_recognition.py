@@ -61,7 +61,7 @@ def test_where_frames_do_not_tell_both_arrays_are_named(tmp_path: Path, bin_file
     path.write_bytes(bin_file("swissspad-half", frames))
     found = recognised(path)
     assert set(found) == {"swissspad-half", "swissspad-full"}
-    assert all(answer.because.endswith("do not tell which") for answer in found.values())
+    assert all(answer.because.endswith("do not decide it") for answer in found.values())
 
 
 @pytest.mark.parametrize("n_frames", [256, 1000])

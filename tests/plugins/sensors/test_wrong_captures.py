@@ -46,8 +46,8 @@ def test_files_of_a_part_of_a_frame(tmp_path: Path, name: str) -> None:
     for size in (0, 3 * frame - 1, 3 * frame + 5):
         fill(tmp_path, {"f1.bin": 4 * frame, "f2.bin": size})
         assert refusal(name, path=tmp_path) == (
-            f"{tmp_path / 'f2.bin'} has {size:,} bytes, which is no whole number of frames of {frame:,} bytes{more}; it is cut "
-            "short, or of another camera: copy it again, or choose another source"
+            f"{tmp_path / 'f2.bin'} has {size:,} bytes, which is not a whole number of frames of {frame:,} bytes{more}; it is "
+            "cut short, or of another camera: copy it again, or choose another source"
         )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["f1.bin", "f2.bin"]
 
@@ -184,11 +184,11 @@ WRONG_TRANSFORMS: dict[str, tuple[dict[str, Any], str]] = {
     "dimension": ({"bitpack_dim": 3}, "{json} is wrong at bitpack_dim: Input should be 1 or 2; write it again"),
     "no dimension": (
         {"bitpack_dim": None},
-        "{json} says that frames are packed, and not along which dimension; add bitpack_dim: 1 or 2",
+        "{json} says that frames are packed, but not along which dimension; add bitpack_dim: 1 or 2",
     ),
     "two dimensions": (
         {"frames": [{"bitpack_dim": 1}] + [{}] * 5},
-        "{json} says that some frames are packed otherwise than others, which this source cannot read",
+        "{json} describes frames that are packed along different dimensions, which this source cannot read",
     ),
     "other dimension": (
         {"bitpack_dim": 1},
@@ -202,7 +202,7 @@ WRONG_TRANSFORMS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "more frames": (
         {"frames": [{}] * 7},
-        "{json} speaks of frame 6 of frames.npy, which has 6; write it again",
+        "{json} lists frame 6 of frames.npy, which has 6; write it again",
     ),
     "no file": ({"file_path": None}, "{json} names no file_path; add that of the .npy file"),
     "another file": ({"file_path": "other.npy"}, "there is no file {folder}/other.npy; check the path"),
@@ -270,9 +270,7 @@ def test_files_of_ubicept_that_are_something_else(tmp_path: Path, ubicept_file: 
     def said(path: Path) -> str:
         return refusal("ubicept-h5", 2, checked=False, path=path).removeprefix(str(path))
 
-    assert said(ubicept_file(metadata="{}")) == (
-        " does not say of how many binary frames each frame is the sum; set binary_frames"
-    )
+    assert said(ubicept_file(metadata="{}")) == (" does not contain the number of binary frames of each sum; set binary_frames")
     assert said(ubicept_file(FRAMES[0] + 3)) == (
         " holds uint8 values up to 4 in frame 1, which cannot be the sum of 3 binary frames, as uint8; correct binary_frames, "
         "or copy the file again"

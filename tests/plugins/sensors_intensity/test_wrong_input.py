@@ -112,7 +112,9 @@ CASES = {
         "fastcam-mraw",
         "a.cihx",
         beam(b"imageDataInfo", b"imageDataInf"),
-        AT_CHECK.format("DIR/a.cihx does not tell 'imageDataInfo/colorInfo/bit'; is it the header of a recording, and whole?"),
+        AT_CHECK.format(
+            "DIR/a.cihx lacks 'imageDataInfo/colorInfo/bit'; check that it is the header of a recording, and complete"
+        ),
     ),
     "a width that is none": Case(
         "fastcam-mraw",
@@ -148,7 +150,9 @@ CASES = {
         "fastcam-mraw",
         "a.mraw",
         files(a_mraw=b"1234"),
-        AT_CHECK.format("DIR/a.mraw has no .cihx or .cih file beside it, which tells size and bits of its frames; copy it too"),
+        AT_CHECK.format(
+            "DIR/a.mraw has no .cihx or .cih file beside it, with the size and the bits of its frames; copy it too"
+        ),
     ),
     "no frames": Case(
         "fastcam-mraw",
@@ -192,7 +196,8 @@ CASES = {
         ".",
         pictures(SMALL, SMALL, LARGE),
         AT_CHECK.format(
-            "DIR/2.png has 5x6 pixels of 8 bits, and DIR/0.png has 4x6 pixels of 8 bits; frames are alike: remove what is none"
+            "DIR/2.png has 5x6 pixels of 8 bits, and DIR/0.png has 4x6 pixels of 8 bits; "
+            "all frames must have one size: remove other pictures"
         ),
     ),
     "pictures of two depths": Case(
@@ -200,7 +205,8 @@ CASES = {
         ".",
         pictures(SMALL, SMALL.astype(np.uint16), suffix="tif"),
         AT_CHECK.format(
-            "DIR/1.tif has 4x6 pixels of 16 bits, and DIR/0.tif has 4x6 pixels of 8 bits; frames are alike: remove what is none"
+            "DIR/1.tif has 4x6 pixels of 16 bits, and DIR/0.tif has 4x6 pixels of 8 bits; "
+            "all frames must have one size: remove other pictures"
         ),
     ),
     "pages of two sizes": Case(
@@ -209,7 +215,7 @@ CASES = {
         two_sizes_of_pages,
         AT_CHECK.format(
             "page 1 of DIR/a.tif has 5x6 pixels of 8 bits, and page 0 of DIR/a.tif has 4x6 pixels of 8 bits; "
-            "frames are alike: remove what is none"
+            "all frames must have one size: remove other pictures"
         ),
     ),
     "pictures in colour": Case(
