@@ -134,12 +134,10 @@ def _load(
     output: str | Path | None,
     catalog: Catalog,
 ) -> Plan:
-    problems: list[Problem] = []
-    written = read_yaml(spec, place, problems) if isinstance(spec, str) else from_python(spec, place)
-    if written is None or written.data is None:
-        place = place if written is None else written.place("")
-        problems += written.problems if written and written.problems is not problems else []
-        raise SpecError(problems or [place.problem("the spec is empty; it needs at least `version` and `source`")])
+    written = read_yaml(spec, place) if isinstance(spec, str) else from_python(spec, place)
+    if written.data is None:
+        empty = written.place("").problem("the spec is empty; it needs at least `version` and `source`")
+        raise SpecError(written.problems or [empty])
     for override in overrides:
         _apply_override(written, override)
     _set_output(written, None if output is None else Path(output).absolute(), Path("runs", name))
@@ -160,9 +158,9 @@ def _apply_override(spec: WrittenSpec, text: str) -> None:
         spec.problems.append(Place(override=text).problem("expected KEY=VALUE, such as run.seed=1"))
         return
     place = Place(path.strip(), override=text)
-    n_problems = len(spec.problems)
-    value = read_yaml(yaml, place, spec.problems) or WrittenSpec(None, {place.where: place})
-    if len(spec.problems) == n_problems:
+    value = read_yaml(yaml, place)
+    spec.problems += value.problems
+    if not value.problems:
         _set(spec, spec.data, "", keys, value, place)
 
 
@@ -180,12 +178,12 @@ def _set(spec: WrittenSpec, node: Any, where: str, keys: list[str], value: Writt
         node[key] = value.data
         spec.replace_places(path, value.places)
         return
-    if isinstance(key, int) or node.get(key) is not None:
-        inside = node[key]
-    else:
-        inside = node[key] = {}
-        spec.places.setdefault(path, Place(path, override=place.override))
-    _set(spec, inside, path, rest, value, place)
+    if isinstance(node, dict) and key not in node:
+        spec.places[path] = Place(path, override=place.override)
+        node[key] = {}
+    if node[key] is None:
+        node[key] = {}
+    _set(spec, node[key], path, rest, value, place)
 
 
 def _set_output(spec: WrittenSpec, chosen: Path | None, default: Path) -> None:

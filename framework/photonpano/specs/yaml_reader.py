@@ -29,25 +29,24 @@ class _TooLongError(Exception):
     """More than `MAX_VALUES` values."""
 
 
-def read_yaml(text: str, place: Place, problems: list[Problem]) -> WrittenSpec | None:
+def read_yaml(text: str, place: Place) -> WrittenSpec:
     """Read one YAML 1.2 document; aliases and merge keys are followed.
 
     Args:
         text: the document.
         place: where the document stands; lines and columns are filled in unless it is an override.
-        problems: what is wrong with it is added here.
 
     Returns:
-        None if the text is not YAML, or holds no document.
+        The document, with problems if something cannot be read; its data is None if the text is not YAML or holds no document.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.composer.warn_double_anchors = False
-    reader = _Reader(place, problems)
+    reader = _Reader(place)
+    problems = reader.spec.problems
     try:
         node = yaml.compose(text)
         if node is not None:
             reader.spec.data = reader.value(node, place.where)
-            return reader.spec
     except MarkedYAMLError as error:
         problems.append(_syntax_problem(error, reader))
     except ReaderError as error:
@@ -61,7 +60,7 @@ def read_yaml(text: str, place: Place, problems: list[Problem]) -> WrittenSpec |
         problems.append(place.problem(f"no spec: with its aliases repeated it has more than {MAX_VALUES} values"))
     except RecursionError:
         problems.append(place.problem("no spec: nested too deeply"))
-    return None
+    return reader.spec
 
 
 def _syntax_problem(error: MarkedYAMLError, reader: _Reader) -> Problem:
@@ -78,9 +77,9 @@ def _syntax_problem(error: MarkedYAMLError, reader: _Reader) -> Problem:
 class _Reader:
     """Reads the nodes of one document."""
 
-    def __init__(self, root: Place, problems: list[Problem]) -> None:
+    def __init__(self, root: Place) -> None:
         self.root = root
-        self.spec = WrittenSpec(None, {}, problems)
+        self.spec = WrittenSpec(None, {root.where: root})
         self.count = 0
         self.open: set[int] = set()
 

@@ -5,7 +5,7 @@ import pytest
 from photonpano import SpecError
 from photonpano.specs import load_spec, parse_spec
 
-SPEC = "version: 1\nsource: {use: simulator}\nlevels: [{}, {scale: 0.5}]\nrun: {seed: 3}\n"
+SPEC = "version: 1\nsource: {use: simulator}\nlevels: [{}, {scale: 0.5}, null]\nrun: {seed: 3}\n"
 
 
 @pytest.mark.parametrize(
@@ -23,6 +23,7 @@ SPEC = "version: 1\nsource: {use: simulator}\nlevels: [{}, {scale: 0.5}]\nrun: {
         ("locate.use=opencv-sift", ("locate", "use"), "opencv-sift"),
         ("locate.fallback=[]", ("locate", "fallback"), []),
         ("run=", ("run", "seed"), 0),
+        ("levels.2.scale=0.5", ("levels", 2, "scale"), 0.5),
         ("run.memory=1 GiB", ("run", "memory"), 2**30),
     ],
 )
@@ -51,8 +52,8 @@ def test_override_repairs_what_the_file_has_wrong(catalog):
         ("=1", "expected KEY=VALUE, such as run.seed=1 (in the override =1)"),
         ("run.seed=-1", "run.seed: expected an integer of at least 0, got -1 (in the override run.seed=-1)"),
         ("run.sed=1", "run.sed: unknown key; did you mean 'seed'? (in the override run.sed=1)"),
-        ("levels.2.scale=1", "levels.2.scale: levels is a list of 2, which has no '2' (in the override levels.2.scale=1)"),
-        ("levels.-1={}", "levels.-1: levels is a list of 2, which has no '-1' (in the override levels.-1={})"),
+        ("levels.3.scale=1", "levels.3.scale: levels is a list of 3, which has no '3' (in the override levels.3.scale=1)"),
+        ("levels.-1={}", "levels.-1: levels is a list of 3, which has no '-1' (in the override levels.-1={})"),
         ("version.x=1", "version.x: version is 1, which has no 'x' (in the override version.x=1)"),
         ("run.seed=[1", "run.seed: not valid YAML: expected ',' or ']', but got '<stream end>' (in the override run.seed=[1)"),
         ("run.seed=!!f 1", "run.seed: tags such as !!f are not allowed (in the override run.seed=!!f 1)"),

@@ -13,9 +13,8 @@ from photonpano.specs.yaml_reader import read_yaml
 
 
 def read(text):
-    problems = []
-    spec = read_yaml(text, Place(), problems)
-    assert problems == []
+    spec = read_yaml(text, Place())
+    assert spec.problems == []
     return spec
 
 
@@ -109,9 +108,8 @@ def test_yaml_reader_reads_json(document):
 @settings(deadline=None)  # the machine may be busy
 @given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))
 def test_any_text_gives_value_or_problem(text):
-    problems = []
-    spec = read_yaml(text, Place(), problems)
-    if (spec is None or spec.data is None) and not problems:
+    spec = read_yaml(text, Place())
+    if spec.data is None and not spec.problems:
         assert YAML(typ="safe", pure=True).load(text) is None
-    for problem in problems:
+    for problem in spec.problems:
         assert problem.line is None or problem.line <= text.count("\n") + 2

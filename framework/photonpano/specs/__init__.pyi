@@ -1,0 +1,13 @@
+from .checks import check_stream as check_stream
+from .json_schema import json_schema as json_schema
+from .loading import SPEC_SUFFIXES as SPEC_SUFFIXES
+from .loading import capture_plan as capture_plan
+from .loading import load_spec as load_spec
+from .loading import parse_spec as parse_spec
+from .plan import Choice as Choice
+from .plan import LevelPlan as LevelPlan
+from .plan import Plan as Plan
+from .settings import GraphSettings as GraphSettings
+from .settings import OutputSettings as OutputSettings
+from .settings import RenderSettings as RenderSettings
+from .settings import RunSettings as RunSettings
