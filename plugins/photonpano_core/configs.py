@@ -57,11 +57,11 @@ class PhotonMleConfig(Config):
     """Keys of `photon-mle`."""
 
     tolerance_px: float = Field(
-        1.0, gt=0, le=8, description="motion, in px of a frame, within which frames are summed before they are warped"
+        1.0, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
     )
     compensate: bool = Field(
         True,
-        description="whether to warp along the motion known so far; false averages frames as they are, the paper's baseline",
+        description="warp along the motion known so far; false averages frames as they are, the paper's baseline",
     )
 
 
@@ -89,7 +89,7 @@ class RobustMergeConfig(Config):
         0.5, ge=0, le=8, description="error of the motion, in px of a frame, whose effect costs no weight either"
     )
     tolerance_px: float = Field(
-        0.5, gt=0, le=8, description="motion, in px of a frame, within which frames are summed before they are warped"
+        0.5, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
     )
 
 

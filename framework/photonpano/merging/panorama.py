@@ -26,7 +26,7 @@ MAX_EXCESS = 16
 
 
 class RenderOptions(Protocol):
-    """How a panorama is rendered."""
+    """Settings of `render_panorama`."""
 
     @property
     def scale(self) -> float:
@@ -35,12 +35,12 @@ class RenderOptions(Protocol):
 
     @property
     def tolerance_px(self) -> float:
-        """Frames are summed before they are warped while they move less than this, in px."""
+        """Motion within which frames are summed before they are warped, in px of a frame."""
         ...
 
     @property
     def white_quantile(self) -> float:
-        """The quantile of the flux that is white in the picture."""
+        """Quantile of the flux that is white in the picture."""
         ...
 
 
@@ -133,7 +133,7 @@ def render(
         trajectory: frame pixels to reference pixels.
         span: the frames to merge.
         canvas: the pixel grid.
-        tolerance_px: frames that move less than this are summed before they are warped.
+        tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
         context: threads and progress.
     """
     (panorama,) = render_tiles(source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
@@ -209,13 +209,13 @@ class RenderedPanorama:
     """A panorama whose tiles have been written.
 
     Attributes:
-        canvas: its pixel grid.
+        canvas: pixel grid of the whole panorama.
         thumbnail: flux and weight, averaged down by `reduction`.
         reduction: side of the squares of pixels that are averaged; 1 if the panorama fits into memory.
         picture: (H, W) uint8, the thumbnail in sRGB.
-        white_flux: the flux that is white in the picture, in photons per pixel per frame.
+        white_flux: flux that is white in the picture, photons per pixel per frame.
         coverage_share: share of the pixels that were seen.
-        seconds: time that rendering and writing took.
+        seconds: time of rendering and writing.
     """
 
     canvas: Canvas
@@ -241,29 +241,29 @@ def render_panorama(
     Args:
         source: the capture.
         trajectory: the motion, frame pixels to reference pixels.
-        span: the frames that are merged.
-        options: scale, tolerance and white.
+        span: the frames to merge.
+        options: scale, tolerance and white quantile.
         memory: bytes that rendering may take.
-        write_tile: called with each tile, its pixels, and the canvas that it is a part of.
+        write_tile: called with each tile, its flux and weight, and the whole canvas.
         context: threads and progress.
 
     Raises:
-        CanvasTooLargeError: the panorama is more than `LARGEST` times as large as what fits into the memory.
+        CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
         LocationError: frames reach the horizon of the reference plane.
     """
     start = time.perf_counter()
     canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory)
     tiles, reduction = tiles_of(canvas, memory)
-    shown = Thumbnail(canvas, reduction)
+    gathered = Thumbnail(canvas, reduction)
     rendered = render_tiles(source, trajectory, span, tiles, options.tolerance_px, context)
     for tile, part in zip(tiles, rendered, strict=True):
         write_tile(tile, part, canvas)
-        shown.add(tile, part)
-    thumbnail = shown.panorama
+        gathered.add(tile, part)
+    thumbnail = gathered.panorama
     white_flux = float(np.quantile(thumbnail.flux[thumbnail.weight > 0], options.white_quantile)) or 1.0
     picture = tone_mapped(thumbnail.flux, white_flux)
     seconds = time.perf_counter() - start
-    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, shown.coverage_share, seconds)
+    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, gathered.coverage_share, seconds)
 
 
 def _gib(size: float) -> str:
