@@ -64,6 +64,7 @@ def test_dir_of_lazy_package_lists_public_names(package: ModuleType) -> None:
         "import photonpano.photometry",
         "from photonpano.registry import discover; discover()",
         "import photonpano.cli",
+        "from photonpano import capture_plan, load_spec, parse_spec",
     ],
 )
 def test_what_plugins_offer_is_told_without_their_libraries(statement: str) -> None:
