@@ -263,6 +263,21 @@ def test_index_links_every_page():
     assert set((ROOT / "docs").rglob("*.md")) - {index} <= linked
 
 
+def test_architecture_page_names_every_package_and_module():
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    parts = [path for folder in ("framework/photonpano", "plugins") for path in (ROOT / folder).iterdir()]
+    names = [path.stem for path in parts if (path / "__init__.py").exists() or path.suffix == ".py"]
+    assert [name for name in sorted(names) if f"`{name}`" not in page and not name.startswith("__")] == []
+
+
+def test_architecture_page_lists_import_layers_bottom_up():
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    shown = [set(re.findall(r"`(\w+)`", line)) for line in re.findall(r"^\d+\. .+$", page, re.MULTILINE)]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    assert shown == [set(re.findall(r"photonpano\.(\w+)", layer)) for layer in reversed(layers)]
+
+
 @pytest.fixture(scope="module")
 def make_reference() -> Any:
     spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
