@@ -92,7 +92,7 @@ def scored(spec: dict[str, Any], capture: Path, folder: Path) -> Evaluation:
     return evaluate(done.directory, truth_path(capture))
 
 
-def test_a_corrected_sensor_is_as_good_as_one_without_faults(
+def test_corrected_sensor_is_as_accurate_as_one_without_faults(
     clean: Evaluation, raw: Path, dark_file: Path, small_capture: Path, tmp_path: Path
 ) -> None:
     """0.1 dB below it when this was written, and 1.8 dB if only the pixels are put in their places."""
@@ -110,7 +110,7 @@ def test_a_corrected_sensor_is_as_good_as_one_without_faults(
     assert parse_spec(record["spec"]).corrections == parse_spec(spec_of(raw, *corrections)).corrections
 
 
-def test_a_masked_pixel_is_filled_by_the_motion_and_not_by_its_neighbours(small_capture: Path, tmp_path: Path) -> None:
+def test_masked_pixel_is_filled_by_the_motion(small_capture: Path, tmp_path: Path) -> None:
     """Six columns are blind; other frames saw what they did not."""
     blind = np.zeros(SHAPE, bool)
     blind[:, 80:86] = True
@@ -137,7 +137,7 @@ def test_a_masked_pixel_is_filled_by_the_motion_and_not_by_its_neighbours(small_
     assert abs(off.mean()) < 0.01 * known.mean()
 
 
-def test_a_correction_that_does_not_suit_the_capture_is_told_with_its_place(small_capture: Path, tmp_path: Path) -> None:
+def test_unsuitable_correction_is_reported_at_its_place(small_capture: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "bad.npy", np.zeros((132, 168), bool))
     (tmp_path / "scan.yaml").write_text(
         "version: 1\n"
@@ -155,7 +155,7 @@ def test_a_correction_that_does_not_suit_the_capture_is_told_with_its_place(smal
     )
 
 
-def test_what_leaves_no_pixel_is_told_as_well_when_frames_tell_it(small_capture: Path, tmp_path: Path) -> None:
+def test_correction_from_frames_that_masks_all_pixels_is_reported(small_capture: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "rates.npy", np.full(SHAPE, 0.3))
     spec = spec_of(small_capture, {"dark-counts": {"dark": str(tmp_path / "rates.npy")}})
     with pytest.raises(SpecError) as caught, open_source(parse_spec(spec)):
@@ -163,7 +163,7 @@ def test_what_leaves_no_pixel_is_told_as_well_when_frames_tell_it(small_capture:
     assert str(caught.value) == "corrections.0: dark-counts leaves no pixel that may be used"
 
 
-def test_a_forecast_takes_corrections_into_account(raw: Path, dark_file: Path) -> None:
+def test_forecast_includes_corrections(raw: Path, dark_file: Path) -> None:
     plan = parse_spec(spec_of(raw, *GEOMETRY, {"dark-counts": {"dark": str(dark_file)}}) | {"levels": 1})
     with build_source(plan) as source:
         assert forecast(plan, source).canvas[0] < 200

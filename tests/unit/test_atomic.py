@@ -12,7 +12,7 @@ from photonpano import OutputError
 from photonpano.atomic import atomic_path
 
 
-def test_the_file_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
+def test_atomic_path_creates_the_file_when_the_block_ends(tmp_path: Path) -> None:
     final = tmp_path / "result.bin"
     with atomic_path(final) as temporary:
         temporary.write_bytes(b"half")
@@ -24,7 +24,7 @@ def test_the_file_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [final]
 
 
-def test_the_mode_follows_the_umask(tmp_path: Path) -> None:
+def test_atomic_path_follows_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         with atomic_path(tmp_path / "result.bin") as temporary:
@@ -35,7 +35,7 @@ def test_the_mode_follows_the_umask(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_failure_keeps_the_old_file_and_removes_the_temporary_one(tmp_path: Path, error: type[BaseException]) -> None:
+def test_atomic_path_keeps_the_old_file_on_failure(tmp_path: Path, error: type[BaseException]) -> None:
     final = tmp_path / "result.bin"
     final.write_bytes(b"old")
     with pytest.raises(error), atomic_path(final) as temporary:
@@ -44,7 +44,7 @@ def test_a_failure_keeps_the_old_file_and_removes_the_temporary_one(tmp_path: Pa
     assert list(tmp_path.iterdir()) == [final]
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+def test_atomic_path_names_a_missing_folder(tmp_path: Path) -> None:
     final = tmp_path / "nowhere" / "result.bin"
     with pytest.raises(OutputError) as caught, atomic_path(final):
         raise AssertionError("the block must not run")
@@ -53,13 +53,13 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     )
 
 
-def test_a_folder_under_the_final_name_is_told_before_the_work(tmp_path: Path) -> None:
+def test_atomic_path_refuses_a_folder_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(OutputError) as caught, atomic_path(tmp_path):
         raise AssertionError("the block must not run")
     assert str(caught.value) == f"cannot write {tmp_path}: Is a directory; choose another name, or remove the folder"
 
 
-def test_a_folder_without_permission_is_told(tmp_path: Path) -> None:
+def test_atomic_path_reports_missing_permission(tmp_path: Path) -> None:
     final = tmp_path / "result.bin"
     with pytest.raises(OutputError) as caught, atomic_path(final):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -82,7 +82,7 @@ except OutputError as error:
 """
 
 
-def test_a_write_that_the_system_cuts_short_leaves_nothing(tmp_path: Path) -> None:
+def test_atomic_path_leaves_no_file_after_a_short_write(tmp_path: Path) -> None:
     """A limit on file sizes stops the write half-way, as a full disk does."""
     final = tmp_path / "result.bin"
     done = subprocess.run([sys.executable, "-c", _FILLS_THE_DISK, final], capture_output=True, text=True, check=True)
@@ -93,7 +93,7 @@ def test_a_write_that_the_system_cuts_short_leaves_nothing(tmp_path: Path) -> No
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_is_told(tmp_path: Path) -> None:
+def test_atomic_path_reports_a_full_disk(tmp_path: Path) -> None:
     final = tmp_path / "result.bin"
     with pytest.raises(OutputError) as caught, atomic_path(final), Path("/dev/full").open("wb", buffering=0) as full:
         full.write(b"x")

@@ -35,7 +35,7 @@ def opened(path: Path, **config: Any) -> PackedFileSource:
 
 
 @pytest.mark.parametrize("width", [24, 19])
-def test_gives_the_frames_and_their_sums(tmp_path: Path, width: int) -> None:
+def test_frames_and_counts_equal_the_array(tmp_path: Path, width: int) -> None:
     frames = cube(width=width)
     path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=-1))
     with opened(path, width=width, frame_rate_hz=96800) as source:
@@ -48,19 +48,19 @@ def test_gives_the_frames_and_their_sums(tmp_path: Path, width: int) -> None:
             np.testing.assert_array_equal(source.counts(span), frames[span.start : span.stop].sum(axis=0))
 
 
-def test_the_width_is_that_of_whole_bytes_unless_told(tmp_path: Path) -> None:
+def test_width_defaults_to_whole_bytes(tmp_path: Path) -> None:
     path = saved(tmp_path / "cube.npy", np.packbits(cube(width=19), axis=-1))
     with opened(path) as source:
         assert source.info.frame_shape == (6, 24)
 
 
-def test_lit_padding_bits_do_not_count(tmp_path: Path) -> None:
+def test_lit_padding_bits_are_ignored(tmp_path: Path) -> None:
     with opened(saved(tmp_path / "cube.npy", np.full((3, 2, 2), 255, np.uint8)), width=11) as source:
         np.testing.assert_array_equal(source.counts(FrameSpan(0, 3)), np.full((2, 11), 3))
         assert source.frames(FrameSpan(0, 3)).shape == (3, 2, 11)
 
 
-def test_many_threads_may_read_at_once(tmp_path: Path) -> None:
+def test_source_is_read_from_many_threads(tmp_path: Path) -> None:
     frames = cube(n=400)
     start = threading.Barrier(4)
 
@@ -74,7 +74,7 @@ def test_many_threads_may_read_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [24, 19])
-def test_one_channel_of_a_capture_in_colour(tmp_path: Path, width: int) -> None:
+def test_channel_of_a_colour_capture_is_read(tmp_path: Path, width: int) -> None:
     channels = [cube(width=width, seed=seed) for seed in range(3)]
     path = saved(tmp_path / "cube.npy", np.packbits(np.stack(channels, axis=-1), axis=2))
     for channel, frames in enumerate(channels):
@@ -84,7 +84,7 @@ def test_one_channel_of_a_capture_in_colour(tmp_path: Path, width: int) -> None:
             np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
 
 
-def test_a_channel_of_a_capture_without_colour_is_refused(tmp_path: Path) -> None:
+def test_channel_without_colour_is_refused(tmp_path: Path) -> None:
     path = saved(tmp_path / "cube.npy", PACKED)
     assert_refused(f"{path} has the shape (40, 6, 3) and no channels; leave out channel: 2", path, channel=2)
 
@@ -135,7 +135,7 @@ def test_compressed_captures_are_unpacked_once(gzipped: Path, caplog: pytest.Log
         ),
     ],
 )
-def test_compressed_captures_that_are_damaged_leave_nothing_behind(gzipped: Path, damaged: Callable, words: str) -> None:
+def test_damaged_compressed_captures_leave_no_files(gzipped: Path, damaged: Callable, words: str) -> None:
     gzipped.write_bytes(damaged(gzipped.read_bytes()))
     with pytest.raises(InputError) as caught:
         opened(gzipped)
@@ -143,7 +143,7 @@ def test_compressed_captures_that_are_damaged_leave_nothing_behind(gzipped: Path
     assert list(gzipped.parent.iterdir()) == [gzipped]
 
 
-def test_a_disk_without_room_is_told_before_anything_is_unpacked(gzipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported_before_unpacking(gzipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=847))
     with pytest.raises(OutputError) as caught:
         opened(gzipped)
@@ -223,13 +223,13 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         (bytes(1000), ", by its first bytes; write it with numpy.save"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, content: bytes, guess: str) -> None:
+def test_files_of_other_formats_are_refused(tmp_path: Path, content: bytes, guess: str) -> None:
     path = tmp_path / "cube.npy"
     path.write_bytes(content)
     assert_refused(f"{path} is not a .npy file{guess}", path)
 
 
-def test_a_file_cut_short_is_refused_with_both_sizes(tmp_path: Path) -> None:
+def test_truncated_file_is_refused_with_both_sizes(tmp_path: Path) -> None:
     path = saved(tmp_path / "cube.npy", PACKED)
     whole = path.stat().st_size
     path.write_bytes(path.read_bytes()[:-100])
@@ -241,14 +241,14 @@ def test_a_file_cut_short_is_refused_with_both_sizes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [16, 25])
-def test_a_width_that_does_not_fit_the_rows_is_refused(tmp_path: Path, width: int) -> None:
+def test_width_that_does_not_fit_the_rows_is_refused(tmp_path: Path, width: int) -> None:
     path = saved(tmp_path / "cube.npy", PACKED)
     assert_refused(
         f"{path} has rows of 3 bytes, which hold a width of 17 to 24, not {width}; correct the width", path, width=width
     )
 
 
-def test_frames_that_were_not_packed_are_recognised_by_their_width(tmp_path: Path) -> None:
+def test_unpacked_frames_are_refused_by_their_width(tmp_path: Path) -> None:
     path = saved(tmp_path / "cube.npy", cube())
     assert_refused(
         f"{path} has rows of 24 bytes, which hold a width of 185 to 192, not 24; "
@@ -258,7 +258,7 @@ def test_frames_that_were_not_packed_are_recognised_by_their_width(tmp_path: Pat
     )
 
 
-def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path: Path) -> None:
+def test_file_that_shrinks_while_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     np.save(path, np.zeros((100, 16, 2), np.uint8))
     with opened(path) as source:
@@ -269,7 +269,7 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path: Path)
     assert str(caught.value) == f"{path} has become shorter while it was read; copy or record it again"
 
 
-def test_a_negative_shape_is_refused(tmp_path: Path) -> None:
+def test_negative_shape_is_refused(tmp_path: Path) -> None:
     path = saved(tmp_path / "cube.npy", PACKED)
     path.write_bytes(path.read_bytes().replace(b"(40, 6, 3)", b"(-4,-6, 3)"))
     assert_refused(f"{path} is empty: its shape is (-4, -6, 3) (frames, height, bytes of a row)", path)
@@ -282,7 +282,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @settings(deadline=None, max_examples=100)
 @given(changes=st.dictionaries(st.integers(0, 127), st.integers(0, 255), min_size=1, max_size=4))
-def test_damaged_headers_raise_nothing_else(folder: Path, changes: dict[int, int]) -> None:
+def test_damaged_headers_raise_input_error_only(folder: Path, changes: dict[int, int]) -> None:
     path = saved(folder / "cube.npy", PACKED)
     content = bytearray(path.read_bytes())
     for place, value in changes.items():

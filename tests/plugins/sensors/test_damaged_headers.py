@@ -64,7 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @settings(deadline=None, max_examples=100)
 @given(content=st.binary(max_size=64) | st.lists(st.integers(0, 262145)).map(lambda words: np.array(words, "<u4").tobytes()))
 @pytest.mark.parametrize("name", ["swissspad-half", "swissspad-full", "spad512", "spad512-sparse"])
-def test_bytes_in_bin_files(folder: Path, name: str, content: bytes) -> None:
+def test_bin_source_raises_input_error_on_random_bytes(folder: Path, name: str, content: bytes) -> None:
     path = folder / "frames.bin"
     path.write_bytes(content)
     try_to_read(name, path)
@@ -72,14 +72,14 @@ def test_bytes_in_bin_files(folder: Path, name: str, content: bytes) -> None:
 
 @settings(deadline=None, max_examples=100)
 @given(values=st.dictionaries(st.sampled_from([*TRANSFORMS, "frames"]), JSON, max_size=4))
-def test_values_in_transforms_json(folder: Path, values: dict[str, Any]) -> None:
+def test_visionsim_raises_input_error_on_random_values(folder: Path, values: dict[str, Any]) -> None:
     (folder / "transforms.json").write_text(json.dumps(TRANSFORMS | {"frames": [{}] * 3} | values))
     try_to_read("visionsim", folder)
 
 
 @settings(deadline=None, max_examples=100)
 @given(changes=CHANGES)
-def test_bytes_in_transforms_json(folder: Path, changes: dict[int, int]) -> None:
+def test_visionsim_raises_input_error_on_random_bytes(folder: Path, changes: dict[int, int]) -> None:
     content = json.dumps(TRANSFORMS | {"frames": [{}] * 3}).encode()
     (folder / "transforms.json").write_bytes(changed(content, changes))
     try_to_read("visionsim", folder)
@@ -87,7 +87,9 @@ def test_bytes_in_transforms_json(folder: Path, changes: dict[int, int]) -> None
 
 @settings(deadline=None, max_examples=100)
 @given(changes=CHANGES, info=st.none() | JSON, compressed=st.booleans())
-def test_bytes_in_matlab_files(folder: Path, changes: dict[int, int], info: Any, compressed: bool) -> None:
+def test_mat_parts_raises_input_error_on_random_bytes(
+    folder: Path, changes: dict[int, int], info: Any, compressed: bool
+) -> None:
     parts = folder / "parts"
     parts.mkdir(exist_ok=True)
     content = (folder / ("compressed.mat" if compressed else "whole.mat")).read_bytes()
@@ -110,7 +112,7 @@ def hdf5(folder: Path) -> bytes:
 
 @settings(deadline=None, max_examples=100)
 @given(kept=st.integers(0, 20_000), start=st.binary(max_size=12))
-def test_hdf5_files_that_are_cut_short(folder: Path, hdf5: bytes, kept: int, start: bytes) -> None:
+def test_ubicept_raises_input_error_on_truncated_file(folder: Path, hdf5: bytes, kept: int, start: bytes) -> None:
     """Or begin with something else. Other bytes are not changed: the HDF5 library ends the process for some of these."""
     path = folder / "capture.ubi.h5"
     path.write_bytes((start + hdf5[len(start) :])[: kept % len(hdf5)])
@@ -119,7 +121,7 @@ def test_hdf5_files_that_are_cut_short(folder: Path, hdf5: bytes, kept: int, sta
 
 @settings(deadline=None, max_examples=100)
 @given(metadata=JSON | st.fixed_dictionaries({"num_integrated_binary_frames": JSON, "node_history": JSON}))
-def test_metadata_in_hdf5_files(folder: Path, metadata: Any) -> None:
+def test_ubicept_raises_input_error_on_random_metadata(folder: Path, metadata: Any) -> None:
     h5py = pytest.importorskip("h5py")
     path = folder / "metadata.ubi.h5"
     with h5py.File(path, "w") as file:

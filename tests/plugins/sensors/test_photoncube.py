@@ -12,7 +12,7 @@ from photonpano import PackedSource, SourceContext, discover
 
 
 @pytest.mark.parametrize(("name", "shape"), [("swissspad-half", (256, 512)), ("swissspad-full", (512, 512))])
-def test_it_reads_what_photoncube_reads(tmp_path: Path, bin_file: Callable, name: str, shape: tuple[int, int]) -> None:
+def test_frames_equal_those_of_photoncube(tmp_path: Path, bin_file: Callable, name: str, shape: tuple[int, int]) -> None:
     photoncube = pytest.importorskip("photoncube")
     folder, converted = tmp_path / "bins", tmp_path / "cube.npy"
     folder.mkdir()

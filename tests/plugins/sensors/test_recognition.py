@@ -38,7 +38,7 @@ def recorded(flux: np.ndarray, n_frames: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("brightness", [1.0, 0.05])
 @pytest.mark.parametrize(("name", "rows"), [("swissspad-half", 256), ("swissspad-full", 512)])
-def test_the_arrays_of_swissspad_are_told_apart(
+def test_swissspad_arrays_are_distinguished_by_correlation(
     tmp_path: Path, bin_file: Callable, street: np.ndarray, name: str, rows: int, brightness: float
 ) -> None:
     frames = recorded(street[100 : 100 + rows, 300:812] * brightness, 512 * 256 // rows)
@@ -52,7 +52,7 @@ def test_the_arrays_of_swissspad_are_told_apart(
 
 
 @pytest.mark.parametrize("scene", ["noise", "stripes", "nothing"])
-def test_where_frames_do_not_tell_both_arrays_are_named(tmp_path: Path, bin_file: Callable, scene: str) -> None:
+def test_both_swissspad_arrays_are_named_if_frames_do_not_decide(tmp_path: Path, bin_file: Callable, scene: str) -> None:
     rng = np.random.default_rng(0)
     stripes = np.tile(np.sin(np.arange(512) / 9) ** 2, (256, 1))
     share = {"noise": 0.3, "stripes": stripes, "nothing": 0.0}[scene]
@@ -65,7 +65,7 @@ def test_where_frames_do_not_tell_both_arrays_are_named(tmp_path: Path, bin_file
 
 
 @pytest.mark.parametrize("n_frames", [256, 1000])
-def test_spad512_is_known_by_the_size_of_its_files(tmp_path: Path, n_frames: int) -> None:
+def test_spad512_is_recognised_by_file_size(tmp_path: Path, n_frames: int) -> None:
     path = tmp_path / "frames.bin"
     path.write_bytes(bytes(n_frames * 32768 + 4 * (n_frames == 256)))
     assert set(recognised(path)) == {"spad512"}
@@ -73,7 +73,7 @@ def test_spad512_is_known_by_the_size_of_its_files(tmp_path: Path, n_frames: int
         assert source.info.n_frames == n_frames
 
 
-def test_sparse_frames_are_known_by_their_end(tmp_path: Path, bin_file: Callable) -> None:
+def test_spad512_sparse_is_recognised_by_last_word(tmp_path: Path, bin_file: Callable) -> None:
     frames = np.random.default_rng(0).random((4, 512, 512)) < 0.01
     (tmp_path / "sparse.bin").write_bytes(bin_file("spad512-sparse", frames))
     assert set(recognised(tmp_path)) == {"spad512-sparse"}
@@ -82,7 +82,7 @@ def test_sparse_frames_are_known_by_their_end(tmp_path: Path, bin_file: Callable
 FRAMES = np.random.default_rng(0).integers(0, 2, (6, 10, 16), dtype=np.uint8)
 
 
-def test_packed_npy_files_are_known_by_their_header(tmp_path: Path) -> None:
+def test_packed_npy_is_recognised_by_header(tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", np.packbits(FRAMES, axis=-1))
     found = recognised(tmp_path / "cube.npy")
     assert set(found) == {"packed-npy"}
@@ -97,14 +97,14 @@ def test_packed_npy_files_are_known_by_their_header(tmp_path: Path) -> None:
     )
 
 
-def test_frames_that_are_not_packed_are_left_alone(tmp_path: Path) -> None:
+def test_unpacked_frames_are_not_recognised(tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", FRAMES)
     assert recognised(tmp_path / "cube.npy") == {}
     (tmp_path / "cube.npy.gz").write_bytes(gzip.compress((tmp_path / "cube.npy").read_bytes()))
     assert recognised(tmp_path / "cube.npy.gz") == {}
 
 
-def test_a_transforms_json_says_what_the_npy_file_beside_it_holds(tmp_path: Path) -> None:
+def test_visionsim_is_recognised_by_transforms_json(tmp_path: Path) -> None:
     np.save(tmp_path / "frames.npy", np.packbits(FRAMES, axis=1))
     np.save(tmp_path / "other.npy", np.packbits(FRAMES, axis=1))
     transforms = {"h": 10, "w": 16, "bitpack_dim": 1, "file_path": "frames.npy", "frames": [{}] * 6}
@@ -117,20 +117,20 @@ def test_a_transforms_json_says_what_the_npy_file_beside_it_holds(tmp_path: Path
     assert recognised(tmp_path / "other.npy") == {}
 
 
-def test_grey_frames_of_visionsim_are_left_alone(tmp_path: Path) -> None:
+def test_grey_visionsim_frames_are_not_recognised(tmp_path: Path) -> None:
     np.save(tmp_path / "frames.npy", FRAMES * 100)
     (tmp_path / "transforms.json").write_text(json.dumps({"h": 10, "w": 16, "file_path": "frames.npy", "frames": [{}] * 6}))
     assert recognised(tmp_path) == {}
 
 
-def test_folders_of_matlab_and_files_of_ubicept_are_known_by_their_names(tmp_path: Path) -> None:
+def test_mat_parts_and_ubicept_are_recognised_by_name(tmp_path: Path) -> None:
     (tmp_path / "part_1.mat").write_bytes(b"anything")
     assert set(recognised(tmp_path)) == {"mat-parts"}
     (tmp_path / "capture.ubi.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
     assert set(recognised(tmp_path / "capture.ubi.h5")) == {"ubicept-h5"}
 
 
-def test_other_files_are_nobodys(tmp_path: Path) -> None:
+def test_other_files_are_not_recognised(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty.bin").touch()
     (tmp_path / "text.bin").write_bytes(b"some text of no length in particular")

@@ -40,7 +40,7 @@ def fill(folder: Path, sizes: Mapping[str, int]) -> None:
 
 
 @pytest.mark.parametrize("name", [HALF, FULL, DENSE])
-def test_files_of_a_part_of_a_frame(tmp_path: Path, name: str) -> None:
+def test_bin_files_with_a_partial_frame_are_refused(tmp_path: Path, name: str) -> None:
     frame = FRAME_BYTES[name]
     more = ", with or without 4 more" if name == DENSE else ""
     for size in (0, 3 * frame - 1, 3 * frame + 5):
@@ -53,7 +53,7 @@ def test_files_of_a_part_of_a_frame(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [HALF, FULL, DENSE])
-def test_files_of_different_length(tmp_path: Path, name: str) -> None:
+def test_bin_files_of_different_length_are_refused(tmp_path: Path, name: str) -> None:
     frame = FRAME_BYTES[name]
     advice = "only the last file of a capture may hold fewer: copy it again, or take out the files of other captures"
     fill(tmp_path, {"f1.bin": 4 * frame, "f2.bin": 3 * frame, "f10.bin": 4 * frame})
@@ -63,7 +63,7 @@ def test_files_of_different_length(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [HALF, FULL, DENSE, SPARSE])
-def test_folders_without_frames(tmp_path: Path, name: str) -> None:
+def test_folders_without_frames_are_refused(tmp_path: Path, name: str) -> None:
     advice = f"there is no .bin file in the folder {tmp_path}; check the path"
     assert refusal(name, path=tmp_path) == advice
     fill(tmp_path, {"notes.txt": 10, "._filename0.bin": 10})
@@ -71,7 +71,7 @@ def test_folders_without_frames(tmp_path: Path, name: str) -> None:
     assert refusal(name, path=tmp_path / "x") == f"there is no file or folder {tmp_path / 'x'}; check the path"
 
 
-def test_sparse_frames_that_are_cut_off(tmp_path: Path) -> None:
+def test_truncated_sparse_frames_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "sparse.bin"
     for content in (b"", b"\0", np.array([5, 262144, 7], "<u4").tobytes(), np.array([262144], "<u4").tobytes() + b"\0"):
         path.write_bytes(content)
@@ -81,7 +81,7 @@ def test_sparse_frames_that_are_cut_off(tmp_path: Path) -> None:
         )
 
 
-def test_sparse_addresses_that_no_pixel_has(tmp_path: Path) -> None:
+def test_sparse_addresses_outside_the_frame_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "sparse.bin"
     path.write_bytes(np.array([5, 262144, 262145, 262144], "<u4").tobytes())
     assert refusal(SPARSE, checked=False, path=path) == (
@@ -90,7 +90,7 @@ def test_sparse_addresses_that_no_pixel_has(tmp_path: Path) -> None:
     )
 
 
-def test_sparse_addresses_in_any_order_and_more_than_once(tmp_path: Path) -> None:
+def test_sparse_addresses_may_be_unordered_and_repeated(tmp_path: Path) -> None:
     path = tmp_path / "sparse.bin"
     path.write_bytes(np.array([700, 5, 700, 262144, 262144, 5, 262144], "<u4").tobytes())
     contribution = CATALOG.find("source", SPARSE).contribution
@@ -100,7 +100,7 @@ def test_sparse_addresses_in_any_order_and_more_than_once(tmp_path: Path) -> Non
         np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)).sum(axis=0), counts)
 
 
-def test_a_file_that_becomes_shorter_while_it_is_read(tmp_path: Path) -> None:
+def test_file_that_shrinks_while_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "frames.bin"
     fill(tmp_path, {"frames.bin": 10 * 16384})
     contribution = CATALOG.find("source", HALF).contribution
@@ -122,7 +122,7 @@ def mat_folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_parts_that_are_missing(mat_folder: Path) -> None:
+def test_missing_mat_parts_are_refused(mat_folder: Path) -> None:
     (mat_folder / "part_2.mat").unlink()
     message = f"there is no part_2.mat in the folder {mat_folder}, which has 3 parts; copy it again"
     assert refusal("mat-parts", path=mat_folder) == message
@@ -133,7 +133,7 @@ def test_parts_that_are_missing(mat_folder: Path) -> None:
     assert refusal("mat-parts", path=path) == f"there is no folder {path}; name the folder of part_1.mat and so on"
 
 
-def test_an_info_json_that_disagrees(mat_folder: Path) -> None:
+def test_contradicting_info_json_is_refused(mat_folder: Path) -> None:
     info = mat_folder / "info.json"
 
     def said(**content: Any) -> str:
@@ -155,7 +155,7 @@ def test_an_info_json_that_disagrees(mat_folder: Path) -> None:
             assert source.info.n_frames == 18
 
 
-def test_parts_that_are_something_else(mat_folder: Path) -> None:
+def test_other_files_as_mat_parts_are_refused(mat_folder: Path) -> None:
     path = mat_folder / "part_2.mat"
 
     def said() -> str:
@@ -218,7 +218,7 @@ def visionsim_folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("case", WRONG_TRANSFORMS)
-def test_a_transforms_json_that_disagrees(visionsim_folder: Path, case: str) -> None:
+def test_contradicting_transforms_json_is_refused(visionsim_folder: Path, case: str) -> None:
     changes, message = WRONG_TRANSFORMS[case]
     path = visionsim_folder / "transforms.json"
     path.write_text(json.dumps(TRANSFORMS | changes))
@@ -226,7 +226,7 @@ def test_a_transforms_json_that_disagrees(visionsim_folder: Path, case: str) -> 
     assert refusal("visionsim", path=visionsim_folder) == expected
 
 
-def test_a_transforms_json_that_is_none(visionsim_folder: Path) -> None:
+def test_invalid_transforms_json_is_refused(visionsim_folder: Path) -> None:
     path = visionsim_folder / "transforms.json"
     path.write_text("{")
     assert refusal("visionsim", path=path) == (
@@ -236,7 +236,7 @@ def test_a_transforms_json_that_is_none(visionsim_folder: Path) -> None:
     assert refusal("visionsim", path=path) == f"there is no file {path}; check the path"
 
 
-def test_frames_of_visionsim_that_are_not_binary(visionsim_folder: Path) -> None:
+def test_visionsim_frames_that_are_not_binary_are_refused(visionsim_folder: Path) -> None:
     np.save(visionsim_folder / "frames.npy", FRAMES * 7)
     path = visionsim_folder / "transforms.json"
     path.write_text(json.dumps(TRANSFORMS | {"bitpack": False}))
@@ -264,7 +264,7 @@ def ubicept_file(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def test_files_of_ubicept_that_are_something_else(tmp_path: Path, ubicept_file: Callable[..., Path]) -> None:
+def test_wrong_ubicept_files_are_refused(tmp_path: Path, ubicept_file: Callable[..., Path]) -> None:
     h5py = pytest.importorskip("h5py")
 
     def said(path: Path) -> str:

@@ -23,7 +23,7 @@ PIECES = [b"-1", b"1e999", b"\xb2", b"<cih>", b"&x;", b" : "]
 
 @pytest.mark.parametrize("name", ["beam", "ball_12bit"])
 @pytest.mark.filterwarnings("ignore::UserWarning")  # pyMRAW warns of recordings that it was not made for
-def test_frames_are_those_that_pymraw_reads(name: str) -> None:
+def test_frames_equal_those_of_pymraw(name: str) -> None:
     reader = pytest.importorskip("pyMRAW")
     known, _ = reader.load_video(str(REAL / f"{name}.cihx"))
     with FastcamMrawSource(FastcamMrawConfig(path=REAL / f"{name}.mraw")) as source:
@@ -31,7 +31,7 @@ def test_frames_are_those_that_pymraw_reads(name: str) -> None:
         np.testing.assert_array_equal(source.counts(source.info.span), known.sum(axis=0, dtype=np.uint32))
 
 
-def test_headers_tell_what_the_camera_did() -> None:
+def test_header_gives_size_bits_and_rate() -> None:
     header = read_header(REAL / "ball_12bit.cihx")
     assert (header.n_frames, header.height, header.width, header.bits) == (3, 384, 384, 12)
     assert (header.encoding, header.frame_rate_hz) == (Encoding.full(12), 30_000)
@@ -41,13 +41,13 @@ def test_headers_tell_what_the_camera_did() -> None:
     assert header.frame_rate_hz == 60_000 / 36  # one frame in 36 was saved
 
 
-def test_levels_in_the_higher_bits_are_known(tmp_path: Path) -> None:
+def test_levels_in_the_higher_bits_are_scaled(tmp_path: Path) -> None:
     (tmp_path / "a.cih").write_bytes(CIH.replace(b"EffectiveBit Side : Lower", b"EffectiveBit Side : Higher"))
     assert read_header(tmp_path / "a.cih").encoding == Encoding(16, 0, 0xFFF0)
 
 
 @pytest.mark.parametrize("bits", [12, 16])
-def test_few_levels_in_large_pixels_are_read(tmp_path: Path, bits: int) -> None:
+def test_8_effective_bits_in_16_bit_pixels_are_read(tmp_path: Path, bits: int) -> None:
     levels = np.random.default_rng(0).integers(0, 256, (3, 4, 6), dtype=np.uint16)
     stored = levels.astype("<u2").tobytes()
     if bits == 12:
@@ -62,7 +62,7 @@ def test_few_levels_in_large_pixels_are_read(tmp_path: Path, bits: int) -> None:
         assert source.response.saturation_level == 255
 
 
-def test_entities_are_not_expanded(tmp_path: Path) -> None:
+def test_xml_entities_are_not_expanded(tmp_path: Path) -> None:
     """A document type is cut off, or makes the header a damaged one."""
     entities = b'<!DOCTYPE a [<!ENTITY a "999"><!ENTITY b "&a;&a;"><!ENTITY c "&b;&b;">]>'
     bomb = BEAM.replace(b"<cih>", entities + b"<cih>", 1).replace(b"<width>1024</width>", b"<width>&c;</width>")
@@ -90,7 +90,7 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(data=st.data())
-def test_a_damaged_header_is_an_input_error_or_none(suffix: str, whole: bytes, data: st.DataObject) -> None:
+def test_damaged_header_raises_input_error_only(suffix: str, whole: bytes, data: st.DataObject) -> None:
     texts = st.text(max_size=300).map(lambda text: f"<cih>{text}</cih>".encode())
     content = data.draw(damaged(whole) | st.binary(max_size=300) | texts)
     with tempfile.TemporaryDirectory() as folder:

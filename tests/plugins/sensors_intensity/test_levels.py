@@ -37,7 +37,7 @@ def test_linear_levels_stay_as_they_are() -> None:
 @pytest.mark.parametrize(
     ("curve", "light"), [("srgb", srgb_to_linear), (2.2, lambda encoded: encoded**2.2), (1.0, lambda encoded: encoded)]
 )
-def test_curves_are_undone(curve: Any, light: Any) -> None:
+def test_encoding_curves_are_inverted(curve: Any, light: Any) -> None:
     linear = levels(curve=curve, saturation_photons=1000.0)
     flux = flux_of_levels(linear)
     encoded = (np.arange(16, 236) - 16) / 219
@@ -47,7 +47,7 @@ def test_curves_are_undone(curve: Any, light: Any) -> None:
     assert (np.diff(flux) >= 0).all()
 
 
-def test_noise_around_black_averages_to_nothing() -> None:
+def test_noise_around_black_averages_to_zero_flux() -> None:
     """It would not if what lies below black were cut off."""
     linear = levels(curve="srgb")
     dark = np.clip(np.rint(16 + np.random.default_rng(0).normal(0, 4, 100_000)), 0, 255).astype(np.uint8)
@@ -74,7 +74,7 @@ WRONG_CURVES = {
 
 
 @pytest.mark.parametrize(("content", "golden"), WRONG_CURVES.items(), ids=range(len(WRONG_CURVES)))
-def test_a_curve_that_is_none_is_refused(tmp_path: Path, content: str, golden: str) -> None:
+def test_invalid_curve_file_is_refused(tmp_path: Path, content: str, golden: str) -> None:
     file = tmp_path / "curve.txt"
     file.write_text(content)
     with pytest.raises(InputError) as raised:
@@ -82,24 +82,24 @@ def test_a_curve_that_is_none_is_refused(tmp_path: Path, content: str, golden: s
     assert str(raised.value) == golden.replace("FILE", str(file))
 
 
-def test_a_curve_that_is_missing_is_refused(tmp_path: Path) -> None:
+def test_missing_curve_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^there is no file .*curve.txt; check the path$"):
         levels(curve_file=tmp_path / "curve.txt")
 
 
 @pytest.mark.parametrize(("black", "white"), [(235, 235), (0, 256), (300, 310)])
-def test_black_and_white_have_to_suit_the_bits(black: float, white: float) -> None:
+def test_black_and_white_levels_outside_the_bits_are_refused(black: float, white: float) -> None:
     with pytest.raises(InputError, match="do not suit levels of 8 bits: black must be below white, and white at most 255"):
         levels(black_level=black, white_level=white)
 
 
-def test_a_curve_is_named_once() -> None:
+def test_curve_and_curve_file_together_are_refused() -> None:
     with pytest.raises(ValidationError, match="curve_file takes the place of the curve srgb; leave out one of them"):
         ResponseConfig(curve="srgb", curve_file="curve.txt")
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])
-def test_saturated_pixels_tell_the_least_that_they_saw(tmp_path: Path, curve: Any) -> None:
+def test_flux_of_saturated_pixels_is_a_lower_bound(tmp_path: Path, curve: Any) -> None:
     (tmp_path / "a.cih").write_text(
         "File Format : MRaw\nTotal Frame : 2\nImage Width : 2\nImage Height : 2\nColor Bit : 8\n"
         "EffectiveBit Depth : 8\nEffectiveBit Side : Lower\n"

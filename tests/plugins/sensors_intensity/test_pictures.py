@@ -12,7 +12,7 @@ from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.pictures import ImageFolderSource
 
 
-def test_pictures_come_in_natural_order_and_other_files_do_not_count(tmp_path: Path) -> None:
+def test_pictures_are_in_natural_order_without_other_files(tmp_path: Path) -> None:
     for number in (10, 2, 9, 100):
         cv2.imwrite(str(tmp_path / f"shot_7_{number}.PNG"), np.full((4, 6), number, np.uint8))
     (tmp_path / "notes.txt").write_text("of the day")
@@ -20,7 +20,7 @@ def test_pictures_come_in_natural_order_and_other_files_do_not_count(tmp_path: P
         assert source.frames(source.info.span)[:, 0, 0].tolist() == [2, 9, 10, 100]
 
 
-def test_pages_may_be_compressed(tmp_path: Path) -> None:
+def test_compressed_tiff_pages_are_read(tmp_path: Path) -> None:
     frames = np.random.default_rng(0).integers(0, 4096, (20, 8, 6)).astype(np.uint16)
     with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
         for frame in frames:
@@ -30,7 +30,7 @@ def test_pages_may_be_compressed(tmp_path: Path) -> None:
         np.testing.assert_array_equal(source.frames(source.info.span), frames)
 
 
-def test_a_picture_that_is_damaged_or_replaced_meanwhile_is_told(tmp_path: Path) -> None:
+def test_picture_damaged_or_replaced_while_open_is_refused(tmp_path: Path) -> None:
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (40, 60), np.uint8))
     with ImageFolderSource(ImageFolderConfig(path=tmp_path)) as source:

@@ -25,7 +25,7 @@ def recognised(path: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", ["beam.cihx", "beam.mraw"])
-def test_recordings_are_recognised(name: str) -> None:
+def test_fastcam_recordings_are_recognised(name: str) -> None:
     other = {"beam.cihx": "beam.mraw beside it holds the frames", "beam.mraw": "beam.cihx beside it is its header"}
     assert recognised(REAL / name) == {"fastcam-mraw": other[name]}
 
@@ -45,7 +45,7 @@ def test_videos_are_recognised_by_their_first_bytes(
     assert recognised(shutil.copy(path, tmp_path / "without-a-suffix")) == {"video": because}
 
 
-def test_pictures_are_recognised(tmp_path: Path) -> None:
+def test_folders_of_pictures_and_tiff_files_are_recognised(tmp_path: Path) -> None:
     assert recognised(tmp_path) == {}
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
     assert recognised(tmp_path) == {"image-folder": "it holds 1 .png file"}
@@ -53,14 +53,14 @@ def test_pictures_are_recognised(tmp_path: Path) -> None:
     assert recognised(tmp_path / "b.tif") == {"image-folder": "by its first bytes it is a TIFF file"}
 
 
-def test_an_infinicam_file_is_recognised_so_that_opening_it_says_what_to_do(tmp_path: Path) -> None:
+def test_infinicam_files_are_recognised(tmp_path: Path) -> None:
     (tmp_path / "a.mdat").write_bytes(b"")
     (tmp_path / "a.cih").write_bytes(b"")
     assert recognised(tmp_path / "a.mdat") == {"fastcam-mraw": "Photron's cameras write .mdat files"}
     assert recognised(tmp_path / "a.cih") == {"fastcam-mraw": "a.mdat beside it holds the frames"}
 
 
-def test_nothing_else_is_recognised(tmp_path: Path) -> None:
+def test_other_files_are_not_recognised(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")
     (tmp_path / "lonely.cih").write_bytes(b"")
     for path in (tmp_path / "a.npy", tmp_path / "lonely.cih", tmp_path / "missing.mp4", tmp_path / "missing"):

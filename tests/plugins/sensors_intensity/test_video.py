@@ -41,7 +41,7 @@ FORMATS = {
 
 
 @pytest.mark.parametrize(("name", "codec", "pixels", "options"), FORMATS.values(), ids=FORMATS)
-def test_any_frame_is_found_in_any_order(
+def test_frames_are_decoded_in_any_order(
     moving: Callable, write_video: Callable, name: str, codec: str, pixels: str, options: dict[str, Any]
 ) -> None:
     """Each frame is nearer to the one that was written than its neighbours are."""
@@ -56,7 +56,7 @@ def test_any_frame_is_found_in_any_order(
     decoded.close()
 
 
-def test_the_index_keeps_no_packets(moving: Callable, write_video: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_index_keeps_no_packets(moving: Callable, write_video: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are the film itself, which may be larger than the memory."""
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
     most = 0
@@ -95,7 +95,7 @@ def test_the_index_keeps_no_packets(moving: Callable, write_video: Callable, mon
         ("a.avi", "rawvideo", "bgr24", 0, 255),
     ],
 )
-def test_range_and_bits_are_those_of_the_file(
+def test_encoding_has_range_and_bits_of_the_file(
     moving: Callable, write_video: Callable, name: str, codec: str, pixels: str, black: float, white: float
 ) -> None:
     bits = 10 if "10" in pixels else 8
@@ -113,14 +113,14 @@ def test_range_and_bits_are_those_of_the_file(
         assert (source.response.black_level, source.response.saturation_level) == (2, 200)
 
 
-def test_the_rate_of_the_spec_comes_before_that_of_playback(moving: Callable, write_video: Callable) -> None:
+def test_frame_rate_of_spec_overrides_playback_rate(moving: Callable, write_video: Callable) -> None:
     path = write_video(moving(3), "a.avi", "mjpeg", "yuvj420p")
     assert opened(path).info.frame_rate_hz == 30
     assert opened(path, frame_rate_hz=500).info.frame_rate_hz == 500
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_overlapping_groups_are_decoded_about_once(moving: Callable, write_video: Callable, threads: int) -> None:
+def test_overlapping_groups_decode_each_frame_about_once(moving: Callable, write_video: Callable, threads: int) -> None:
     """Groups of 20 frames, each beginning at the middle of the one before, merged side by side."""
     path = write_video(moving(200), "a.mp4", "libx264", "yuvj420p", g=50)
     index = index_of(path)
@@ -137,7 +137,7 @@ def test_overlapping_groups_are_decoded_about_once(moving: Callable, write_video
     assert 200 <= decoded.n_decoded <= (200 if threads == 1 else 360)
 
 
-def test_no_more_is_kept_than_allowed(moving: Callable, write_video: Callable) -> None:
+def test_cache_stays_within_its_capacity(moving: Callable, write_video: Callable) -> None:
     index = index_of(write_video(moving(), "a.avi", "mjpeg", "yuvj420p"))
     decoded = DecodedFrames(index, 1, 5 * index.height * index.width)
     for frame in range(40):
@@ -150,7 +150,7 @@ def test_no_more_is_kept_than_allowed(moving: Callable, write_video: Callable) -
     decoded.close()
 
 
-def test_what_ends_in_the_middle_of_a_frame_is_told_at_the_frame(moving: Callable, write_video: Callable) -> None:
+def test_truncated_frame_is_refused_when_read(moving: Callable, write_video: Callable) -> None:
     """A file whose packets are all there, and damaged."""
     path = write_video(moving(), "a.mp4", "libx264", "yuvj420p", g=12)
     content = bytearray(path.read_bytes())

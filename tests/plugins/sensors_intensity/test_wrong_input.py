@@ -254,14 +254,14 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_it_says_what_is_wrong_and_leaves_nothing(tmp_path: Path, case: Case) -> None:
+def test_run_refuses_wrong_capture_and_leaves_no_files(tmp_path: Path, case: Case) -> None:
     if case.use == "video":
         pytest.importorskip("av")
     case.arrange(tmp_path)
     run(tmp_path, case.use, case.path, case.golden, case.more)
 
 
-def test_a_video_that_is_cut_short_is_refused(moving: Callable, write_video: Callable, tmp_path: Path) -> None:
+def test_truncated_video_is_refused(moving: Callable, write_video: Callable, tmp_path: Path) -> None:
     """An AVI file promises its frames at its beginning; the end of an MP4 file is its index."""
     video = write_video(moving(), "a.avi", "mjpeg", "yuvj420p")
     content = video.read_bytes()
@@ -270,7 +270,7 @@ def test_a_video_that_is_cut_short_is_refused(moving: Callable, write_video: Cal
     run(tmp_path, "video", "a.avi", AT_OPENING.format(golden))
 
 
-def test_a_missing_library_comes_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "av" else there(name, *more))
     (tmp_path / "a.mp4").write_bytes(b"1234")

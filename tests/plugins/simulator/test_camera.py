@@ -20,7 +20,7 @@ def exposed(flux: float, **keys: float) -> tuple[IntensityCamera, np.ndarray]:
 
 
 @pytest.mark.parametrize(("bits", "read_noise"), [(8, 20.0), (8, 0.0), (12, 20.0), (16, 5.0)])
-def test_levels_have_the_mean_and_the_noise_that_the_response_says(bits: int, read_noise: float) -> None:
+def test_levels_have_mean_and_noise_of_the_response(bits: int, read_noise: float) -> None:
     flux = 1000.0
     camera, levels = exposed(flux, bits=bits, read_noise=read_noise, black_level=10)
     estimate = camera.response.flux(levels.astype(np.float32), 1)
@@ -29,12 +29,12 @@ def test_levels_have_the_mean_and_the_noise_that_the_response_says(bits: int, re
     assert estimate.var(dtype=np.float64) == pytest.approx(variance, rel=0.05)
 
 
-def test_a_full_well_saturates() -> None:
+def test_pixel_saturates_at_full_well() -> None:
     _, levels = exposed(20_000, bits=12)
     assert (levels == 4095).all()
 
 
-def test_an_open_shutter_blurs_along_the_motion_and_keeps_the_light() -> None:
+def test_open_shutter_blurs_along_the_motion_and_keeps_the_flux() -> None:
     def frame(exposure: float) -> np.ndarray:
         config = CameraSimulatorConfig.model_validate(
             {

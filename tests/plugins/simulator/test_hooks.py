@@ -19,7 +19,7 @@ def problems(**settings: Any) -> list[str]:
     return list(SIMULATOR.check(SimulatorConfig.model_validate(settings)))
 
 
-def test_offers_the_simulator(photo: Path) -> None:
+def test_hooks_offer_the_simulator(photo: Path) -> None:
     assert (SIMULATOR.kind, SIMULATOR.name) == ("source", "simulator")
     config = SIMULATOR.config.model_validate(
         {"scene": {"kind": "photo", "file": photo}, "path": {"kind": "hand-shake"}, "frame_shape": (40, 50)}
@@ -28,25 +28,25 @@ def test_offers_the_simulator(photo: Path) -> None:
         assert source.counts(FrameSpan(0, 3)).shape == (40, 50)
 
 
-def test_the_hooks_import_nothing_heavy() -> None:
+def test_hooks_import_no_heavy_library() -> None:
     code = "import sys, photonpano_simulator.hooks; print(*sorted({'cv2', 'scipy', 'matplotlib'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 
 
-def test_the_defaults_are_a_small_demo() -> None:
+def test_simulator_defaults_are_a_small_demo() -> None:
     config = SimulatorConfig()
     assert (config.n_frames, config.frame_shape, config.scene.kind, config.path.kind) == (2000, (254, 496), "street", "pan")
     assert problems() == []
 
 
-def test_the_conventional_camera_is_a_small_demo_too() -> None:
+def test_camera_simulator_defaults_are_a_small_demo() -> None:
     config = CAMERA.config()
     assert (config.n_frames, config.frame_rate_hz, config.sensor.bits) == (200, 500, 8)
     assert CAMERA.check(config) == []
 
 
-def test_relative_paths_count_from_the_spec(tmp_path: Path) -> None:
+def test_relative_paths_are_relative_to_the_spec(tmp_path: Path) -> None:
     config = SimulatorConfig.model_validate(
         {"scene": {"kind": "photo", "file": "a.png"}, "sensor": {"dark_rates": "b.npy"}}, context={"directory": tmp_path}
     )
@@ -56,7 +56,7 @@ def test_relative_paths_count_from_the_spec(tmp_path: Path) -> None:
     ]
 
 
-def test_a_path_that_leaves_the_street_is_told_before_the_run() -> None:
+def test_check_refuses_path_that_leaves_the_street() -> None:
     scene = {"kind": "street", "width": 800, "height": 600}
     assert problems(scene=scene, path={"kind": "pan", "length_px": 400, "shake": {}}, n_frames=1_000_000) == [
         "the camera path leaves the scene of 800x600 px by 49.1 px at the right, 100% of the way along; "

@@ -38,13 +38,13 @@ def steps(maps: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", LINES)
-def test_the_path_is_as_long_as_told(kind: str) -> None:
+def test_path_has_the_length_of_the_config(kind: str) -> None:
     assert steps(homographies(LINES[kind] | {"length_px": 700}, 20_001)).sum() == pytest.approx(700, rel=1e-4)
 
 
 @pytest.mark.parametrize("kind", LINES)
 @pytest.mark.parametrize("shake", [None, {"rms_px": 3, "roll_rms_deg": 0.5}])
-def test_the_camera_only_turns(kind: str, shake: dict[str, Any] | None) -> None:
+def test_homographies_are_rotations_of_the_camera(kind: str, shake: dict[str, Any] | None) -> None:
     maps = homographies(LINES[kind] | {"length_px": 700, "shake": shake}, 50)
     frame = np.array([[FOCAL, 0, (FRAME[1] - 1) / 2], [0, FOCAL, (FRAME[0] - 1) / 2], [0, 0, 1]])
     scene = np.array([[FOCAL, 0, MIDDLE[0]], [0, FOCAL, MIDDLE[1]], [0, 0, 1]])
@@ -55,18 +55,18 @@ def test_the_camera_only_turns(kind: str, shake: dict[str, Any] | None) -> None:
 
 
 @pytest.mark.parametrize("kind", LINES)
-def test_the_path_stays_around_its_centre(kind: str) -> None:
+def test_path_is_centred(kind: str) -> None:
     points = centres(homographies(LINES[kind] | {"length_px": 700, "centre": (900, 600)}))
     np.testing.assert_allclose((points.min(axis=0) + points.max(axis=0)) / 2, (900, 600), atol=0.5)
 
 
 @pytest.mark.parametrize("kind", ["pan", "scan", "loop"])
-def test_the_speed_is_constant(kind: str) -> None:
+def test_speed_is_constant(kind: str) -> None:
     lengths = steps(homographies(LINES[kind] | {"length_px": 700}))
     np.testing.assert_allclose(lengths, 700 / 2000, rtol=2e-3)
 
 
-def test_a_pan_is_a_straight_line() -> None:
+def test_pan_is_a_straight_line() -> None:
     points = centres(homographies({"kind": "pan", "length_px": 400, "angle_deg": 90}))
     np.testing.assert_allclose(points[:, 0], MIDDLE[0], atol=1e-9)
     np.testing.assert_allclose(points[[0, -1], 1], MIDDLE[1] + np.array([-200, 200]), atol=1e-9)
@@ -74,7 +74,7 @@ def test_a_pan_is_a_straight_line() -> None:
     assert rightwards[-1, 0] - rightwards[0, 0] == pytest.approx(300)
 
 
-def test_perspective_is_that_of_the_focal_length() -> None:
+def test_perspective_follows_the_focal_length() -> None:
     """At the angle a from the axis, a small step of the camera covers 1 / cos(a)^2 as much of the scene."""
     maps = homographies({"kind": "pan", "length_px": 800}, 3)
     width = np.diff(apply(maps, [[247, 126.5], [248, 126.5]])[..., 0], axis=1)[:, 0]
@@ -83,14 +83,14 @@ def test_perspective_is_that_of_the_focal_length() -> None:
     assert abs(apply(maps[2], corners(FRAME))[1, 1] - apply(maps[1], corners(FRAME))[1, 1]) > 0.5
 
 
-def test_a_loop_returns_to_its_start() -> None:
+def test_loop_returns_to_its_start() -> None:
     maps = homographies({"kind": "loop", "length_px": 900, "aspect": 3})
     np.testing.assert_allclose(maps[0], maps[-1], atol=1e-9)
     extent = np.ptp(centres(maps), axis=0)
     assert extent[0] / extent[1] == pytest.approx(3, rel=1e-3)
 
 
-def test_a_scan_sees_neighbouring_rows_twice() -> None:
+def test_scan_rows_have_the_spacing_of_the_config() -> None:
     points = centres(homographies({"kind": "scan", "rows": 3, "row_spacing_px": 60, "length_px": 900}, 9001))
     rows = MIDDLE[1] + np.array([-60, 0, 60])
     row = (900 - 2 * np.pi * 30) / 3
@@ -105,7 +105,7 @@ def test_a_scan_sees_neighbouring_rows_twice() -> None:
     )
 
 
-def test_a_random_spline_is_smooth_and_its_own() -> None:
+def test_random_spline_is_smooth_and_depends_on_its_seed() -> None:
     maps = homographies({"kind": "random-spline", "length_px": 800})
     velocity = np.diff(centres(maps), axis=0)
     assert np.abs(np.diff(velocity, axis=0)).max() < 0.02 * steps(maps).max()
@@ -114,7 +114,7 @@ def test_a_random_spline_is_smooth_and_its_own() -> None:
     np.testing.assert_array_equal(homographies({"kind": "random-spline", "length_px": 800}, seed=9), maps)
 
 
-def test_the_shake_is_as_strong_and_as_fast_as_told() -> None:
+def test_shake_has_rms_and_frequencies_of_the_config() -> None:
     shake = {"rms_px": 2.0, "roll_rms_deg": 0.1, "frequencies_hz": (10, 40, 70)}
     maps = homographies({"kind": "hand-shake", "shake": shake}, 1000, frame_rate_hz=1000)
     moved = centres(maps) - MIDDLE
@@ -128,7 +128,7 @@ def test_the_shake_is_as_strong_and_as_fast_as_told() -> None:
     assert (homographies({"kind": "hand-shake", "shake": shake}, 1000, seed=1, frame_rate_hz=1000) != maps).any()
 
 
-def test_the_shake_goes_on_top_of_a_path() -> None:
+def test_shake_is_added_to_a_path() -> None:
     still = homographies({"kind": "pan", "length_px": 300})
     shaken = homographies({"kind": "pan", "length_px": 300, "shake": {"rms_px": 1}})
     distance = np.linalg.norm(centres(shaken) - centres(still), axis=1)
@@ -137,7 +137,7 @@ def test_the_shake_goes_on_top_of_a_path() -> None:
 
 
 @pytest.mark.parametrize("kind", [*LINES, "hand-shake"])
-def test_one_frame_is_enough(kind: str) -> None:
+def test_path_of_one_frame(kind: str) -> None:
     assert homographies(LINES.get(kind, {"kind": kind}), 1).shape == (1, 3, 3)
 
 
@@ -184,7 +184,7 @@ def test_homographies_come_from_a_file(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(homographies({"kind": "file", "file": path}, 6), maps / 2)
 
 
-def test_wrong_files_are_refused(tmp_path: Path) -> None:
+def test_wrong_homography_files_are_refused(tmp_path: Path) -> None:
     cases = {
         "number": (np.tile(np.eye(3), (7, 1, 1)), "{path} holds 7 homographies for 5 frames; set n_frames to 7"),
         "shape": (np.zeros((5, 2, 3)), "{path} holds float64 of shape (5, 2, 3); homographies are (n_frames, 3, 3)"),

@@ -16,7 +16,7 @@ def written(path: Path, image: np.ndarray) -> Path:
     return path
 
 
-def test_the_mean_over_the_scene_is_the_flux(photo: Path) -> None:
+def test_mean_of_the_scene_is_the_flux(photo: Path) -> None:
     for scene in (PhotoScene(file=photo), StreetScene(width=320, height=240)):
         flux = scene_flux(scene, 0.3)
         assert flux.dtype == np.float32
@@ -26,7 +26,7 @@ def test_the_mean_over_the_scene_is_the_flux(photo: Path) -> None:
 
 
 @pytest.mark.parametrize(("bits", "step"), [(np.uint8, 1), (np.uint16, 257)])
-def test_the_tone_curve_is_undone(tmp_path: Path, bits: type, step: int) -> None:
+def test_tone_curve_is_inverted(tmp_path: Path, bits: type, step: int) -> None:
     """The encoded grey 188 has 0.502886 of the light of white (IEC 61966-2-1)."""
     image = np.zeros((10, 30), bits)
     image[:, 10:20], image[:, 20:] = 188 * step, 255 * step
@@ -34,7 +34,7 @@ def test_the_tone_curve_is_undone(tmp_path: Path, bits: type, step: int) -> None
     np.testing.assert_allclose(flux[0, [0, 10, 20]], [0, 0.502886, 1.0], rtol=1e-5)
 
 
-def test_colours_become_their_luminance(tmp_path: Path) -> None:
+def test_colours_are_converted_to_luminance(tmp_path: Path) -> None:
     image = np.zeros((10, 30, 3), np.uint8)
     for channel in range(3):
         image[:, 10 * channel : 10 * channel + 10, channel] = 255
@@ -54,7 +54,7 @@ def assert_refused(message: str, path: Path) -> None:
     assert str(caught.value) == message
 
 
-def test_wrong_files_are_refused(tmp_path: Path) -> None:
+def test_wrong_photographs_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "photo.png"
     assert_refused(f"there is no file {path}; check the path", path)
     assert_refused(f"cannot read {tmp_path}: Is a directory", tmp_path)

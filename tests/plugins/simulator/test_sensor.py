@@ -20,7 +20,7 @@ def counts(sensor: SpadSensor, flux: float, n_frames: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("flux", "dark"), [(0.5, 0.0), (0.02, 0.0), (0.1, 0.05), (3.0, 0.0), (0.0, 0.01)])
-def test_a_pixel_is_lit_as_often_as_equation_2_says(flux: float, dark: float) -> None:
+def test_pixel_is_lit_with_probability_of_equation_2(flux: float, dark: float) -> None:
     n = 400
     chance = 1 - np.exp(-(flux + dark))
     z = (counts(SpadSensor(Sensor(dark_rate=dark), SHAPE, 0), flux, n) - n * chance) / np.sqrt(n * chance * (1 - chance))
@@ -30,13 +30,13 @@ def test_a_pixel_is_lit_as_often_as_equation_2_says(flux: float, dark: float) ->
     assert abs(z.var() - 1) < 5 * np.sqrt(kurtosis / z.size)
 
 
-def test_no_flux_lights_no_pixel_and_much_flux_lights_all() -> None:
+def test_zero_flux_lights_no_pixel_and_high_flux_all() -> None:
     sensor = SpadSensor(Sensor(), SHAPE, 0)
     assert counts(sensor, 0.0, 200).max() == 0
     assert counts(sensor, 1e6, 200).min() == 200
 
 
-def test_small_chances_are_not_rounded() -> None:
+def test_small_probabilities_are_not_rounded() -> None:
     """At 8 bits a chance of 1 / 1000 would be 0 or 1 / 256."""
     n = 1000
     lit = counts(SpadSensor(Sensor(), SHAPE, 0), 1e-3, n).sum()
@@ -44,7 +44,7 @@ def test_small_chances_are_not_rounded() -> None:
     assert abs(lit - expected) < 5 * np.sqrt(expected)
 
 
-def test_hot_pixels_are_drawn_as_told() -> None:
+def test_hot_pixels_have_fraction_and_rates_of_the_config() -> None:
     sensor = SpadSensor(Sensor(hot_fraction=0.3, hot_rate=(0.01, 1.0), dark_rate=0.5), (200, 200), seed=3)
     share = sensor.hot.mean()
     assert abs(share - 0.3) < 5 * np.sqrt(0.3 * 0.7 / 40_000)
@@ -85,7 +85,7 @@ def test_files_of_rates_and_hot_pixels_are_added(tmp_path: Path) -> None:
         ("hot_pixels", None, "there is no file {path}; check the path"),
     ],
 )
-def test_wrong_files_are_refused(tmp_path: Path, field: str, array: np.ndarray | None, message: str) -> None:
+def test_wrong_rate_and_mask_files_are_refused(tmp_path: Path, field: str, array: np.ndarray | None, message: str) -> None:
     path = tmp_path / "file.npy"
     if array is not None:
         np.save(path, array)
@@ -94,7 +94,7 @@ def test_wrong_files_are_refused(tmp_path: Path, field: str, array: np.ndarray |
     assert str(caught.value) == message.format(path=path)
 
 
-def test_an_archive_is_not_a_mask(tmp_path: Path) -> None:
+def test_archive_is_refused_as_a_mask(tmp_path: Path) -> None:
     path = tmp_path / "truth.npz"
     np.savez(path, hot=np.zeros(SHAPE, bool))
     with pytest.raises(InputError) as caught:

@@ -28,7 +28,7 @@ def opencv_threads() -> Iterator[None]:
     cv2.setNumThreads(before)
 
 
-def test_tells_what_it_gives(simulated: Simulated) -> None:
+def test_info_describes_the_frames(simulated: Simulated) -> None:
     with simulated(frame_rate_hz=1000) as source:
         info = source.info
         assert (info.n_frames, info.frame_shape, info.frame_rate_hz) == (50, (40, 52), 1000)
@@ -61,7 +61,7 @@ def test_frames_do_not_depend_on_the_threads_of_opencv(simulated: Simulated) -> 
     np.testing.assert_array_equal(frames[0], frames[2])
 
 
-def test_the_seed_decides(simulated: Simulated) -> None:
+def test_frames_depend_on_the_seed(simulated: Simulated) -> None:
     span = FrameSpan(0, 5)
     first = simulated(run_seed=1).frames(span)
     assert (first != simulated(run_seed=2).frames(span)).any()
@@ -84,7 +84,7 @@ def test_frames_are_independent(simulated: Simulated) -> None:
         assert abs(product.mean(dtype=np.float64)) < 5 / np.sqrt(n)
 
 
-def test_the_frames_show_the_scene_where_the_truth_says(simulated: Simulated) -> None:
+def test_frames_agree_with_the_truth(simulated: Simulated) -> None:
     source = simulated(n_frames=3000, path={"kind": "pan", "length_px": 1e-6, "centre": (90.3, 70.6)}, flux=0.5)
     truth = source.truth()
     height, width = truth["frame_shape"]
@@ -112,7 +112,7 @@ def test_hot_pixels_are_valid_unless_they_are_masked(simulated: Simulated) -> No
     assert simulated(sensor={"hot_fraction": 0.1}).valid.all()
 
 
-def test_the_written_capture_holds_the_same_frames(simulated: Simulated, tmp_path: Path) -> None:
+def test_written_capture_has_the_same_frames(simulated: Simulated, tmp_path: Path) -> None:
     source = simulated(**NOISY, frame_shape=(40, 51))
     path, truth_path = write_packed(source, tmp_path / "cube.npy")
     packed = np.load(path, allow_pickle=False)

@@ -8,7 +8,7 @@ from photonpano_simulator.street import street
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (333, 500), (64, 160), (300, 64)])
-def test_it_is_drawn_at_any_size(shape: tuple[int, int]) -> None:
+def test_street_is_drawn_at_any_size(shape: tuple[int, int]) -> None:
     image = street(shape, seed=0)
     assert (image.shape, image.dtype) == (shape, np.float32)
     assert image.min() >= 0
@@ -16,7 +16,7 @@ def test_it_is_drawn_at_any_size(shape: tuple[int, int]) -> None:
     assert image.std() > 0.1
 
 
-def test_the_seed_decides() -> None:
+def test_street_depends_on_the_seed() -> None:
     first = street((240, 320), seed=1)
     np.testing.assert_array_equal(first, street((240, 320), seed=1))
     assert np.abs(first - street((240, 320), seed=2)).mean() > 0.05

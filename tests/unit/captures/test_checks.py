@@ -21,7 +21,7 @@ LIT = (
 
 @pytest.mark.parametrize(("n_frames", "looked_at"), [(1, 1), (40, 40), (256, 256), (257, 256), (1000, 256)])
 @pytest.mark.parametrize(("value", "text"), [(0, DARK), (1, LIT)])
-def test_all_dark_and_all_lit_captures_are_refused(
+def test_require_photons_refuses_all_dark_and_all_lit(
     memory_source: type, n_frames: int, looked_at: int, value: int, text: str
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -30,14 +30,14 @@ def test_all_dark_and_all_lit_captures_are_refused(
 
 
 @pytest.mark.parametrize("value", [0, 1])
-def test_one_pixel_of_the_last_frame_is_enough(memory_source: type, value: int) -> None:
+def test_require_photons_accepts_one_pixel_of_the_last_frame(memory_source: type, value: int) -> None:
     frames = np.full((1000, 4, 8), value)
     frames[-1, 2, 3] = 1 - value
     require_photons(memory_source(frames))
 
 
 @pytest.mark.parametrize("value", [0, 1])
-def test_masked_pixels_do_not_count(memory_source: type, value: int) -> None:
+def test_require_photons_ignores_masked_pixels(memory_source: type, value: int) -> None:
     frames, valid = np.full((100, 4, 8), value), np.ones((4, 8), bool)
     frames[:, 2, 3], valid[2, 3] = 1 - value, False
     with pytest.raises(InputError):
@@ -45,7 +45,7 @@ def test_masked_pixels_do_not_count(memory_source: type, value: int) -> None:
 
 
 @pytest.mark.parametrize(("level", "text"), [(16, "no pixel is brighter than black"), (235, "every pixel is saturated")])
-def test_grey_levels_are_judged_by_black_and_white(memory_source: type, level: int, text: str) -> None:
+def test_require_photons_compares_grey_levels_with_black_and_white(memory_source: type, level: int, text: str) -> None:
     with pytest.raises(InputError, match=f"^{text} in"):
         require_photons(grey(memory_source, level))
     require_photons(grey(memory_source, 100))

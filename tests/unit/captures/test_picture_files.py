@@ -27,7 +27,7 @@ def broken(pictures: list[np.ndarray]) -> Iterator[np.ndarray]:
     raise KeyboardInterrupt
 
 
-def test_a_folder_holds_pngs_as_they_are(tmp_path: Path, smooth: list[np.ndarray]) -> None:
+def test_folder_gets_lossless_pngs(tmp_path: Path, smooth: list[np.ndarray]) -> None:
     write_pictures(tmp_path / "look", iter(smooth), NAMES, 24)
     assert [path.name for path in tmp_path.iterdir()] == ["look"]
     files = sorted((tmp_path / "look").iterdir())
@@ -36,7 +36,7 @@ def test_a_folder_holds_pngs_as_they_are(tmp_path: Path, smooth: list[np.ndarray
         np.testing.assert_array_equal(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), picture)
 
 
-def test_an_mp4_has_even_sides_and_these_levels(tmp_path: Path, smooth: list[np.ndarray]) -> None:
+def test_mp4_has_even_sides_and_the_levels(tmp_path: Path, smooth: list[np.ndarray]) -> None:
     av = pytest.importorskip("av")
     write_pictures(tmp_path / "look.mp4", iter(smooth), NAMES, 12.5)
     with av.open(str(tmp_path / "look.mp4")) as film:
@@ -50,7 +50,7 @@ def test_an_mp4_has_even_sides_and_these_levels(tmp_path: Path, smooth: list[np.
         np.testing.assert_allclose(shown[41], shown[40], atol=6)
 
 
-def test_a_webp_is_animated(tmp_path: Path, smooth: list[np.ndarray]) -> None:
+def test_webp_is_animated(tmp_path: Path, smooth: list[np.ndarray]) -> None:
     write_pictures(tmp_path / "look.webp", iter(smooth), NAMES, 20)
     with Image.open(tmp_path / "look.webp") as film:
         assert (film.n_frames, film.size) == (3, (67, 41))
@@ -62,7 +62,7 @@ def test_a_webp_is_animated(tmp_path: Path, smooth: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("name", ["look", "look.mp4", "look.webp"])
-def test_nothing_is_left_when_it_is_interrupted(tmp_path: Path, smooth: list[np.ndarray], name: str) -> None:
+def test_interrupted_writing_leaves_no_files(tmp_path: Path, smooth: list[np.ndarray], name: str) -> None:
     if name.endswith("mp4"):
         pytest.importorskip("av")
     with pytest.raises(KeyboardInterrupt):
@@ -76,7 +76,7 @@ def refused(path: Path, n_pictures: int = 3) -> str:
     return str(caught.value).replace(f"{path.parent}/", "")
 
 
-def test_a_folder_that_holds_something_is_not_replaced(tmp_path: Path, smooth: list[np.ndarray]) -> None:
+def test_folder_with_files_is_refused(tmp_path: Path, smooth: list[np.ndarray]) -> None:
     (tmp_path / "look").mkdir()
     (tmp_path / "look" / "mine.txt").touch()
     assert refused(tmp_path / "look") == ("cannot write look: it is there already; choose another folder, or remove it")
@@ -86,7 +86,7 @@ def test_a_folder_that_holds_something_is_not_replaced(tmp_path: Path, smooth: l
     assert len(list((tmp_path / "look").iterdir())) == 3
 
 
-def test_what_cannot_be_written_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_names_are_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert refused(tmp_path / "look.gif") == (
         "cannot write look.gif: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp"
     )

@@ -25,16 +25,16 @@ def ramp() -> np.ndarray:
     ("group_size", "step", "starts"),
     [(40, 40, [0, 40]), (40, 25, [0, 25, 50]), (100, 1, [0]), (50, 50, [0, 50]), (30, 50, [0, 50])],
 )
-def test_exposures_lie_a_step_apart_as_long_as_they_fit(group_size: int, step: int, starts: list[int]) -> None:
+def test_preview_spans_are_a_step_apart_within_the_capture(group_size: int, step: int, starts: list[int]) -> None:
     spans = preview_spans(StreamInfo(100, 4, 8, None), group_size, step)
     assert spans == [FrameSpan(start, start + group_size) for start in starts]
 
 
-def test_a_short_capture_is_one_exposure() -> None:
+def test_short_capture_is_one_exposure() -> None:
     assert preview_spans(StreamInfo(30, 4, 8, None), 256, 256) == [FrameSpan(0, 30)]
 
 
-def test_levels_are_those_of_the_flux_in_srgb(memory_source: type, ramp: np.ndarray) -> None:
+def test_levels_are_the_flux_in_srgb(memory_source: type, ramp: np.ndarray) -> None:
     spans = [FrameSpan(0, 256), FrameSpan(300, 556)]
     found = list(pictures(memory_source(ramp), spans, UNLABELLED, threads=2))
     for span, picture in zip(spans, found, strict=True):
@@ -47,7 +47,7 @@ def test_levels_are_those_of_the_flux_in_srgb(memory_source: type, ramp: np.ndar
     assert np.abs(linear - 255 * flux).max() <= 0.51
 
 
-def test_white_is_a_quantile_over_all_exposures(memory_source: type) -> None:
+def test_white_flux_is_a_quantile_over_all_exposures(memory_source: type) -> None:
     frames = np.zeros((200, 10, 10), np.uint8)
     frames[100:200:2, :, :] = 1
     spans = preview_spans(StreamInfo(200, 10, 10, None), 100, 100)
@@ -56,14 +56,14 @@ def test_white_is_a_quantile_over_all_exposures(memory_source: type) -> None:
     assert white_flux(memory_source(0 * frames), spans, 1.0) == 1.0
 
 
-def test_pixels_that_must_not_be_used_are_black(memory_source: type) -> None:
+def test_masked_pixels_are_black(memory_source: type) -> None:
     valid = np.ones((4, 6), bool)
     valid[1, 2] = False
     (picture,) = pictures(memory_source(np.ones((20, 4, 6)), valid), [FrameSpan(0, 20)], UNLABELLED)
     assert (picture == np.where(valid, 255, 0)).all()
 
 
-def test_a_label_stands_below_and_leaves_the_picture_as_it_is(memory_source: type, ramp: np.ndarray) -> None:
+def test_label_is_added_below_the_picture(memory_source: type, ramp: np.ndarray) -> None:
     source, spans = memory_source(ramp), [FrameSpan(0, 100), FrameSpan(500, 600)]
     plain, labelled = (list(pictures(source, spans, Style(1.0, label=label))) for label in (False, True))
     strips = [each[len(bare) :] for each, bare in zip(labelled, plain, strict=True)]
@@ -84,7 +84,7 @@ cube.save_images(sys.argv[2], invert_response=True, tonemap2srgb=sys.argv[3] == 
 
 
 @pytest.mark.parametrize("curve", ["srgb", "linear"])
-def test_levels_are_those_of_photoncube(tmp_path: Path, memory_source: type, ramp: np.ndarray, curve: str) -> None:
+def test_levels_equal_those_of_photoncube(tmp_path: Path, memory_source: type, ramp: np.ndarray, curve: str) -> None:
     """Which rounds down, takes the flux of 1 for white whatever its quantile says, and has no more frames than fit."""
     pytest.importorskip("photoncube")
     np.save(tmp_path / "cube.npy", np.packbits(ramp, axis=-1))

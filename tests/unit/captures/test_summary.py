@@ -40,13 +40,13 @@ class Film:
 
 
 @pytest.mark.parametrize("speed_px", [0.05, 0.3, 2.0])
-def test_the_speed_of_a_pan_is_found(speed_px: float) -> None:
+def test_summary_finds_the_speed_of_a_pan(speed_px: float) -> None:
     summary = summarise(Film(lambda frame: speed_px * frame, 400, 0.5))
     assert summary.speed_px == pytest.approx(speed_px, rel=0.1)
     assert summary.flux == pytest.approx(0.5, rel=0.1)
 
 
-def test_in_the_dark_longer_sums_tell_it() -> None:
+def test_summary_uses_longer_sums_in_the_dark() -> None:
     bright, dark = (summarise(Film(lambda frame: 0.5 * frame, 400, flux)) for flux in (1.0, 0.05))
     assert dark.speed_px == pytest.approx(0.5, rel=0.1)
     assert dark.flux == pytest.approx(0.05, rel=0.1)
@@ -54,38 +54,38 @@ def test_in_the_dark_longer_sums_tell_it() -> None:
     assert frames[0] < frames[1]
 
 
-def test_the_fast_part_of_a_capture_counts() -> None:
+def test_summary_gives_the_speed_of_the_fast_part() -> None:
     def x_px(frame: int) -> float:
         return 0.1 * frame + 0.9 * max(0, frame - 280)  # 1 px a frame in the last third
 
     assert summarise(Film(x_px, 400, 0.5)).speed_px == pytest.approx(1.0, rel=0.1)
 
 
-def test_a_capture_that_stands_still_is_slow() -> None:
+def test_summary_of_a_still_capture_is_slow() -> None:
     speed_px = summarise(Film(lambda _: 0, 200, 0.5)).speed_px
     assert speed_px is not None
     assert speed_px < 0.02
 
 
 @pytest.mark.parametrize(("flux", "contrast"), [(1e-5, 0.9), (0.5, 0)])
-def test_a_capture_too_dark_or_without_texture_tells_nothing(flux: float, contrast: float) -> None:
+def test_summary_has_no_speed_in_the_dark_or_without_texture(flux: float, contrast: float) -> None:
     summary = summarise(Film(lambda frame: 0.3 * frame, 200, flux, contrast))
     assert summary.speed_px is None
     assert summary.how == "no motion was found at any of 12 places"
 
 
-def test_pixels_that_are_not_valid_do_not_pretend_to_stand_still() -> None:
+def test_summary_ignores_masked_pixels() -> None:
     summary = summarise(Film(lambda frame: 0.3 * frame, 400, 0.1, hot=True))
     assert summary.speed_px == pytest.approx(0.3, rel=0.1)
     assert summary.flux == pytest.approx(0.1, rel=0.1)
 
 
-def test_it_does_not_depend_on_the_number_of_threads() -> None:
+def test_summary_does_not_depend_on_the_number_of_threads() -> None:
     film = Film(lambda frame: 0.3 * frame, 200, 0.1)
     assert summarise(film, threads=1) == summarise(film, threads=4)
 
 
-def test_a_few_frames_tell_no_motion() -> None:
+def test_summary_of_few_frames_has_no_speed() -> None:
     summary = summarise(Film(lambda frame: frame, 20, 0.5))
     assert summary.speed_px is None
     assert summary.how == "20 frames are too few to estimate a motion"
@@ -99,7 +99,7 @@ class Veiled(MemorySource):
         return counts.astype(np.float32) / 2
 
 
-def test_what_the_source_takes_out_of_sums_is_no_flux() -> None:
+def test_summary_uses_corrected_sums() -> None:
     frames = np.random.default_rng(0).random((120, *SHAPE)) < 0.1
     assert summarise(MemorySource(frames)).flux == pytest.approx(-np.log1p(-0.1), rel=0.02)
     assert summarise(Veiled(frames)).flux == pytest.approx(-np.log1p(-0.05), rel=0.02)

@@ -58,7 +58,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_the_file_holds_the_frames_bit_by_bit(tmp_path: Path, threads: int) -> None:
+def test_written_file_equals_the_frames(tmp_path: Path, threads: int) -> None:
     source, path, told = RandomSource(100, 6, 19), tmp_path / "cube.npy", []
     assert write_packed(source, path, told.append, threads) == (path,)
     packed = np.load(path, allow_pickle=False)
@@ -68,7 +68,7 @@ def test_the_file_holds_the_frames_bit_by_bit(tmp_path: Path, threads: int) -> N
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_truth_lies_beside_it(tmp_path: Path) -> None:
+def test_truth_is_written_beside_the_capture(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     assert write_packed(TruthfulSource(5, 6, 19), path) == (path, tmp_path / "cube.truth.npz")
     with np.load(truth_path(path), allow_pickle=False) as truth:
@@ -84,7 +84,7 @@ def interrupt(n_frames: int) -> None:
 @pytest.mark.parametrize(
     ("fails_at", "progress", "error"), [(50, None, InputError), (None, interrupt, KeyboardInterrupt)], ids=["flaw", "Ctrl-C"]
 )
-def test_nothing_is_left_when_it_fails_half_way(
+def test_failure_leaves_no_files(
     tmp_path: Path, fails_at: int | None, progress: Callable[[int], object] | None, error: type[BaseException]
 ) -> None:
     with pytest.raises(error):
@@ -115,7 +115,7 @@ except OutputError as error:
 """
 
 
-def test_nothing_is_left_when_the_system_cuts_the_file_short(tmp_path: Path) -> None:
+def test_full_disk_leaves_no_files(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     done = subprocess.run([sys.executable, "-c", _RUNS_OUT_OF_DISK, path], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == (
@@ -124,7 +124,7 @@ def test_nothing_is_left_when_the_system_cuts_the_file_short(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_that_is_too_small_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_disk_is_reported_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, 1_000_000_000))
     path = tmp_path / "cube.npy"
     with pytest.raises(OutputError) as caught:
@@ -135,7 +135,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_work(tmp_path: Path, monkey
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_folder_is_told_before_the_work(tmp_path: Path) -> None:
+def test_missing_folder_is_reported_before_the_work(tmp_path: Path) -> None:
     path = tmp_path / "nowhere" / "cube.npy"
     with pytest.raises(OutputError, match=r"there is no folder .*nowhere; create it or choose another"):
         write_packed(TruthfulSource(5, 6, 19, fails_at=0), path)
@@ -156,7 +156,7 @@ def test_intensities_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
     def peak(n_frames: int) -> int:
         tracemalloc.start()
         try:
@@ -201,7 +201,7 @@ def test_packed_frames_are_not_unpacked(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("kind", [RandomSource, PackedRandomSource])
 @pytest.mark.parametrize("more", [b"", b"half a frame"])
-def test_what_was_interrupted_is_continued(tmp_path: Path, kind: type[RandomSource], more: bytes) -> None:
+def test_interrupted_file_is_continued(tmp_path: Path, kind: type[RandomSource], more: bytes) -> None:
     path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
     interrupted_after(30, path, kind(100, 6, 19))
     assert list(tmp_path.iterdir()) == [part]
@@ -221,7 +221,7 @@ def test_what_was_interrupted_is_continued(tmp_path: Path, kind: type[RandomSour
 
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("other", ["another shape", "another last frame", "another first frame", "no header"])
-def test_a_part_of_another_capture_is_written_anew(tmp_path: Path, other: str) -> None:
+def test_partial_file_of_another_capture_is_replaced(tmp_path: Path, other: str) -> None:
     path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
     interrupted_after(30, path, RandomSource(100, 7 if other == "another shape" else 6, 19))
     frame_bytes = 6 * 3
@@ -238,7 +238,7 @@ def test_a_part_of_another_capture_is_written_anew(tmp_path: Path, other: str) -
     )
 
 
-def test_a_part_that_is_longer_than_the_capture_is_cut(tmp_path: Path) -> None:
+def test_partial_file_longer_than_the_capture_is_cut(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     write_packed(RandomSource(20, 6, 19), path)
     whole = path.read_bytes()
@@ -248,7 +248,7 @@ def test_a_part_that_is_longer_than_the_capture_is_cut(tmp_path: Path) -> None:
     assert (found, path.read_bytes()) == ([20], whole)
 
 
-def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
+def test_second_process_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
 
     def write_again(n_frames: int) -> None:
@@ -259,7 +259,7 @@ def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
     assert str(caught.value) == f"cannot write {path}: another process is writing it; wait for it, or choose another name"
 
 
-def test_a_full_disk_leaves_what_can_be_continued(tmp_path: Path) -> None:
+def test_full_disk_leaves_a_resumable_file(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     script = _RUNS_OUT_OF_DISK.replace("Path(sys.argv[1])", "Path(sys.argv[1]), resumed=print")
     done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True, check=True)
@@ -275,7 +275,7 @@ def test_a_full_disk_leaves_what_can_be_continued(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "packed", [np.zeros((5, 6, 4), np.uint8), np.zeros((5, 6, 3), np.uint16), np.zeros((4, 6, 3), np.uint8)]
 )
-def test_a_source_that_breaks_its_contract_is_told(tmp_path: Path, packed: np.ndarray) -> None:
+def test_source_with_wrong_shape_is_reported(tmp_path: Path, packed: np.ndarray) -> None:
     source = PackedRandomSource(5, 6, 19)
     source.packed = lambda _span: packed
     with pytest.raises(PluginError) as caught:

@@ -26,7 +26,7 @@ def frames_of(flux: Any, seed: int = 0, n: int = N) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate", [0.001, 0.05, 0.4, 1.5])
-def test_dark_counts_are_taken_out_without_bias(rate: float, corrections: Callable, tmp_path: Path) -> None:
+def test_dark_counts_are_subtracted_without_bias(rate: float, corrections: Callable, tmp_path: Path) -> None:
     flux = 0.2
     np.save(tmp_path / "dark.npy", np.full(SHAPE, rate))
     keys = {"dark": "dark.npy", "limit": 2}
@@ -37,7 +37,7 @@ def test_dark_counts_are_taken_out_without_bias(rate: float, corrections: Callab
     assert abs(found.mean() + np.expm1(-flux)) < 4 * error
 
 
-def test_it_is_the_same_whatever_is_summed_with_what(corrections: Callable, tmp_path: Path) -> None:
+def test_correction_of_a_sum_is_the_sum_of_corrections(corrections: Callable, tmp_path: Path) -> None:
     rates = np.random.default_rng(0).uniform(0, 0.1, SHAPE)
     np.save(tmp_path / "dark.npy", rates)
     with corrected_source(MemorySource(frames_of(0.3 + rates)), corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
@@ -68,7 +68,7 @@ def test_pixels_with_more_than_the_limit_are_masked_and_counted(corrections: Cal
         assert source.decisions == [Decision("dark_counts_masked", 2, reason)]
 
 
-def test_what_is_measured_is_the_rate_of_the_photons(tmp_path: Path) -> None:
+def test_measure_dark_returns_the_rate_of_the_photons(tmp_path: Path) -> None:
     rates = np.array([0.01, 0.5, 1.5])[:, None].repeat(SHAPE[0] * SHAPE[1] // 3, axis=1).reshape(SHAPE)
     advanced: list[int] = []
     measured = measure_dark(MemorySource(frames_of(rates)), advanced.append)
@@ -96,7 +96,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_files_that_hold_no_rates_are_refused(case: str, tmp_path: Path) -> None:
+def test_wrong_dark_files_are_refused(case: str, tmp_path: Path) -> None:
     array, message = WRONG[case]
     path = tmp_path / "dark.npy"
     if array is None:
@@ -108,7 +108,7 @@ def test_files_that_hold_no_rates_are_refused(case: str, tmp_path: Path) -> None
     assert str(caught.value) == f"{path} {message}"
 
 
-def test_archives_of_something_else_are_refused(tmp_path: Path) -> None:
+def test_wrong_dark_archives_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "dark.npz"
     np.savez(path, homographies=np.eye(3))
     with pytest.raises(InputError, match="is an archive without `rates`; name what `photonpano dark` wrote, or a"):

@@ -44,7 +44,7 @@ def by_photoncube(frames: np.ndarray, folder: Path, transforms: tuple[str, ...] 
         (["rot90", "flip-ud"], ("Rot90", "FlipUD")),
     ],
 )
-def test_turns_are_those_of_photoncube(written: list[str], transforms: Any, corrections: Callable, tmp_path: Path) -> None:
+def test_turns_equal_those_of_photoncube(written: list[str], transforms: Any, corrections: Callable, tmp_path: Path) -> None:
     frames = bits((16, 24))
     expected = by_photoncube(frames, tmp_path, transforms)
     np.testing.assert_array_equal(np.packbits(moved(frames, corrections(*written)), axis=-1), expected)
@@ -58,7 +58,7 @@ def test_turns_are_those_of_photoncube(written: list[str], transforms: Any, corr
         ("grey-swissspad2-full", (512, 512), "grayspad_fix", (509, 496)),
     ],
 )
-def test_presets_are_those_of_photoncube(
+def test_presets_equal_those_of_photoncube(
     preset: str, shape: Any, fix: str, result: Any, corrections: Callable, tmp_path: Path
 ) -> None:
     frames = bits(shape)
@@ -74,27 +74,27 @@ def test_rot90_turns_clockwise(corrections: Callable) -> None:
     assert moved(frames, corrections("rot270"))[0].tolist() == [[0, 0], [0, 0], [1, 0]]
 
 
-def test_the_order_of_the_list_counts(corrections: Callable) -> None:
+def test_corrections_are_applied_in_order(corrections: Callable) -> None:
     frames = bits((6, 10))
     crop = {"crop": {"rows": [1, 4]}}
     np.testing.assert_array_equal(moved(frames, corrections(crop, "rot90"))[0], np.rot90(frames[0, 1:4], -1))
     np.testing.assert_array_equal(moved(frames, corrections("rot90", crop))[0], np.rot90(frames[0], -1)[1:4])
 
 
-def test_a_crop_counts_from_either_end(corrections: Callable) -> None:
+def test_crop_counts_from_either_end(corrections: Callable) -> None:
     frames = bits((6, 10))
     cropped = moved(frames, corrections({"crop": {"rows": [2, None], "columns": [-7, -1]}}))
     np.testing.assert_array_equal(cropped, frames[:, 2:, -7:-1])
 
 
-def test_columns_are_swapped_both_ways(corrections: Callable) -> None:
+def test_swap_columns_swaps_both_blocks(corrections: Callable) -> None:
     frames = bits((4, 12))
     swapped = moved(frames, corrections({"swap-columns": {"first": [8, 10], "second": [2, 4]}}))
     np.testing.assert_array_equal(swapped, frames[:, :, [0, 1, 8, 9, 4, 5, 6, 7, 2, 3, 10, 11]])
 
 
 @pytest.mark.parametrize(("settings", "row"), [({}, 3), ({"before": 1}, 1), ({"before": 6}, 6)])
-def test_a_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, corrections: Callable) -> None:
+def test_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, corrections: Callable) -> None:
     frames = bits((6, 5))
     with corrected_source(MemorySource(frames), corrections({"missing-row": settings})) as source:
         np.testing.assert_array_equal(source.frames(source.info.span), np.insert(frames, row, 0, axis=1))
@@ -128,7 +128,7 @@ def test_a_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, co
         ),
     ],
 )
-def test_what_does_not_fit_the_frame_is_refused(written: Any, message: str, corrections: Callable) -> None:
+def test_rearrangement_outside_the_frame_is_refused(written: Any, message: str, corrections: Callable) -> None:
     with pytest.raises(InputError) as caught:
         corrected_source(MemorySource(bits((6, 10))), corrections(written))
     assert str(caught.value) == message

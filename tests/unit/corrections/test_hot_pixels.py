@@ -26,7 +26,7 @@ def exposed(flux: np.ndarray, n: int = N, seed: int = 1) -> np.ndarray:
 
 
 @pytest.mark.parametrize("n_frames", [100, 10_000])
-def test_few_dark_frames_make_no_pixel_hot_by_chance(n_frames: int) -> None:
+def test_single_counts_in_few_dark_frames_are_not_hot(n_frames: int) -> None:
     rng, hot = np.random.default_rng(2), hot_ones()
     rates = np.where(hot, 0.5, 0.0013)
     measured = DarkFrames((rng.poisson(rates * n_frames) / n_frames).astype(np.float32), n_frames)
@@ -35,7 +35,7 @@ def test_few_dark_frames_make_no_pixel_hot_by_chance(n_frames: int) -> None:
     assert 0.0013 < limit < 0.5
 
 
-def test_dark_frames_tell_which_pixels_are_hot(corrections: Callable, tmp_path: Path) -> None:
+def test_hot_pixels_are_found_in_dark_frames(corrections: Callable, tmp_path: Path) -> None:
     hot = hot_ones()
     rates = np.where(hot, 0.3, np.random.default_rng(0).lognormal(np.log(0.0013), 0.3, SHAPE)).astype(np.float32)
     write_dark(tmp_path / "dark.npz", DarkFrames(rates, 10**7))
@@ -47,7 +47,7 @@ def test_dark_frames_tell_which_pixels_are_hot(corrections: Callable, tmp_path: 
     assert decision.reason.endswith(" dark counts a frame in dark.npz, by threshold = 10")
 
 
-def test_the_capture_itself_tells_hot_and_dead_pixels(corrections: Callable) -> None:
+def test_hot_and_dead_pixels_are_found_in_the_capture(corrections: Callable) -> None:
     """At the borders and beside each other, before a scene that is brighter on one side."""
     hot, dead = hot_ones(), hot_ones(0.01, seed=5)
     hot[0, 0] = hot[30, 40] = hot[30, 41] = True
@@ -59,7 +59,7 @@ def test_the_capture_itself_tells_hot_and_dead_pixels(corrections: Callable) -> 
     assert "stand out from their neighbours in 2000 frames sampled all over the capture" in source.decisions[0].reason
 
 
-def test_edges_and_lines_of_the_scene_are_no_hot_pixels(corrections: Callable) -> None:
+def test_edges_and_lines_of_the_scene_are_not_hot(corrections: Callable) -> None:
     """As a camera sees them that moves along them."""
     flux = np.full(SHAPE, 0.1)
     flux[20] = 0.8
@@ -70,7 +70,7 @@ def test_edges_and_lines_of_the_scene_are_no_hot_pixels(corrections: Callable) -
 
 
 @pytest.mark.parametrize("every", [2, 3])
-def test_masked_pixels_are_no_neighbours(every: int, corrections: Callable, tmp_path: Path) -> None:
+def test_masked_pixels_are_not_used_as_neighbours(every: int, corrections: Callable, tmp_path: Path) -> None:
     """They are so bright that nothing would stand out among them. Of every third column, too few are left to tell."""
     bad, hot = np.broadcast_to(np.arange(SHAPE[1]) % every != 0, SHAPE), hot_ones()
     np.save(tmp_path / "bad.npy", bad)
@@ -80,7 +80,7 @@ def test_masked_pixels_are_no_neighbours(every: int, corrections: Callable, tmp_
     assert (source.valid[~bad & hot].mean() < 0.2) == (every == 2)
 
 
-def test_no_frame_is_read_before_the_mask_is_asked_for(corrections: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_frame_is_read_before_valid(corrections: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     frames = exposed(np.full(SHAPE, 0.1), n=50)
     read: list[FrameSpan] = []
     counts = MemorySource.counts

@@ -34,7 +34,7 @@ def refused(source: MemorySource, corrections: Callable) -> Callable[..., str]:
     return refused
 
 
-def test_a_picture_is_as_good_a_mask_as_an_array(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
+def test_mask_from_a_picture_equals_mask_from_an_array(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
     bad = np.random.default_rng(3).random(SHAPE) < 0.2
     np.save(tmp_path / "bad.npy", bad)
     cv2.imwrite(str(tmp_path / "bad.png"), bad * np.uint8(255))
@@ -42,7 +42,7 @@ def test_a_picture_is_as_good_a_mask_as_an_array(source: MemorySource, correctio
         np.testing.assert_array_equal(corrected_source(source, corrections({"mask": {"file": name}})).valid, ~bad)
 
 
-def test_a_mask_is_of_the_size_at_its_place_of_the_list(refused: Callable, tmp_path: Path) -> None:
+def test_mask_must_have_the_size_at_its_place_of_the_list(refused: Callable, tmp_path: Path) -> None:
     np.save(tmp_path / "bad.npy", np.zeros((10, 6), bool))
     mask = {"mask": {"file": "bad.npy"}}
     file = tmp_path / "bad.npy"
@@ -52,7 +52,7 @@ def test_a_mask_is_of_the_size_at_its_place_of_the_list(refused: Callable, tmp_p
     )
 
 
-def test_files_that_are_no_masks_are_refused(refused: Callable, tmp_path: Path) -> None:
+def test_wrong_mask_files_are_refused(refused: Callable, tmp_path: Path) -> None:
     np.save(tmp_path / "rates.npy", np.zeros(SHAPE))
     np.savez(tmp_path / "dark.npz", rates=np.zeros(SHAPE))
     for name in ("text.npy", "text.png"):
@@ -78,7 +78,7 @@ def pattern_of(red: np.ndarray) -> np.ndarray:
     return np.where(red[..., None], np.uint8(RED), np.uint8(WHITE))
 
 
-def test_the_pixels_of_other_colours_are_masked(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
+def test_colour_filter_masks_other_colours(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
     red = np.random.default_rng(3).random(SHAPE) < 0.3
     np.save(tmp_path / "pattern.npy", pattern_of(red))
     cv2.imwrite(str(tmp_path / "pattern.png"), pattern_of(red)[..., ::-1])
@@ -92,7 +92,7 @@ def test_the_pixels_of_other_colours_are_masked(source: MemorySource, correction
         assert both.all()
 
 
-def test_filtered_pixels_are_the_mean_of_clear_ones_that_touch_them(
+def test_interpolated_pixels_are_the_mean_of_clear_neighbours(
     source: MemorySource, corrections: Callable, tmp_path: Path
 ) -> None:
     red = np.zeros(SHAPE, bool)
@@ -114,7 +114,7 @@ def test_filtered_pixels_are_the_mean_of_clear_ones_that_touch_them(
     assert summed[2, 3] == pytest.approx((beside + corners / 2) / 4)
 
 
-def test_filtered_pixels_without_a_clear_neighbour_are_masked(
+def test_interpolated_pixels_without_clear_neighbour_are_masked(
     source: MemorySource, corrections: Callable, tmp_path: Path
 ) -> None:
     red = np.zeros(SHAPE, bool)
@@ -126,7 +126,7 @@ def test_filtered_pixels_without_a_clear_neighbour_are_masked(
     np.testing.assert_array_equal(corrected_source(source, corrections({"colour-filter": keys})).valid, ~lonely)
 
 
-def test_unknown_colours_and_other_arrays_are_refused(refused: Callable, tmp_path: Path) -> None:
+def test_wrong_patterns_are_refused(refused: Callable, tmp_path: Path) -> None:
     pattern = pattern_of(np.zeros(SHAPE, bool))
     pattern[4, 5] = (255, 255, 0)
     np.save(tmp_path / "pattern.npy", pattern)

@@ -41,7 +41,7 @@ class TestCorrectedSource(SourceConformance):
     [[], [{"crop": {"rows": [2, None], "columns": [0, 8]}}], ["rot90", "flip-ud"], ["missing-row"], ["rot90", "rot270"]],
     ids=str,
 )
-def test_packed_frames_are_those_that_frames_gives(
+def test_packed_equals_packed_frames(
     written: list[Any], frames: np.ndarray, packed_source: type, corrections: Callable
 ) -> None:
     source = corrected_source(packed_source(frames), corrections(*written))
@@ -50,7 +50,9 @@ def test_packed_frames_are_those_that_frames_gives(
     np.testing.assert_array_equal(source.counts(SPAN), source.frames(SPAN).sum(axis=0))
 
 
-def test_it_has_what_the_source_has(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
+def test_corrected_source_has_optional_methods_only_where_they_apply(
+    frames: np.ndarray, corrections: Callable, tmp_path: Path
+) -> None:
     plain = corrected_source(MemorySource(frames), corrections("rot180"))
     assert not isinstance(plain, PackedSource)
     assert not isinstance(plain, LinearlyCorrectedSource)
@@ -59,7 +61,7 @@ def test_it_has_what_the_source_has(frames: np.ndarray, corrections: Callable, t
     assert isinstance(dark, LinearlyCorrectedSource)
 
 
-def test_masks_of_the_source_and_of_the_list_add_up_where_they_are_moved_to(
+def test_masks_of_source_and_corrections_are_combined_and_moved(
     frames: np.ndarray, corrections: Callable, tmp_path: Path
 ) -> None:
     valid, bad = np.ones(SHAPE, bool), np.zeros(SHAPE, bool)
@@ -71,7 +73,7 @@ def test_masks_of_the_source_and_of_the_list_add_up_where_they_are_moved_to(
         source.valid[0, 0] = False
 
 
-def test_what_leaves_no_pixel_is_refused(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
+def test_corrections_that_mask_all_pixels_are_refused(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
     half = np.zeros(SHAPE, bool)
     half[:6] = True
     np.save(tmp_path / "upper.npy", half)
@@ -82,7 +84,7 @@ def test_what_leaves_no_pixel_is_refused(frames: np.ndarray, corrections: Callab
     assert str(caught.value) == "mask leaves no pixel that may be used"
 
 
-def test_a_source_that_corrects_its_sums_is_refused(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
+def test_linearly_corrected_source_is_refused(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
     """What it takes out would be lost, as it is of the size of its own frames."""
     np.save(tmp_path / "dark.npy", np.zeros(SHAPE))
     once = corrected_source(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
@@ -90,7 +92,7 @@ def test_a_source_that_corrects_its_sums_is_refused(frames: np.ndarray, correcti
         corrected_source(once, corrections("rot90"))
 
 
-def test_close_closes_the_capture(frames: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_corrected_source_closes_the_source(frames: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
     monkeypatch.setattr(MemorySource, "close", lambda self: closed.append(self))
     with corrected_source(MemorySource(frames), ()):

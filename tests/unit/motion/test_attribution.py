@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, PluginError
+from photonpano import FrameSpan, InputError, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
 from photonpano.motion.attribution import AttributedTrajectory, attributed
 
 ORIGIN = "source 'toy' of toys 1.0"
@@ -36,10 +36,13 @@ def test_attributed_source_reads_what_the_source_reads(source: Any) -> None:
 
 
 def test_attributed_source_has_the_optional_methods_of_the_source(source: Any) -> None:
-    assert not isinstance(attributed(source, ORIGIN), PackedSource | LinearlyCorrectedSource)
+    assert not isinstance(attributed(source, ORIGIN), PackedSource | LinearlyCorrectedSource | KnowsTruth)
     source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
     source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
+    source.truth = lambda: {"scene": np.ones((4, 6))}
     named = attributed(source, ORIGIN)
+    assert isinstance(named, KnowsTruth)
+    assert set(named.truth()) == {"scene"}
     assert isinstance(named, PackedSource)
     assert isinstance(named, LinearlyCorrectedSource)
     np.testing.assert_array_equal(named.packed(SPAN), source.packed(SPAN))

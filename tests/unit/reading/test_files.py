@@ -11,7 +11,7 @@ from photonpano import FrameSpan, InputError
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, read_json
 
 
-def test_files_come_in_natural_order(tmp_path: Path) -> None:
+def test_files_in_returns_natural_order(tmp_path: Path) -> None:
     names = ["a2/f10.bin", "a2/f9.BIN", "a10/f1.bin", "f2.bin", "f0.bin", "f02.bin", "f10.bin"]
     for name in [*names, "a2/notes.txt", ".f1.bin", "a2/._f1.bin"]:
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -39,7 +39,7 @@ def open_files() -> int:
     return len(list(Path("/dev/fd").iterdir()))
 
 
-def test_few_of_many_files_are_open_at_a_time(source: PackedFileSource) -> None:
+def test_at_most_16_files_stay_open(source: PackedFileSource) -> None:
     before = open_files()
 
     def read(first: int) -> int:
@@ -54,7 +54,7 @@ def test_few_of_many_files_are_open_at_a_time(source: PackedFileSource) -> None:
     assert open_files() == before
 
 
-def test_a_file_that_is_gone_is_named(source: PackedFileSource, tmp_path: Path) -> None:
+def test_missing_file_is_named_when_read(source: PackedFileSource, tmp_path: Path) -> None:
     (tmp_path / "7.bin").unlink()
     source.counts(FrameSpan(0, 14))
     with pytest.raises(InputError) as caught:
@@ -74,7 +74,7 @@ class Size(BaseModel):
         (b"\xff", " is wrong: Invalid JSON: "),
     ],
 )
-def test_json_that_says_something_else(tmp_path: Path, content: bytes, message: str) -> None:
+def test_read_json_refuses_what_does_not_fit_the_model(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "size.json"
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
