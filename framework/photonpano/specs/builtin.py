@@ -174,7 +174,7 @@ def first_with_fallbacks(section: dict[str, Any], where: str, spec: WrittenSpec)
     """Rewrite a section that uses `chain-of-backends` into one that uses the first, and has the others as its fallbacks."""
     keys = section.get("with")
     if section.get("fallback"):
-        spec.wrong_key(f"{where}.fallback", "a chain has its fallbacks among its backends")
+        spec.wrong_key(f"{where}.fallback", "a chain cannot have a fallback; add the locator to its backends")
     validate(ChainConfig, keys, f"{where}.with", spec)
     backends = keys.get("backends") if isinstance(keys, dict) else None
     items = f"{where}.with.backends"
@@ -186,7 +186,7 @@ def first_with_fallbacks(section: dict[str, Any], where: str, spec: WrittenSpec)
     first, *others = backends
     chosen = {"use": first} if isinstance(first, str) else {"use": None} | first
     if "fallback" in chosen:
-        message = "a locator of a chain has no fallback; list all of them, in the order in which they are tried"
+        message = "a locator of a chain cannot have a fallback; list all of them, in the order in which they are tried"
         spec.wrong_key(f"{items}.0.fallback", message)
     moved = {f"{where}.use": spec.place(f"{items}.0")} if isinstance(first, str) else {}
     moved |= spec.places_under(f"{items}.0", where)

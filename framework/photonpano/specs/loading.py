@@ -114,7 +114,7 @@ def _read(path: Path) -> str:
         problem = Problem("", f"cannot be read: {error.strerror}", path)
     else:
         if len(data) > MAX_BYTES:
-            raise SpecError([Problem("", f"no spec: longer than {MAX_BYTES} bytes", path)])
+            raise SpecError([Problem("", f"not a spec: longer than {MAX_BYTES} bytes", path)])
         try:
             return data.decode("utf-8-sig")
         except UnicodeDecodeError as error:

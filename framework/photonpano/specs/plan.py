@@ -60,18 +60,18 @@ class Plan:
 
     Attributes:
         source: the capture.
-        corrections: what is done to its frames before anything else, in order.
+        corrections: the corrections of its frames, in order.
         levels: one plan for each level, in order.
-        until_converged: the loop ends once the motion has settled, at the latest after the last of `levels`, all of them alike.
-        graph: which pairs are registered, and what happens when the graph falls apart.
+        until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
+        graph: which pairs are registered, and what happens when the graph is disconnected.
         render: the panorama.
         output: the run folder.
         run: seed, threads, memory.
         document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
-        places: where each value of the spec was written, by its path, for messages that come up later.
+        places: the place of each value that was written, by its path in `document`, for later messages: see `place`.
         file: the spec file, None for a spec that was built in Python.
         observers: the plugins that watch the run.
-        decisions: what the spec leaves open, and reading it has decided: which source recognises the capture.
+        decisions: choices that the spec leaves open and that reading it made: the source that recognises the capture.
     """
 
     source: Choice

@@ -28,9 +28,9 @@ VERSION = 1
 LEVELS = 3
 MAX_LEVELS = 8
 UNTIL_CONVERGED = "until-converged"
-"""Instead of a number of levels: as many as it takes, `MAX_LEVELS` at most."""
+"""Instead of a number of levels: as many as the motion needs to converge, `MAX_LEVELS` at most."""
 DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "direct", "interpolate": "smoothing-spline"}
-"""The components of a spec that does not choose."""
+"""The components that a spec uses by default."""
 DEFAULT_FALLBACK = "opencv-sift"
 """The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks."""
 KIND_OF = {kind.section: kind for kind in KINDS.values()}
@@ -81,7 +81,7 @@ def resolve(spec: WrittenSpec) -> Plan:
 
 
 def _order(problem: Problem) -> tuple[bool, int, int]:
-    """Order by line; what concerns the whole file comes first, what an override brought in comes last."""
+    """Order problems by line; those of the whole file come first, those of overrides last."""
     return problem.file is None and problem.line is None, problem.line or 0, problem.column or 0
 
 
@@ -248,7 +248,7 @@ class _Resolver:
         if self.is_alias(kind, item, where):
             return None
         if "fallback" in item:
-            message = "a fallback has none of its own; list all of them, in the order in which they are tried"
+            message = "a fallback cannot have a fallback; list all of them, in the order in which they are tried"
             spec.wrong_key(f"{where}.fallback", message)
         spec.check_keys(item, where, ("use", "with", "fallback"), below=self.keys_of(kind, item.get("use")))
         return self.component(kind, item, where)
@@ -301,7 +301,7 @@ class _Resolver:
         name = section.get("use")
         found = self.alias(kind, name) is not None
         if found:
-            self.spec.wrong_key(where, f"{name!r} is no part of a chain and no fallback; list the {kind.name}s themselves")
+            self.spec.wrong_key(where, f"{name!r} cannot be part of a chain or a fallback; list the {kind.name}s themselves")
         return found
 
     def levels(self, data: Any) -> list[Any]:

@@ -57,7 +57,7 @@ class WrittenSpec:
         remark: added to the message of every problem.
         directory: what relative paths count from.
         catalog: what can be chosen.
-        decisions: what the spec leaves open and reading it has decided.
+        decisions: choices that the spec leaves open and that reading it made.
     """
 
     data: Any

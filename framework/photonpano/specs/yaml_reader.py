@@ -57,9 +57,9 @@ def read_yaml(text: str, place: Place) -> WrittenSpec:
     except YAMLError as error:
         problems.append(place.problem(f"not valid YAML: {error}"))
     except _TooLongError:
-        problems.append(place.problem(f"no spec: with its aliases repeated it has more than {MAX_VALUES} values"))
+        problems.append(place.problem(f"not a spec: with its aliases expanded it has more than {MAX_VALUES} values"))
     except RecursionError:
-        problems.append(place.problem("no spec: nested too deeply"))
+        problems.append(place.problem("not a spec: nested too deeply"))
     return reader.spec
 
 
@@ -105,7 +105,7 @@ class _Reader:
         if not self.is_known(node, where, "map", "seq"):
             return None
         if id(node) in self.open:
-            self.unreadable(where, "an alias stands inside what it repeats")
+            self.unreadable(where, "an alias inside the value that it repeats")
             return None
         self.open.add(id(node))
         try:
@@ -147,7 +147,7 @@ class _Reader:
         place = self.spec.places[where]
         for source in reversed([node] if isinstance(node, MappingNode) else node.value):
             if not isinstance(source, MappingNode):
-                self.report(node, where, "<< merges mappings, got something else")
+                self.report(node, where, "<< merges mappings, expected a mapping or a list of mappings")
                 return {}
             content |= self.value(source, where) or {}
         self.spec.places[where] = place

@@ -197,9 +197,9 @@ def test_load_spec_of_other_file_is_an_error(catalog, tmp_path, monkeypatch):
     assert told == {
         "missing.yaml": "missing.yaml: there is no such file",
         "folder.yaml": "folder.yaml: this is a folder, expected a spec in YAML",
-        "long.yaml": "long.yaml: no spec: longer than 1048576 bytes",
+        "long.yaml": "long.yaml: not a spec: longer than 1048576 bytes",
         "null.yaml": "null.yaml:2:1: the spec is empty; it needs at least `version` and `source`",
-        "deep.yaml": "deep.yaml: no spec: nested too deeply",
+        "deep.yaml": "deep.yaml: not a spec: nested too deeply",
         "utf16.yaml": "utf16.yaml:1:2: not valid YAML: special characters are not allowed, got the character 0x00",
         "bom16.yaml": "bom16.yaml:1:1: not UTF-8 text, got the byte 0xff; save the file as UTF-8",
     }
