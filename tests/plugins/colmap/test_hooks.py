@@ -1,4 +1,4 @@
-"""What is told of the plugin where its library is missing."""
+"""How the plugin is listed without its library."""
 
 from __future__ import annotations
 

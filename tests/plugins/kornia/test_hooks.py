@@ -1,4 +1,4 @@
-"""What is told of the plugin, whether its libraries are installed or not."""
+"""How the plugin is listed, with and without its libraries."""
 
 from __future__ import annotations
 

@@ -25,14 +25,14 @@ def test_pyramid_is_finest_first_and_ends_above_smallest_side(seen_from: Callabl
 def test_ecc_locates_pair_of_different_brightness_with_less_certainty(seen_from: Callable) -> None:
     """The correlation coefficient does not depend on brightness; the expected error does."""
     true = translation(10, -3)
-    alike, dimmed = (
+    equal, dimmed = (
         LOCATOR.register(LOCATOR.describe(seen_from(true, 1)), LOCATOR.describe(seen_from(STILL, 2, brightness)), None)
         for brightness in (1.0, 0.7)
     )
-    for motion in (alike, dimmed):
+    for motion in (equal, dimmed):
         assert isinstance(motion, Located), motion
         assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
-    assert dimmed.residual_px > 2 * alike.residual_px
+    assert dimmed.residual_px > 2 * equal.residual_px
 
 
 def test_ecc_skips_layers_that_fail(seen_from: Callable, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,8 +91,8 @@ def test_misalignment_lowers_information(seen_from: Callable) -> None:
 def test_pair_of_different_places_is_rejected_for_similarity(seen_from: Callable, brightness: float) -> None:
     failure = judged(seen_from(translation(0, 330), 1, brightness), seen_from(STILL, 2, brightness), STILL)
     assert isinstance(failure, NotLocated)
-    alike = failure.evidence["similarity"]
-    assert failure.reason == f"after alignment the similarity of the images is {alike:.2f}, less than min_agreement = 0.5"
+    similarity = failure.evidence["similarity"]
+    assert failure.reason == f"after alignment the similarity of the images is {similarity:.2f}, less than min_agreement = 0.5"
 
 
 def test_pair_of_noise_is_rejected(photograph: Callable) -> None:
