@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
+from photonpano.compiling import compiled
 from photonpano.reading import OpenFiles, missing_file
 from photonpano_sensors.intensity.cih import Header, read_header
 from photonpano_sensors.intensity.configs import FastcamMrawConfig
 from photonpano_sensors.intensity.recognition import header_beside, mraw_beside, refuse_mdat
-from photonpano_sensors.intensity.source import IntensitySource
-from photonpano_sensors.intensity.summing import Levels, unpack_12_bits
+from photonpano_sensors.intensity.source import IntensitySource, Levels
 
 
 class FastcamMrawSource(IntensitySource):
@@ -40,7 +41,7 @@ class FastcamMrawSource(IntensitySource):
             return
         packed = np.empty(len(span) * frame_bytes, np.uint8)
         self._files.read(self._path, position, packed)
-        unpack_12_bits(packed, flat.view(np.uint16))
+        _unpack_12_bits(packed, flat.view(np.uint16))
 
 
 def open_recording(path: Path) -> tuple[Path, Header]:
@@ -78,3 +79,12 @@ def open_recording(path: Path) -> tuple[Path, Header]:
             f"{header_path.name} promises, are {needed} bytes, the file has {size}; copy or record it again"
         )
     return mraw, header
+
+
+@compiled
+def _unpack_12_bits(packed: NDArray[np.uint8], levels: NDArray[np.uint16]) -> None:
+    """Unpack two levels from every three bytes, the higher bits first: (3 n,) to (2 n,)."""
+    for pair in range(len(levels) // 2):
+        first, middle, last = packed[3 * pair], packed[3 * pair + 1], packed[3 * pair + 2]
+        levels[2 * pair] = np.uint16(first) << 4 | np.uint16(middle) >> 4
+        levels[2 * pair + 1] = (np.uint16(middle) & 15) << 8 | np.uint16(last)

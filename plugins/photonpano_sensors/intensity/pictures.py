@@ -18,8 +18,7 @@ from photonpano.reading import missing_file, read_picture, reading
 from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import pictures_in
-from photonpano_sensors.intensity.source import IntensitySource
-from photonpano_sensors.intensity.summing import Levels
+from photonpano_sensors.intensity.source import IntensitySource, Levels
 
 Image = NDArray[np.generic]
 

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, StreamInfo
+from photonpano.compiling import compiled
 from photonpano.reading import Closing
 from photonpano_sensors.intensity.configs import IntensityConfig
 from photonpano_sensors.intensity.levels import Encoding, linear_levels
-from photonpano_sensors.intensity.summing import Levels, add_levels, add_linear
+
+Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PART_BYTES = 4 * 1024**2
 """Bytes of the frames that are read at once for a sum."""
 _MOST_COUNT = 2**32 - 1
+_BLOCK_PIXELS = 4096
+"""Pixels summed at once: their sums stay in the L1 cache."""
 
 
 class IntensitySource(Closing, ABC):
@@ -77,9 +82,9 @@ class IntensitySource(Closing, ABC):
             levels = self._levels_of(block)
             flat = levels.reshape(len(levels), -1)
             if self._table is None:
-                add_levels(flat, counts.reshape(-1))
+                _add_levels(flat, counts.reshape(-1))
             else:
-                add_linear(flat, self._table, counts.reshape(-1))
+                _add_linear(flat, self._table, counts.reshape(-1))
         return counts
 
     def _levels_of(self, span: FrameSpan) -> Levels:
@@ -87,3 +92,25 @@ class IntensitySource(Closing, ABC):
         levels: Levels = np.empty(shape, np.uint8) if self._one_byte else np.empty(shape, np.uint16)
         self._read(span, levels)
         return levels
+
+
+@compiled
+def _add_levels(frames: Levels, total: NDArray[np.uint32]) -> None:
+    """Add frames, (n, N) levels, to the sums of their pixels, (N,)."""
+    for start in range(0, len(total), _BLOCK_PIXELS):
+        block = total[start : start + _BLOCK_PIXELS]
+        for index in range(len(frames)):
+            levels = frames[index, start : start + _BLOCK_PIXELS]
+            for pixel in range(len(block)):
+                block[pixel] += np.uint32(levels[pixel])
+
+
+@compiled
+def _add_linear(frames: Levels, table: NDArray[np.uint16], total: NDArray[np.uint32]) -> None:
+    """Add the values of a table for the levels of frames."""
+    for start in range(0, len(total), _BLOCK_PIXELS):
+        block = total[start : start + _BLOCK_PIXELS]
+        for index in range(len(frames)):
+            levels = frames[index, start : start + _BLOCK_PIXELS]
+            for pixel in range(len(block)):
+                block[pixel] += np.uint32(table[levels[pixel]])

@@ -16,8 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from photonpano_sensors.intensity import video_index
-from photonpano_sensors.intensity.decoding import DecodedFrames
-from photonpano_sensors.intensity.video import VideoSource
+from photonpano_sensors.intensity.video import DecodedFrames, VideoSource
 from photonpano_sensors.intensity.video_index import index_of, open_video
 
 
