@@ -1,4 +1,4 @@
-"""The components of this plugin keep what every component of their kinds promises."""
+"""Conformance tests of the components of this plugin."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_choose_group_size_keeps_sixteen_frames_for_fast_motion() -> None:
 
 
 def test_choose_group_size_allows_single_grey_frames() -> None:
-    """At 500 frames a second the image may move by tens of px from one to the next."""
+    """At 500 frames per second the image may move by tens of px per frame."""
     assert choice(20, 10.0, shortest=1)[0] == 4
     assert choice(2000, 100.0, shortest=1) == (
         1,
@@ -130,7 +130,7 @@ def test_auto_resampler_doubles_groups_of_dim_capture_from_level_3() -> None:
 
 @pytest.mark.parametrize("name", ["constant-groups", "sliding-window"])
 def test_auto_resampler_never_doubles_groups_that_get_no_denser(name: str) -> None:
-    """Longer ones would be fewer, or other ones than at the levels before."""
+    """Their number, or their positions, would differ from those of the levels before."""
     resampler = built(StreamInfo(2000, 254, 496, None), name, capture=lambda: CaptureSummary(0.05, 0.381, HOW))
     assert resampler.groups(2000, 3) == resampler.groups(2000, 1)
     assert {len(group.span) for group in resampler.groups(2000, 3)} == {100}

@@ -1,4 +1,4 @@
-"""What all interpolators have in common."""
+"""Properties that all interpolators share."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_interpolators_pass_through_every_knot(name, gaps, seed, fit, motions):
 @few
 @given(gaps=gaps, seed=seeds)
 def test_group_interpolators_do_not_depend_on_reference_plane(name, gaps, seed, fit, motions):
-    """What is seen from another plane G is G H(t), also beyond the knots."""
+    """In another reference plane G the curve is G H(t), also beyond the knots."""
     instants, (plane, *knots) = np.cumsum(gaps), motions(len(gaps) + 1, seed)
     frames = np.linspace(instants[0] - 100, instants[-1] + 100, 50)
     here = fit(name, instants, np.array(knots)).at(frames)
@@ -60,7 +60,7 @@ def test_interpolators_return_still_camera_for_one_knot(name, fit):
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("n_knots", [2, 3, 4, 5, 12])
 def test_extrapolation_holds_velocity_then_stops(name, n_knots, fit):
-    """By default for twice the mean distance of the knots: 200 frames, here at half a pixel a frame."""
+    """By default for twice the mean distance of the knots: 200 frames, here at 0.5 px per frame."""
     instants = 100.0 * np.arange(1, n_knots + 1)
     trajectory = fit(name, instants, np.stack([translation(0.5 * frame, 0) for frame in instants]))
     end = instants[-1]

@@ -10,13 +10,13 @@ FRAME_SHAPE = (254, 496)
 
 
 def path(frames: np.ndarray) -> np.ndarray:
-    """Rotation vectors of a camera that looks around, and is rolled by much."""
+    """Rotation vectors of a camera that pans, tilts and rolls by much."""
     t = np.asarray(frames) / 1000
     return np.stack([0.1 * np.sin(5 * t), 0.15 * np.cos(4 * t), np.sin(3 * t)], axis=1)
 
 
 def test_lie_is_exact_for_rotation_about_any_axis(fit, turning):
-    """Also where the angle is a cubic of time, as it is for a cubic spline."""
+    """The angle is a cubic of time, which a cubic spline reproduces."""
     instants, frames = np.array([0.0, 130, 200, 430, 500, 610]), np.linspace(0, 610, 40)
     axis = np.array([-0.1, 0.3, 0.9])
 

@@ -6,7 +6,7 @@ import pytest
 from photonpano.geometry import from_parameters, translation
 
 SIZES = np.array([1e-2, 1e-2, 1e-2, 1e-2, 100, 100, 1e-5, 1e-5])
-"""What the eight parameters come to, roughly."""
+"""Typical sizes of the eight parameters."""
 
 
 @pytest.mark.parametrize(("n_knots", "degree"), [(1, 0), (2, 1), (3, 2), (4, 3), (9, 3)])
@@ -24,7 +24,7 @@ def test_lucas_kanade_reproduces_polynomials_up_to_degree_of_knots(n_knots, degr
 
 
 def test_lucas_kanade_extrapolates_velocity_at_last_knot(fit):
-    """A parabola x = t^2 / 100 moves by 2 px a frame at 100."""
+    """A parabola x = t^2 / 100 moves by 2 px per frame at t = 100."""
     instants = np.array([0.0, 50, 100])
     trajectory = fit("lucas-kanade", instants, np.stack([translation(frame**2 / 100, 0) for frame in instants]), hold_frames=10)
     np.testing.assert_allclose(trajectory.at([105, 110, 111])[:, 0, 2], [110, 120, 120])

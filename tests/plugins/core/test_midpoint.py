@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano import FrameSpan, Group, InputError, StreamInfo
+from photonpano import FrameSpan, Group
 from photonpano_core.configs import MidpointConfig
-from photonpano_core.hooks import photonpano_resamplers
 from photonpano_core.midpoint import MidpointResampler
 
 
@@ -85,20 +84,3 @@ def test_midpoint_level_1_has_as_many_disjoint_groups_as_fit(group_size: int, co
     found = groups(group_size * count + rest % group_size, 1, group_size)
     assert len(found) == count
     assert all(earlier.span.stop <= later.span.start for earlier, later in pairwise(found))
-
-
-TOO_SHORT = (
-    "the capture has 99 frames, fewer than one group of 100; set group_size to 24 or less, so that at least four groups fit"
-)
-
-
-def test_midpoint_refuses_capture_shorter_than_a_group() -> None:
-    with pytest.raises(InputError) as caught:
-        groups(99, 1)
-    assert str(caught.value) == TOO_SHORT
-
-
-def test_check_refuses_capture_shorter_than_a_group() -> None:
-    (contribution,) = (each for each in photonpano_resamplers() if each.name == "midpoint")
-    assert contribution.check(MidpointConfig(group_size=100), StreamInfo(99, 8, 8, None)) == [TOO_SHORT]
-    assert contribution.check(MidpointConfig(group_size=100), StreamInfo(100, 8, 8, None)) == []

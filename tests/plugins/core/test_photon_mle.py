@@ -18,7 +18,7 @@ SPEED_PX = 0.25
 
 @pytest.fixture(scope="module")
 def scene() -> np.ndarray:
-    """(40, 80) of stripes, 8 px wide."""
+    """(40, 80) stripes, 8 px wide."""
     return np.tile(np.where(np.arange(80) // 8 % 2, 0.9, 0.2), (40, 1))
 
 
@@ -65,7 +65,7 @@ def test_photon_mle_sharpens_edges_along_known_motion(panning: Source, scene: np
 
 
 def test_photon_mle_warps_relative_to_reference_instant(panning: Source, pan: Callable) -> None:
-    """A camera that stands far away on the plane, or a plane that is turned, gives the same exposure."""
+    """A translation of the reference plane does not change the exposure."""
     motion = pan(SPEED_PX)
     there = type(motion)(lambda frame: translation(5000, -300) @ motion.at([frame])[0])
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""The resamplers beside midpoint: what they share, and what each is for."""
+"""Checks that all resamplers share, and the groups of those other than midpoint."""
 
 from __future__ import annotations
 
@@ -49,13 +49,14 @@ TOO_SHORT = (
 )
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["midpoint", *NAMES])
 def test_resamplers_refuse_capture_shorter_than_a_group(name: str) -> None:
     with pytest.raises(InputError) as caught:
         groups(name, 99)
     assert str(caught.value) == TOO_SHORT
     contribution = CONTRIBUTIONS[name]
     assert contribution.check(contribution.config(group_size=100), StreamInfo(99, 8, 8, None)) == [TOO_SHORT]
+    assert contribution.check(contribution.config(group_size=100), StreamInfo(100, 8, 8, None)) == []
 
 
 @pytest.mark.parametrize("level", [1, 2, 5])
@@ -76,7 +77,7 @@ def test_sliding_window_steps_by_step_frames_or_slightly_less() -> None:
 
 
 def test_sliding_window_step_shrink_adds_groups_per_level() -> None:
-    """With a step of a group that is halved, they are those of midpoint without its ends."""
+    """With half the step at each level, they equal those of midpoint without its ends."""
     for level in (1, 2, 3, 4):
         found = groups("sliding-window", 1000, level, step_frames=100, step_shrink=2)
         assert found == midpoint(1000, level, endpoints=False)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from photonpano_core.sl3 import exponential, logarithm, unimodular
 
 PIXELS = np.array([[1, 1, 300], [1, 1, 300], [1 / 300, 1 / 300, 1]])
-"""Sizes of the entries of a matrix that maps pixels of an image of 300 px."""
+"""Typical sizes of the entries of a matrix that maps pixels of an image of 300 px."""
 
 
 def matrices(size: float) -> np.ndarray:

@@ -10,7 +10,7 @@ FRAME_SHAPE = (254, 496)
 
 
 def parabola(frames: np.ndarray) -> np.ndarray:
-    """A motion that needs no more than three numbers for each parameter."""
+    """A motion that is a parabola in each parameter."""
     t = np.asarray(frames)[:, None] / 3000
     start = np.array([1e-2, 2e-2, -1e-2, 1e-2, 200, -50, 1e-5, 2e-5])
     return from_parameters(start * (t - 0.7 * np.array([1, -1, 2, 1, 0.5, 3, 1, -2]) * t**2))
@@ -40,7 +40,7 @@ def rms_px(trajectory: Trajectory, truth: np.ndarray, frames: np.ndarray) -> flo
 
 
 def test_smoothing_spline_reduces_noise_on_parabola_to_its_fit(fit):
-    """Three of N numbers: the error falls by sqrt(N / 3), or a little less, since a slight curve might be one."""
+    """The fit has three parameters for N knots: the error falls by sqrt(N / 3), or slightly less."""
     instants = np.arange(80) * 40.0
     truth = parabola(instants)
     left = []
@@ -53,7 +53,7 @@ def test_smoothing_spline_reduces_noise_on_parabola_to_its_fit(fit):
 
 
 def test_smoothing_spline_weights_knots_by_information(fit):
-    """Every second knot is ten times worse: by themselves the good ones give sqrt(3 / 40) of their error."""
+    """Every second knot is ten times worse; the good ones alone give sqrt(3 / 40) of their error."""
     instants = np.arange(80) * 40.0
     truth = parabola(instants)
     std = np.where(np.arange(80)[:, None] % 2, [1.0] * 8, 0.1)
@@ -102,7 +102,7 @@ def test_smoothing_spline_does_not_depend_on_scale_of_information(fit):
 
 
 def shaken(frames: np.ndarray, period: float) -> np.ndarray:
-    """Rotation vectors of a slow sweep, in a hand that shakes by about 2 px."""
+    """Rotation vectors of a slow sweep, with a tremor of about 2 px."""
     phases = 2 * np.pi * np.asarray(frames) / period
     sweep = np.asarray(frames) / 4000
     shake = np.stack([np.sin(phases), np.sin(0.83 * phases + 1), np.sin(1.1 * phases + 2)], axis=1) / 750
@@ -146,7 +146,7 @@ def test_smoothing_spline_of_still_camera_stands_still(fit):
 
 
 def test_smoothing_spline_accounts_for_uneven_knots(fit):
-    """Knots in pairs, with gaps between the pairs, as at the ends of a level, and where exposures were lost."""
+    """Knots in pairs with gaps in between, as at the ends of a level, and where exposures were lost."""
     instants = np.cumsum(np.tile([5.0, 95.0], 30))
     truth = parabola(instants)
     left = [rms_px(fit("smoothing-spline", instants, noisy(truth, 0.3, seed)), truth, instants) for seed in range(3)]

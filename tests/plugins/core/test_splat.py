@@ -29,7 +29,7 @@ def rigid(pan: Callable) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def turning(known_motion: type) -> Trajectory:
-    """A camera that turns, comes nearer, and tilts: neighbours no longer land a pixel apart."""
+    """A camera that rolls, zooms and tilts, so that pixels are no longer 1 px apart."""
 
     def at(frame: float) -> np.ndarray:
         cosine, sine = np.cos(0.02 * frame), np.sin(0.02 * frame)
@@ -40,7 +40,7 @@ def turning(known_motion: type) -> Trajectory:
 
 
 def dense(frame: np.ndarray, to_grid: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Splat a frame pixel by pixel, in the words of the definition: each grid pixel takes a tent of what lands near it."""
+    """Splat a frame by the definition: each pixel of the grid sums nearby photons with tent weights."""
     y, x = np.mgrid[: frame.shape[0], : frame.shape[1]]
     u, v, depth = np.einsum("ij,jyx->iyx", to_grid, np.array([x, y, np.ones_like(x)], dtype=float))
     worth = frame * np.linalg.det(to_grid) / depth**3
@@ -91,7 +91,7 @@ def test_splat_equals_adjoint_of_interpolation(
 
 
 def test_splat_skips_weights_for_nearly_rigid_motion(memory_source: type, frames: np.ndarray, known_motion: type) -> None:
-    """The shortcut errs by less than a hundredth of a frame in twenty, and only at the border."""
+    """The error of the shortcut is below 0.01 of 20 frames, and only at the border."""
     motion = known_motion(
         lambda t: np.array([[1 + 2e-4 * t, -3e-4 * t, 0.3 * t], [3e-4 * t, 1 + 1e-4 * t, 0.2 * t], [1e-6 * t, 0, 1]])
     )
@@ -116,7 +116,7 @@ class Intensities:
 @pytest.mark.parametrize("scale", [1.0, 2.0, 0.6])
 @pytest.mark.parametrize("motion", ["rigid", "turning"])
 def test_splat_keeps_flat_scene_flat(memory_source: type, motion: str, scale: float, request: pytest.FixtureRequest) -> None:
-    """However densely pixels land, beside masks and at the border."""
+    """For any density of pixels, also beside masks and at the border."""
     source = memory_source(np.ones((N, HEIGHT, WIDTH), np.uint8), some_masked())
     source.response = Intensities()
     exposure = SplatMerger().merge(source, GROUP, request.getfixturevalue(motion), scale)
@@ -180,7 +180,7 @@ def test_splat_ignores_frames_behind_camera_or_off_grid(memory_source: type, fra
 
 
 def test_splat_refuses_source_with_corrected_sums() -> None:
-    """At the first level already, where nothing is splatted yet."""
+    """Also at the first level, where frames are not splatted."""
     source: Any = MemorySource(np.zeros((10, 8, 8)))
     source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
     for trajectory in (None, KnownMotion(lambda _: np.eye(3))):

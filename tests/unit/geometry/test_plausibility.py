@@ -12,7 +12,7 @@ SHAPE = (101, 201)
 
 
 def about_centre(matrix: np.ndarray) -> np.ndarray:
-    """Let a map act about the centre of the image."""
+    """Return a map that acts about the centre of the image."""
     return normalised(translation(100, 50) @ matrix @ translation(-100, -50))
 
 

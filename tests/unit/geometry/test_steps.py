@@ -1,4 +1,4 @@
-"""Small changes of a homography: derivatives against differences."""
+"""Derivatives of homographies, compared with finite differences."""
 
 import numpy as np
 import pytest

@@ -64,7 +64,7 @@ def test_accumulate_keeps_visible_half_of_frame(memory_source: type) -> None:
 
 
 def test_accumulate_interpolates_counts_and_weight_alike(memory_source: type) -> None:
-    """Half a pixel on, every pixel is the mean of two; at the border half a frame is missing."""
+    """Shifted by 0.5 px, every pixel is the mean of two; at the border half of the weight is missing."""
     source = memory_source(frames_of(FLUX, 50))
     photons = accumulate(source, still(50, translation(0.5, 0)), np.eye(3), SHAPE)
     counts = source.counts(FrameSpan(0, 50)).astype(float)
@@ -74,7 +74,7 @@ def test_accumulate_interpolates_counts_and_weight_alike(memory_source: type) ->
 
 
 def test_accumulate_misplaces_chunks_by_less_than_tolerance(memory_source: type, known_motion: type) -> None:
-    """Frames of a scene that is smooth: misplaced by at most d px, a count errs by d times its slope."""
+    """In a smooth scene, a displacement by d px changes a count by d times its gradient."""
     n, tolerance_px = 80, 0.5
     motion = known_motion(lambda frame: from_parameters(np.array([1e-4, 5e-4, -5e-4, 0, 0.11, 0.05, 1e-6, 0]) * frame))
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -101,7 +101,7 @@ def test_accumulate_misplaces_chunks_by_less_than_tolerance(memory_source: type,
 
 
 def test_estimate_of_panned_bernoulli_frames_is_unbiased(memory_source: type, pan: Callable) -> None:
-    """The mean over P pixels of n frames errs by sqrt((exp(f) - 1) / (n P)), wherever the camera looks."""
+    """The standard error of the mean over P pixels of n frames is sqrt((exp(f) - 1) / (n P))."""
     n = 200
     source = memory_source(frames_of(FLUX, n))
     chunks = chunks_of(FrameSpan(0, n), pan(0.013), SHAPE, 0.25)
@@ -123,7 +123,7 @@ def test_estimate_of_still_capture_has_photon_noise(memory_source: type) -> None
 
 @pytest.fixture
 def masked(memory_source: type) -> object:
-    """A capture with one pixel that is always lit, and is masked."""
+    """A capture with one hot pixel, which is masked."""
     frames = frames_of(FLUX, 200)
     frames[:, 10, 20] = True
     valid = np.ones(SHAPE, bool)
@@ -149,7 +149,7 @@ def test_accumulate_fills_masked_pixel_from_moved_frames(masked, pan: Callable) 
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
 def test_accumulate_preserves_photons_on_coarser_grid(memory_source: type, factor: int) -> None:
-    """Of 30x40 px, 3 and 5 do not divide all sides: what is missing of the last pixels is unseen, not dark."""
+    """3 and 5 do not divide both sides of 30x40 px: the missing part of the last pixels is unseen, not dark."""
     source = memory_source(frames_of(FLUX, 50))
     grid = (-(-SHAPE[0] // factor), -(-SHAPE[1] // factor))
     photons = accumulate(source, still(50), rescaling(1 / factor), grid)
@@ -167,7 +167,7 @@ def test_accumulate_averages_four_pixels_at_half_scale(memory_source: type) -> N
 
 
 def test_accumulate_weight_is_number_of_frames(memory_source: type, pan: Callable) -> None:
-    """A pan of one pixel a frame over 40 px: column c of the plane is seen in min(c, 39) + 1 of the first 60 frames."""
+    """A pan of 1 px per frame over 40 px: column c of the plane is seen in min(c, 39) + 1 of the first 60 frames."""
     source = memory_source(frames_of(FLUX, 60))
     chunks = chunks_of(FrameSpan(0, 60), pan(1), SHAPE, 0.25)
     photons = accumulate(source, chunks, np.eye(3), (30, 60))
@@ -183,7 +183,7 @@ def test_estimate_is_nan_below_one_frame() -> None:
 
 @pytest.mark.parametrize("shift_px", [0.01, 0.1, 1 / 64])
 def test_accumulate_is_exact_for_shifts_below_opencv_4_rounding(memory_source: type, shift_px: float) -> None:
-    """OpenCV 4 rounds bilinear coordinates to 1/32 px: there, 0.01 px would do nothing at all."""
+    """OpenCV 4 rounds bilinear coordinates to 1/32 px, so that 0.01 px would have no effect."""
     ramp = np.arange(100)[:, None, None] < np.arange(SHAPE[1])  # column x is lit in x of 100 frames
     source = memory_source(np.broadcast_to(ramp, (100, *SHAPE)))
     photons = accumulate(source, still(100, translation(shift_px, 0)), np.eye(3), SHAPE)
@@ -192,7 +192,7 @@ def test_accumulate_is_exact_for_shifts_below_opencv_4_rounding(memory_source: t
 
 
 class Halved(MemorySource):
-    """A source whose sums count twice."""
+    """A source whose correction halves sums and subtracts an offset."""
 
     def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
         assert counts.dtype == np.uint32
@@ -201,7 +201,7 @@ class Halved(MemorySource):
 
 @pytest.mark.parametrize("scale", [1, 0.5])
 def test_accumulate_corrects_each_chunk_once(scale: float) -> None:
-    """Whether the sums are the source's or are shared, and before pixels are masked and averaged."""
+    """Sums are corrected before pixels are masked and averaged, also if they come from a cache."""
     frames = frames_of(FLUX, 50)
     valid = np.random.default_rng(0).random(SHAPE) > 0.1
     halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]

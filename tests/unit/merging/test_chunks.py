@@ -33,7 +33,7 @@ def test_chunks_of_fast_camera_has_one_frame_each(pan: Callable) -> None:
 
 @pytest.mark.parametrize("zoom", [0.5, 2.0])
 def test_chunks_of_measures_tolerance_in_frame_pixels(known_motion: type, zoom: float) -> None:
-    """A camera whose pixels look small on the plane moves as many of its own."""
+    """The number of chunks does not depend on the scale of the reference plane."""
     motion = known_motion(lambda frame: np.diag([zoom, zoom, 1.0]) @ translation(0.125 * frame, 0))
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 8), motion, SHAPE, 0.5)] == [4, 4]
 

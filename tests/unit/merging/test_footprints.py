@@ -1,4 +1,4 @@
-"""Where frames land on a grid."""
+"""Footprints of frames on a grid."""
 
 import numpy as np
 import pytest

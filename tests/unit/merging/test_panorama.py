@@ -20,7 +20,7 @@ GIB = 1024**3
 
 
 def test_plan_canvas_holds_frames_of_span_only(pan: Callable) -> None:
-    """At 2 px a frame, frames 10 to 19 span 18 px and a frame."""
+    """At 2 px per frame, frames 10 to 19 span 18 px and a frame."""
     canvas = plan_canvas(pan(2), FrameSpan(10, 20), SHAPE, 1.0, GIB)
     assert canvas.shape == (30, 40 + 18)
     np.testing.assert_array_equal(canvas.transform, translation(-20, 0))
@@ -180,7 +180,7 @@ def test_render_reports_progress_of_every_frame(panning: Any, pan: Callable) -> 
 
 
 def test_render_takes_no_more_memory_than_predicted(memory_source: type, pan: Callable) -> None:
-    """A still camera at a scale that makes 2.4 megapixels of every frame: what is held at the same time at most."""
+    """Peak memory for a still camera, at a scale of 2.4 megapixels a frame."""
     source = memory_source(np.random.default_rng(0).random((4, 60, 100)) < 0.5)
     canvas = plan_canvas(pan(0), source.info.span, source.info.frame_shape, 20.0, GIB)
     tracemalloc.start()

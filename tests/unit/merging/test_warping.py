@@ -1,4 +1,4 @@
-"""Warps that add up: against an interpolation of single pixels, written out."""
+"""Warps that add to a grid, compared with interpolation pixel by pixel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ IMAGE = np.random.default_rng(0).random((23, 37)).astype(np.float32)
 
 
 def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Look at an image, with zeros around it, from each pixel of a grid."""
+    """Interpolate an image, with zeros around it, at each pixel of a grid."""
     padded = np.pad(image.astype(np.float64), 2)
     y, x = np.mgrid[: shape[0], : shape[1]]
     seen = apply(to_image, np.stack([x.ravel(), y.ravel()], axis=-1).astype(float)) + 2

@@ -17,7 +17,7 @@ def photographed(flux: np.ndarray, frames: int) -> VirtualExposure:
 
 
 def waves(amplitude: float) -> np.ndarray:
-    """Flux whose arcsin(sqrt(mean count)) is a wave, wide against the blocks that are averaged."""
+    """Flux whose arcsin(sqrt(mean count)) is a wave, much longer than the averaged blocks."""
     x = np.arange(300)[None] + np.zeros((200, 1))
     return -np.log1p(-(np.sin(np.pi / 4 + amplitude * np.sin(x / 20)) ** 2))
 
@@ -28,7 +28,7 @@ def test_signal_to_noise_of_noise_is_near_0() -> None:
 
 @pytest.mark.parametrize(("amplitude", "frames"), [(0.05, 100), (0.2, 100), (0.05, 400)])
 def test_signal_to_noise_is_contrast_over_photon_noise(amplitude: float, frames: int) -> None:
-    """A wave varies by its amplitude over sqrt(2), the noise of n frames by 1 / (2 sqrt(n))."""
+    """The standard deviation of a wave is its amplitude / sqrt(2), that of the noise of n frames 1 / (2 sqrt(n))."""
     expected = amplitude / np.sqrt(2) * 2 * np.sqrt(frames)
     assert signal_to_noise(photographed(waves(amplitude), frames)) == pytest.approx(expected, rel=0.05)
 

@@ -40,7 +40,7 @@ def test_flux_clips_means_above_1_and_keeps_nan() -> None:
 
 @pytest.mark.parametrize("frames", [100, 400])
 def test_stabilised_noise_is_uniform(frames: int) -> None:
-    """Standard deviations of 20,000 draws are known to 0.5 %; what is left is the approximation itself."""
+    """The standard deviation of 20,000 draws has an error of 0.5 %; the rest is that of the approximation."""
     flux = f32(0.2, 0.5, 1.0, 2.0)[:, None]
     rng = np.random.default_rng(0)
     counts = rng.binomial(frames, -np.expm1(-flux.astype(float)), (4, 20_000))
@@ -53,7 +53,7 @@ def test_stabilised_ranges_from_0_to_half_pi() -> None:
 
 
 def test_stabilised_mean_does_not_depend_on_number_of_frames() -> None:
-    """Four counts in forty frames, on average, and 40 in 400; the means of 200,000 draws are known to 0.0003."""
+    """Four counts in forty frames, on average, and 40 in 400; the means of 200,000 draws have an error of 0.0003."""
     rng = np.random.default_rng(0)
     few, many = (
         RESPONSE.stabilised(RESPONSE.flux((rng.binomial(n, 0.1, 200_000) / n).astype(np.float32), n), n).mean()
@@ -98,7 +98,7 @@ def test_intensity_response_keeps_negative_flux_below_black_level() -> None:
 @pytest.mark.parametrize("n_frames", [1, 4, 30])
 @pytest.mark.parametrize("flux", [0.0, 100.0, 2000.0])
 def test_intensity_response_stabilises_noise(flux: float, n_frames: int) -> None:
-    """Photons and reading together; where single frames are read with more noise than light, their distribution is cut off."""
+    """Photon noise and read noise together; the transform clips single frames with more noise than light."""
     rng = np.random.default_rng(0)
     photons = rng.poisson(flux, (n_frames, 40_000)) + rng.normal(0, GREY.read_noise, (n_frames, 40_000))
     levels = (16 + photons / GREY.photons_per_level).mean(axis=0).astype(np.float32)

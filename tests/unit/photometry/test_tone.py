@@ -12,7 +12,7 @@ def f32(*values: float) -> np.ndarray:
 
 
 def test_known_values() -> None:
-    """Of the standard: middle grey of 8 bits, and where the straight part meets the power."""
+    """Values of the standard: middle grey of 8 bits, and the end of the linear part."""
     np.testing.assert_allclose(srgb_to_linear(f32(0, 0.04045, 118 / 255, 1)), [0, 0.0031308, 0.18116, 1], rtol=1e-4)
     np.testing.assert_allclose(linear_to_srgb(f32(0, 0.0031308, 0.5, 1)), [0, 0.04045, 0.73536, 1], rtol=1e-4)
 
