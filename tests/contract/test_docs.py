@@ -154,7 +154,9 @@ class Reader:
             assert not report, "".join(report)
             self.names.update(test.globs)
         else:
-            exec(compile("\n" * block.line + block.text, str(block.page), "exec"), self.names)
+            source = self.workplace / f".{block.page.name}"  # numba keeps machine code beside the source of a loop
+            shutil.copy(block.page, source)
+            exec(compile("\n" * block.line + block.text, str(source), "exec"), self.names)
 
     def run_command(self, block: Block, words: list[str], shown: str) -> None:
         environment = dict(word.split("=", 1) for word in itertools.takewhile(ASSIGNMENT.match, words))
