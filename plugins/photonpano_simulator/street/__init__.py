@@ -1,4 +1,4 @@
-"""A street of shops, drawn: the scene that is built in."""
+"""The built-in scene: a drawing of a street of shops."""
 
 from photonpano_simulator.street.scene import street
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Style(NamedTuple):
-    """What the windows of one house have in common."""
+    """The style of the windows of one house."""
 
     arched: bool
     shutters: bool

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _OVERSAMPLING = 2
-"""Shapes are drawn so many times finer and then averaged, which smooths their edges."""
+"""Shapes are drawn at twice the resolution and averaged down, which smooths their edges."""
 _FRACTION_BITS = 4
 
 Box = tuple[float, float, float, float]
@@ -28,8 +28,8 @@ class Painter:
 
     Args:
         shape: (height, width) of the result, px.
-        height: of the drawing, in units.
-        rng: what is left to chance.
+        height: height of the drawing, in units.
+        rng: random generator of the drawing.
     """
 
     def __init__(self, shape: tuple[int, int], height: float, rng: np.random.Generator) -> None:
