@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from heapq import nsmallest
 from itertools import islice
@@ -125,11 +126,13 @@ def ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recogni
         except Exception as error:
             failures.append(f"recognise of the {entry.label} raised {type(error).__name__}: {error}")
             continue
-        if isinstance(answer, Recognised):
+        returned = f"recognise of the {entry.label} returned"
+        if not isinstance(answer, Recognised | None):
+            failures.append(f"{returned} a {type(answer).__name__}, expected a Recognised or None")
+        elif answer and not isinstance(answer.keys, Mapping):
+            failures.append(f"{returned} keys of type {type(answer.keys).__name__}, expected a mapping")
+        elif answer:
             recognised.append((entry, answer))
-        elif answer is not None:
-            returned = type(answer).__name__
-            failures.append(f"recognise of the {entry.label} returned a {returned}, expected a Recognised or None")
     return recognised, failures
 
 

@@ -137,10 +137,18 @@ def test_recognise_that_raises_is_logged_and_other_sources_are_tried(folder, cat
     assert complaint in message_of(folder, catalog.including(sulky), "source: {use: auto, with: {path: cube.dat}}")
 
 
-def test_recognise_that_returns_wrong_type_is_named(folder, catalog):
-    odd = SourceContribution(name="odd", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=lambda _: {})
+@pytest.mark.parametrize(
+    ("answer", "broken"),
+    [
+        ({}, "a dict, expected a Recognised or None"),
+        (Recognised(None, "it is odd"), "keys of type NoneType, expected a mapping"),
+        (Recognised(["path"], "it is odd"), "keys of type list, expected a mapping"),
+    ],
+)
+def test_recognise_that_returns_wrong_type_is_named(folder, catalog, answer, broken):
+    odd = SourceContribution(name="odd", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=lambda _: answer)
     said = message_of(folder, catalog.including(odd), "source: {use: auto, with: {path: cube.dat}}")
-    complaint = f"recognise of the source 'odd' of {__name__} unreleased returned a dict, expected a Recognised or None"
+    complaint = f"recognise of the source 'odd' of {__name__} unreleased returned {broken}"
     assert said.splitlines()[1:] == [f"  {complaint}"]
 
 
