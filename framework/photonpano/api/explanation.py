@@ -14,7 +14,7 @@ from photonpano.registry import KINDS, Catalog, discover
 from photonpano.registry.description import flow
 from photonpano.specs import Plan
 from photonpano.specs.written import joined
-from photonpano.text import byte_size
+from photonpano.text import byte_size, counted, duration
 
 if TYPE_CHECKING:
     from photonpano.pipeline.forecast import Forecast  # imports numba, which only a forecast needs
@@ -78,7 +78,6 @@ def _levels(plan: Plan, source: Source) -> Iterator[str]:
 
 def _forecast_lines(plan: Plan, source: Source) -> list[str]:
     from photonpano.pipeline.forecast import forecast as forecast_from
-    from photonpano.report.numbers import counted, duration
 
     try:
         found = forecast_from(plan, source)

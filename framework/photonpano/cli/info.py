@@ -49,7 +49,7 @@ def info(
 
 def _rows(found: "CaptureInfo") -> Iterator[list[str]]:
     from photonpano.api.capture_info import percent
-    from photonpano.report.numbers import duration
+    from photonpano.text import duration
 
     speed, size = found.speed_px, found.group_size
     yield ["source", found.source + (f" ({found.reason})" if found.reason else "")]

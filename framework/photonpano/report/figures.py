@@ -18,7 +18,7 @@ from photonpano.geometry import apply, corners
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
-from photonpano.report.numbers import duration
+from photonpano.text import duration
 from photonpano.values import FloatArray, FluxImage, true_spans
 
 if TYPE_CHECKING:  # importing matplotlib takes a second

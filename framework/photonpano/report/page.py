@@ -8,13 +8,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from photonpano import text
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import RunRecord
-from photonpano.report import figures, numbers
+from photonpano.report import figures
 from photonpano.report.failures import failure_groups
 from photonpano.report.figures import jpeg_uri, shrunk
-from photonpano.text import byte_size
 from photonpano.values import true_spans
 
 PICTURE_PIXELS = 1600
@@ -41,9 +41,8 @@ def render_report(record: RunRecord, motion: FrameMotion | None, panorama: Rende
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for name in ("count", "counted", "duration", "pixels", "rate", "share", "span"):
-        environment.filters[name] = getattr(numbers, name)
-    environment.filters["memory"] = byte_size
+    for name in ("byte_size", "count", "counted", "duration", "pixels", "rate", "share", "span"):
+        environment.filters[name] = getattr(text, name)
     page: str = environment.get_template("report.html").render(
         record=record,
         title=_title(record),
