@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
 from photonpano.errors import CaptureUnreadError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
-    from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
+from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
+from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
 """The version of the contract with plugins: hooks, contributions, protocols. It changes only when plugins must change."""

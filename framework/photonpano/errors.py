@@ -5,12 +5,9 @@ Everything raised on purpose derives from `PhotonpanoError`; anything else that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
+from pathlib import Path
 
 
 class PhotonpanoError(Exception):

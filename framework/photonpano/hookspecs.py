@@ -11,22 +11,19 @@ distribution, and `docs/tutorial/first-plugin.md` writes it step by step.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 import pluggy
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from pathlib import Path
-    from typing import Any
-
-    from photonpano.contributions import (
-        InterpolatorContribution,
-        LocatorContribution,
-        MergerContribution,
-        ResamplerContribution,
-        SourceContribution,
-    )
+from photonpano.contributions import (
+    InterpolatorContribution,
+    LocatorContribution,
+    MergerContribution,
+    ResamplerContribution,
+    SourceContribution,
+)
 
 PROJECT = "photonpano"
 """The pluggy project name, and the entry-point group."""

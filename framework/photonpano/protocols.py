@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Protocol, runtime_checkable
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from types import TracebackType
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-    import numpy as np
-    from numpy.typing import ArrayLike, NDArray
-
-    from photonpano.values import (
-        BoolArray,
-        Counts,
-        FloatArray,
-        FluxImage,
-        Frames,
-        FrameSpan,
-        Group,
-        Homography,
-        Located,
-        NotLocated,
-        Response,
-        StreamInfo,
-        VirtualExposure,
-    )
+from photonpano.values import (
+    BoolArray,
+    Counts,
+    FloatArray,
+    FluxImage,
+    Frames,
+    FrameSpan,
+    Group,
+    Homography,
+    Located,
+    NotLocated,
+    Response,
+    StreamInfo,
+    VirtualExposure,
+)
 
 
 class Source(Protocol):

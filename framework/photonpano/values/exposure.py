@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
-    from photonpano.values.arrays import FluxImage, Homography
-    from photonpano.values.frames import Group
+from photonpano.values.arrays import FluxImage, Homography
+from photonpano.values.frames import Group
 
 
 class Response(Protocol):

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano_simulator.street.facades import facade, roof, wall
 from photonpano_simulator.street.painter import Painter
 from photonpano_simulator.street.shops import POSTERS, SHOPS, Shop, front, poster
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _HEIGHT = 1365.0
 _GROUND = 1130.0

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from photonpano_simulator.street.facades import cat
-
-if TYPE_CHECKING:
-    from photonpano_simulator.street.painter import Box, Painter
+from photonpano_simulator.street.painter import Box, Painter
 
 
 class Shop(NamedTuple):
