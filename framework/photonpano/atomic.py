@@ -92,20 +92,25 @@ def atomic_files(directory: Path, last: str = "") -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(final: Path) -> Iterator[Path]:
-    """Lend an empty folder whose files become those of `final`, a folder that is new or empty, when the block ends well.
+    """Lend an empty folder beside `final`, which becomes `final` in one rename when the block ends well.
 
     Raises:
         OutputError: there is something under that name, or the folder cannot be written.
     """
+    place = final.absolute()
+    temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
     try:
         if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
             raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
-        if not final.parent.is_dir():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        with atomic_files(final) as staging:
-            yield staging
+        temporary.mkdir()
+        yield temporary
+        for file in temporary.iterdir():
+            _flush_to_disk(file)
+        temporary.replace(place)
     except OSError as error:
         raise OutputError(_message(final, error)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager
