@@ -169,16 +169,19 @@ class _Resolver:
             return _Stage()
         n_problems = len(spec.problems)
         choice = self.component(KIND_OF[name], section, where)
-        if base is not None:  # the problems of the keys that a level inherits are reported once
-            reported = {(each.where.removeprefix(name), each.message) for each in spec.problems[:n_problems]}
-            new = spec.problems[n_problems:]
-            spec.problems[n_problems:] = [x for x in new if (x.where.removeprefix(where), x.message) not in reported]
-        if name != "locate":
-            return _Stage(section, choice)
-        inherited = base is not None and content.get("fallback") is None
-        if base is not None and inherited and choice == base.choice:
-            return _Stage(section, choice, base.fallbacks)
-        return _Stage(section, choice, self.fallbacks(section["fallback"], where, choice, inherited))
+        fallbacks: tuple[Choice, ...] = ()
+        if name == "locate":
+            inherited = base is not None and content.get("fallback") is None
+            if base is not None and inherited and choice == base.choice:
+                fallbacks = base.fallbacks
+            else:
+                fallbacks = self.fallbacks(section["fallback"], where, choice, inherited)
+        if base is not None:  # a problem of the base is reported again only for a key that the level itself writes
+            old, new = spec.problems[:n_problems], spec.problems[n_problems:]
+            reported = {(each.where.removeprefix(name), each.message) for each in old}
+            own = spec.places.keys() - {f"{where}.with"}
+            spec.problems = old + [x for x in new if x.where in own or (x.where.removeprefix(where), x.message) not in reported]
+        return _Stage(section, choice, fallbacks)
 
     def spelled_out(self, name: str, content: dict[str, Any], where: str, base: _Stage | None) -> dict[str, Any] | None:
         """Return a section with inherited keys, defaults and aliases filled in, and a list of fallbacks; None if that fails."""
