@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 
@@ -44,5 +44,5 @@ class Context:
     """
 
     threads: int = 1
-    progress: Progress = Quiet()  # noqa: RUF009 - it has no state
+    progress: Progress = field(default_factory=Quiet)
     on_level: Callable[[Any], object] = lambda _: None
