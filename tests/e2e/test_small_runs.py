@@ -44,7 +44,7 @@ def test_panorama_larger_than_memory_is_written_in_parts(small_spec: dict[str, A
     blocks = np.nan_to_num(flux[whole]).reshape(flux.shape[0] // factor, factor, -1, factor).mean(axis=(1, 3))
     shown = picture[: blocks.shape[0], : blocks.shape[1]]
     assert np.corrcoef(np.sqrt(blocks).ravel(), shown.ravel())[0, 1] > 0.98
-    assert f"<code>panorama.png</code> one for {factor}" in (tmp_path / "report.html").read_text()
+    assert f"<code>panorama.png</code> one pixel for {factor}" in (tmp_path / "report.html").read_text()
 
 
 @pytest.fixture(scope="module")
