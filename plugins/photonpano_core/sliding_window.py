@@ -12,8 +12,8 @@ from photonpano_core.grouping import centred, evenly_spread, require_a_group, si
 class SlidingWindowResampler:
     """A group of m frames every s frames.
 
-    With one step for all levels, the first level has as many groups as the last, O(n m / s) frames a level, although so many
-    hardly help while the motion is inaccurate.
+    With one step for all levels, the first level has as many groups as the last, O(n m / s) frames a level. Dense
+    groups hardly help while the motion is inaccurate.
 
     Raises:
         ValueError: the group size is `auto`.

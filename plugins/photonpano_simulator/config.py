@@ -107,7 +107,7 @@ class FilePath(_Path):
 
 
 class Sensor(Config):
-    """A single-photon camera whose pixels tell whether they detected a photon."""
+    """A single-photon camera: a pixel of a frame is 1 if it detected at least one photon."""
 
     quantum_efficiency: float = Field(1.0, gt=0, le=1, description="fraction of the incident photons that are detected")
     dark_rate: float = Field(0.0, ge=0, le=100, description="dark counts per pixel per frame")

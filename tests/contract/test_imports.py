@@ -32,7 +32,7 @@ def imported_by(statement: str, folder: Path | None = None) -> set[str]:
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
-def test_what_the_suite_does_not_run_can_be_imported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_script_outside_the_suite_can_be_imported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Benchmarks and the scripts of the docs take too long to run here, and are not to fall behind."""
     spec = importlib.util.spec_from_file_location(f"script_{script.stem}", script)
     module = importlib.util.module_from_spec(spec)
@@ -40,7 +40,7 @@ def test_what_the_suite_does_not_run_can_be_imported(script: Path, monkeypatch: 
     spec.loader.exec_module(module)
 
 
-def test_the_package_imports_nothing_at_all() -> None:
+def test_package_imports_no_library() -> None:
     assert imported_by("import photonpano") & {*HEAVY, "numpy", "pydantic", "pluggy", "rich", "typer"} == set()
 
 
@@ -67,12 +67,12 @@ def test_dir_of_lazy_package_lists_public_names(package: ModuleType) -> None:
         "from photonpano import capture_plan, load_spec, parse_spec",
     ],
 )
-def test_what_plugins_offer_is_told_without_their_libraries(statement: str) -> None:
+def test_discovery_imports_no_heavy_library(statement: str) -> None:
     assert imported_by(statement) & set(HEAVY) == set()
 
 
 @pytest.mark.parametrize("arguments", COMMANDS)
-def test_commands_that_do_not_run_need_no_heavy_library(arguments: str, tmp_path: Path) -> None:
+def test_command_without_run_imports_no_heavy_library(arguments: str, tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", np.zeros((2000, 16, 2), np.uint8))
     (tmp_path / "scan.yaml").write_text(
         "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\nresample: {with: {group_size: 100}}\n"

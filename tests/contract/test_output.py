@@ -39,7 +39,7 @@ def trajectory(folder: Path) -> dict[str, np.ndarray]:
         return dict(archive)
 
 
-def test_the_folder_holds_these_files_and_no_others(folder: Path) -> None:
+def test_run_folder_holds_exactly_the_promised_files(folder: Path) -> None:
     assert {file.name for file in folder.iterdir()} == {
         "panorama.tiff",
         "panorama.png",
@@ -50,7 +50,7 @@ def test_the_folder_holds_these_files_and_no_others(folder: Path) -> None:
     }
 
 
-def test_the_panorama_is_linear_flux_and_unknown_where_nothing_was_seen(folder: Path) -> None:
+def test_panorama_is_linear_flux_and_nan_where_unseen(folder: Path) -> None:
     flux, coverage = tifffile.imread(folder / "panorama.tiff"), tifffile.imread(folder / "coverage.tiff")
     assert flux.dtype == coverage.dtype == np.float32
     assert flux.shape == coverage.shape
@@ -61,7 +61,7 @@ def test_the_panorama_is_linear_flux_and_unknown_where_nothing_was_seen(folder: 
     assert set(np.unique(coverage[(coverage > 0) & (coverage < 1)])) == set()
 
 
-def test_the_picture_is_the_panorama_in_srgb(folder: Path, record: dict[str, Any]) -> None:
+def test_picture_is_the_panorama_in_srgb(folder: Path, record: dict[str, Any]) -> None:
     picture = cv2.imread(str(folder / "panorama.png"), cv2.IMREAD_UNCHANGED)
     flux = tifffile.imread(folder / "panorama.tiff")
     white = record["panorama"]["white_flux"]
@@ -69,7 +69,7 @@ def test_the_picture_is_the_panorama_in_srgb(folder: Path, record: dict[str, Any
     np.testing.assert_array_equal(picture, tone_mapped(flux, white))
 
 
-def test_the_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str, np.ndarray]) -> None:
+def test_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str, np.ndarray]) -> None:
     homographies = trajectory["homographies"]
     assert {name: array.shape for name, array in trajectory.items()} == {
         "homographies": (N_FRAMES, 3, 3),
@@ -89,7 +89,7 @@ def test_the_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str,
     np.testing.assert_array_equal(homographies[:, 2, 2], 1)
 
 
-def test_the_canvas_maps_the_reference_frame_to_the_panorama(folder: Path, trajectory: dict[str, np.ndarray]) -> None:
+def test_canvas_maps_the_reference_frame_to_the_panorama(folder: Path, trajectory: dict[str, np.ndarray]) -> None:
     """Every located frame lies on the panorama, and its middle was seen."""
     coverage = tifffile.imread(folder / "coverage.tiff")
     to_panorama = trajectory["canvas"] @ trajectory["homographies"][trajectory["located"]]
@@ -100,13 +100,13 @@ def test_the_canvas_maps_the_reference_frame_to_the_panorama(folder: Path, traje
     assert coverage[middles[:, 1], middles[:, 0]].min() > 100
 
 
-def test_the_coverage_counts_the_located_frames(folder: Path, trajectory: dict[str, np.ndarray]) -> None:
+def test_coverage_counts_the_located_frames(folder: Path, trajectory: dict[str, np.ndarray]) -> None:
     """The maps hardly change areas here: the sum is frames times pixels of a frame."""
     coverage = tifffile.imread(folder / "coverage.tiff")
     assert coverage.sum() == pytest.approx(trajectory["located"].sum() * SHAPE[0] * SHAPE[1], rel=0.02)
 
 
-def test_the_record_tells_how_it_was_made(record: dict[str, Any], small_spec: dict[str, Any], folder: Path) -> None:
+def test_record_names_source_components_and_versions(record: dict[str, Any], small_spec: dict[str, Any], folder: Path) -> None:
     assert record["status"] == "done"
     assert record["seed"] == 0
     assert record["source"] == {
@@ -131,13 +131,13 @@ def test_the_record_tells_how_it_was_made(record: dict[str, Any], small_spec: di
     assert record["seconds"] > 0
 
 
-def test_the_recorded_spec_is_a_spec_of_the_same_run(record: dict[str, Any], small_spec: dict[str, Any], folder: Path) -> None:
+def test_recorded_spec_resolves_to_the_same_document(record: dict[str, Any], small_spec: dict[str, Any], folder: Path) -> None:
     again = parse_spec(record["spec"])
     assert again.document == parse_spec(small_spec, output=folder).document
     assert again.source.config.path.is_absolute()
 
 
-def test_the_record_tells_of_every_level(record: dict[str, Any]) -> None:
+def test_record_has_an_entry_for_every_level(record: dict[str, Any]) -> None:
     levels = record["levels"]
     assert [level["level"] for level in levels] == [1, 2, 3]
     assert [level["groups"] for level in levels] == [6, 13, 25]
@@ -151,7 +151,7 @@ def test_the_record_tells_of_every_level(record: dict[str, Any]) -> None:
             assert set(failure) == {"moving", "fixed", "reason", "evidence"}
 
 
-def test_the_report_needs_nothing_else(folder: Path) -> None:
+def test_report_refers_to_no_other_file(folder: Path) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert re.findall(r"""(?:src|href)=["'](?!data:|#)[^"']*""", page) == []
     assert "<script" not in page

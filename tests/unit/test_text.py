@@ -40,14 +40,14 @@ def test_byte_size_has_the_unit_that_fits(size, text):
     ("value", "text"),
     [(None, "\N{EN DASH}"), (0.0, "0"), (0.0631, "0.063"), (1.834, "1.83"), (12.34, "12.3"), (1234.5, "1,234")],
 )
-def test_pixels(value, text):
+def test_pixels_has_two_digits_below_a_tenth_and_a_dash_for_none(value, text):
     assert words.pixels(value) == text
 
 
 @pytest.mark.parametrize(
     ("value", "text"), [(1, "100 %"), (0.998, "over 99 %"), (0.934, "93 %"), (0.003, "under 1 %"), (0, "0 %")]
 )
-def test_shares(value, text):
+def test_share_is_exact_at_0_and_100_percent_only(value, text):
     assert words.share(value) == text
 
 

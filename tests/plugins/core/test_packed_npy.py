@@ -154,7 +154,7 @@ def test_full_disk_is_reported_before_unpacking(gzipped: Path, monkeypatch: pyte
     assert list(gzipped.parent.iterdir()) == [gzipped]
 
 
-def test_a_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
+def test_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
     with opened(saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))) as source:
         for read in (source.counts, source.frames):
             with pytest.raises(InputError) as caught:
@@ -208,7 +208,7 @@ def test_wrong_arrays_are_refused(tmp_path: Path, case: str) -> None:
     assert_refused(message.format(path=path), path)
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
     assert_refused(f"there is no file {path}; check the path", path)
     assert_refused(f"{tmp_path} is a folder; name the .npy file in it", tmp_path)

@@ -56,7 +56,7 @@ def test_noise_around_black_averages_to_zero_flux() -> None:
     assert abs(linear.response.flux(np.float32([mean]), 1)[0]) < 5 * 10_000 * (4 / 219 / 12.92) / np.sqrt(100_000)
 
 
-def test_a_measured_curve_is_scaled_to_black_and_white(tmp_path: Path) -> None:
+def test_measured_curve_is_scaled_to_black_and_white(tmp_path: Path) -> None:
     file = tmp_path / "curve.txt"
     np.savetxt(file, 7 + 3 * np.arange(256.0) ** 2)
     flux = flux_of_levels(levels(Encoding.full(8), curve_file=file, saturation_photons=255.0**2, black_level=10))

@@ -42,7 +42,7 @@ def test_colours_are_converted_to_luminance(tmp_path: Path) -> None:
     np.testing.assert_allclose(flux[0, [0, 10, 20]], [0.0722, 0.7152, 0.2126], rtol=1e-4)
 
 
-def test_a_photograph_is_resized(photo: Path) -> None:
+def test_photograph_is_resized(photo: Path) -> None:
     assert scene_flux(PhotoScene(file=photo), 1.0).shape == (150, 200)
     assert scene_flux(PhotoScene(file=photo, width=100), 1.0).shape == (75, 100)
     assert scene_flux(PhotoScene(file=photo, width=400), 1.0).shape == (300, 400)

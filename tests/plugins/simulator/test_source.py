@@ -129,7 +129,7 @@ def test_written_capture_has_the_same_frames(simulated: Simulated, tmp_path: Pat
     np.testing.assert_allclose(replayed.truth()["homographies"], homographies, rtol=0, atol=1e-12)
 
 
-def test_a_span_beyond_the_end_is_refused(simulated: Simulated) -> None:
+def test_span_beyond_the_end_is_refused(simulated: Simulated) -> None:
     with simulated() as source:
         for read in (source.counts, source.frames):
             with pytest.raises(InputError) as caught:

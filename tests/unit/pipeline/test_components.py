@@ -61,7 +61,7 @@ def plan(levels: Any = 1, **changes: Any) -> Plan:
     return parse_spec(spec | {"run": {"seed": 7, "threads": 3}}, catalog=Catalog(tuple(rows)))
 
 
-def test_components_are_told_what_they_may_know() -> None:
+def test_components_receive_their_config_and_context() -> None:
     made = plan()
     source = build_source(made)
     assert source.wrapped.context == SourceContext(seed=7, threads=3)
@@ -85,7 +85,7 @@ class Curious(Built):
         return (Group(span, span.centre),)
 
 
-def test_the_capture_is_measured_once_when_first_asked_for_and_choices_are_recorded(memory_source: Any) -> None:
+def test_capture_is_summarised_once_on_first_use_and_decisions_are_recorded(memory_source: Any) -> None:
     source = memory_source(np.random.default_rng(0).random((48, 16, 16)) < 0.5)
     looked: list[FrameSpan] = []
     source.counts = lambda span, counts=source.counts: looked.append(span) or counts(span)
@@ -100,21 +100,21 @@ def test_the_capture_is_measured_once_when_first_asked_for_and_choices_are_recor
     assert decisions == [Decision("size", 1, "the flux is 0.7"), Decision("size", 2, "the flux is 0.7")]
 
 
-def test_what_cannot_be_recorded_is_refused_at_once() -> None:
+def test_decision_that_json_cannot_hold_is_refused() -> None:
     made = plan()
     (level,) = build_levels(made, build_source(made), [])
     with pytest.raises(TypeError, match="number, a text, true or false; size is a list"):
         level.locators[0].component.context.decide("size", [1], "so")
 
 
-def test_groups_are_foreseen_without_reading_frames() -> None:
+def test_foreseen_groups_reads_no_frames() -> None:
     made = plan(levels=[{}, {"resample": {"with": {"size": 2}}}], resampler={"build": Curious})
     assert foreseen_groups(made, build_source(made)) == ["chosen from flux and speed when the capture is read"] * 2
     with pytest.raises(PluginError, match=r"^resampler 'toy' of toys 1\.0 failed at level 1: AttributeError: "):
         foreseen_groups(plan(), build_source(made))
 
 
-def test_levels_that_choose_alike_share_a_component() -> None:
+def test_levels_with_the_same_choice_share_a_component() -> None:
     made = plan(levels=[{"scale": 0.5}, {"locate": {"with": {"size": 2}}}, {}])
     first, second, third = build_levels(made, build_source(made), [])
     locators = [level.locators[0].component for level in (first, second, third)]
@@ -125,7 +125,7 @@ def test_levels_that_choose_alike_share_a_component() -> None:
     assert locators[1].config == Keys(size=2)
 
 
-def test_fallbacks_follow_the_locator_in_order_and_share_its_component() -> None:
+def test_fallbacks_follow_the_locator_in_order_and_share_components() -> None:
     larger = {"use": "toy", "with": {"size": 2}}
     made = plan(
         levels=[
@@ -146,14 +146,14 @@ def broken(*_: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", [kind.kind for kind in KINDS])
-def test_a_component_that_cannot_be_built_is_named(kind: str) -> None:
+def test_component_that_cannot_be_built_is_named(kind: str) -> None:
     made = plan(**{kind: {"build": broken}})
     with pytest.raises(PluginError) as caught:
         build_levels(made, build_source(made), [])
     assert str(caught.value) == f"{kind} 'toy' of toys 1.0 could not be built: RuntimeError: no such device"
 
 
-def test_an_error_for_users_passes_as_it_is() -> None:
+def test_error_for_users_passes_unchanged() -> None:
     def missing(*_: Any) -> Any:
         raise InputError("there is no file cube.npy")
 
@@ -161,7 +161,7 @@ def test_an_error_for_users_passes_as_it_is() -> None:
         build_source(plan(source={"build": missing}))
 
 
-def test_a_library_that_went_missing_is_named_with_its_install_line() -> None:
+def test_missing_library_is_named_with_its_install_line() -> None:
     """A spec that was checked elsewhere, or a library that was uninstalled since."""
     made = plan()
     contribution = made.source.contribution
@@ -174,7 +174,7 @@ def test_a_library_that_went_missing_is_named_with_its_install_line() -> None:
     )
 
 
-def test_the_response_reaches_every_stage() -> None:
+def test_response_reaches_every_stage() -> None:
     made = plan()
     source = build_source(made)
     (level,) = build_levels(made, source, [])
@@ -193,7 +193,7 @@ def test_the_response_reaches_every_stage() -> None:
         ([{"scale": 2}, {}, {}], (254, 496), [2, 0.5, 1]),
     ],
 )
-def test_levels_that_later_ones_refine_are_located_at_half_size(
+def test_auto_scale_halves_the_first_two_levels_if_a_later_one_refines_them(
     levels: Any, shape: tuple[int, int], scales: list[float]
 ) -> None:
     plan = parse_spec({"version": 1, "source": {"use": "simulator"}, "levels": levels})

@@ -12,7 +12,7 @@ from photonpano.specs import parse_spec
 from photonpano.testing import MemorySource
 
 
-def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[MemorySource]) -> None:
+def test_part_of_capture_numbers_its_frames_from_zero(memory_source: type[MemorySource]) -> None:
     frames = np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8)
     part = part_of(memory_source(frames), FrameSpan(2, 7))
     assert part.info.n_frames == 5
@@ -22,7 +22,7 @@ def test_a_part_of_a_capture_numbers_its_frames_from_zero(memory_source: type[Me
         part.counts(FrameSpan(3, 6))
 
 
-def test_a_part_has_what_the_capture_has(memory_source: type[MemorySource]) -> None:
+def test_part_of_capture_has_the_optional_methods_of_the_capture(memory_source: type[MemorySource]) -> None:
     whole: Any = memory_source(np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8))
     assert not isinstance(part_of(whole, FrameSpan(2, 7)), PackedSource | LinearlyCorrectedSource)
     whole.packed = lambda span: np.packbits(whole.frames(span), axis=-1)
@@ -34,7 +34,7 @@ def test_a_part_has_what_the_capture_has(memory_source: type[MemorySource]) -> N
     assert part.corrected(np.uint32([[5]]), 3) == 2
 
 
-def test_a_trial_tells_time_memory_and_canvas(small_spec: dict[str, Any]) -> None:
+def test_forecast_predicts_time_memory_and_canvas(small_spec: dict[str, Any]) -> None:
     plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 20}}, "levels": 2})
     with build_source(plan) as source:
         found = forecast(plan, source)

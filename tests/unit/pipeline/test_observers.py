@@ -48,7 +48,7 @@ def log(told: list[Any]) -> ModuleType:
     )
 
 
-def test_a_run_that_ends_well(told: list[Any], log: ModuleType) -> None:
+def test_observers_are_called_at_start_stage_and_end_of_a_run(told: list[Any], log: ModuleType) -> None:
     observers = watching(log)
     with observers.watching({"version": 1}) as finished:
         observers.rendered(Canvas(30, 40, np.eye(3)), 2.5)
@@ -69,14 +69,16 @@ def test_a_run_that_ends_well(told: list[Any], log: ModuleType) -> None:
     ],
     ids=repr,
 )
-def test_a_run_that_fails_raises_what_it_raised(told: list[Any], log: ModuleType, error: BaseException, message: str) -> None:
+def test_failed_run_raises_its_error_and_reports_it(
+    told: list[Any], log: ModuleType, error: BaseException, message: str
+) -> None:
     with pytest.raises(type(error)) as caught, watching(log).watching({}):
         raise error
     assert caught.value is error
     assert told[1:] == [(DIRECTORY, None, message)]
 
 
-def test_the_stages_of_each_level(
+def test_observers_receive_four_stages_of_each_level(
     told: list[Any], log: ModuleType, memory_source: type, make_level: Callable, pan: Callable
 ) -> None:
     source = memory_source(np.zeros((120, 40, 60)))
@@ -98,7 +100,7 @@ def test_the_stages_of_each_level(
     assert summaries[7] == {"change_px": results[1].change_px, "std_px": results[1].uncertainty.mean_px}
 
 
-def test_what_is_not_known_is_none(told: list[Any], log: ModuleType) -> None:
+def test_stage_summary_holds_none_where_std_is_infinite(told: list[Any], log: ModuleType) -> None:
     located = SimpleNamespace(edges=(), failures=(), n_located=1)
     alone = SimpleNamespace(mean_px=np.inf)
     watching(log).level_finished(
@@ -110,7 +112,7 @@ def test_what_is_not_known_is_none(told: list[Any], log: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError("no space"), SystemExit(3)], ids=repr)
-def test_what_an_observer_raises_is_logged_with_its_name_and_the_others_go_on(
+def test_exception_of_observer_is_logged_with_its_name_and_others_are_called(
     told: list[Any], log: ModuleType, caplog: pytest.LogCaptureFixture, error: BaseException
 ) -> None:
     def fail(directory: Path) -> None:
@@ -128,7 +130,7 @@ def test_what_an_observer_raises_is_logged_with_its_name_and_the_others_go_on(
     assert all(record.exc_info and record.exc_info[1] is error for record in caplog.records)
 
 
-def test_an_observer_that_fails_does_not_hide_what_ended_the_run(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_observer_does_not_replace_the_error_of_the_run(caplog: pytest.LogCaptureFixture) -> None:
     def fail(error: str) -> None:
         raise RuntimeError("and now this")
 
@@ -137,7 +139,7 @@ def test_an_observer_that_fails_does_not_hide_what_ended_the_run(caplog: pytest.
     assert len(caplog.messages) == 1
 
 
-def test_observers_cannot_change_what_they_see() -> None:
+def test_frozen_data_cannot_be_changed() -> None:
     spec = {"run": {"seed": 3}, "levels": [{"scale": 1.0}]}
     seen = frozen(spec)
     assert seen == {"run": {"seed": 3}, "levels": ({"scale": 1.0},)}

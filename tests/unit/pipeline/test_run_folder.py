@@ -72,7 +72,7 @@ def require_old(directory: Path) -> None:
     assert all(file.read_text() == f"old {file.name}" for file in directory.iterdir())
 
 
-def test_the_files_hold_what_was_written(tmp_path: Path) -> None:
+def test_run_folder_holds_the_written_files(tmp_path: Path) -> None:
     with run_folder(tmp_path / "runs" / "scan") as folder:
         write_all(folder)
     directory = tmp_path / "runs" / "scan"
@@ -87,7 +87,7 @@ def test_the_files_hold_what_was_written(tmp_path: Path) -> None:
     assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")
 
 
-def test_nothing_has_a_final_name_before_the_end(old: Path) -> None:
+def test_run_folder_renames_no_file_before_the_block_ends(old: Path) -> None:
     with run_folder(old) as folder:
         write_all(folder)
         assert all(file.read_text() == f"old {file.name}" for file in old.iterdir() if file.is_file())
@@ -103,19 +103,19 @@ def write_and_fail(directory: Path, error: BaseException) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_an_exception_leaves_what_was_there(old: Path, error: type[BaseException]) -> None:
+def test_run_folder_keeps_old_files_when_the_block_raises(old: Path, error: type[BaseException]) -> None:
     with pytest.raises(error):
         write_and_fail(old, error())
     require_old(old)
 
 
-def test_an_exception_leaves_no_folder_that_was_not_there(tmp_path: Path) -> None:
+def test_run_folder_removes_new_folders_when_the_block_raises(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="half-way"):
         write_and_fail(tmp_path / "runs" / "today" / "scan", ValueError("half-way"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_somebody_else_put_there_stays(tmp_path: Path) -> None:
+def test_run_folder_keeps_files_of_other_programs(tmp_path: Path) -> None:
     def meet_another() -> None:
         with run_folder(tmp_path / "runs" / "scan"):
             (tmp_path / "runs" / "notes.txt").write_text("a note")
@@ -138,7 +138,7 @@ def files_of_at_most(n_bytes: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("write", WRITERS)
-def test_a_full_disk_leaves_what_was_there(old: Path, write: Callable[[RunFolder], None]) -> None:
+def test_run_folder_keeps_old_files_when_the_disk_is_full(old: Path, write: Callable[[RunFolder], None]) -> None:
     with pytest.raises(OutputError) as caught, run_folder(old) as folder, files_of_at_most(4096):
         write(folder)
     assert str(caught.value) == (
@@ -148,7 +148,7 @@ def test_a_full_disk_leaves_what_was_there(old: Path, write: Callable[[RunFolder
     require_old(old)
 
 
-def test_a_file_in_the_way_is_told_before_the_work(tmp_path: Path) -> None:
+def test_run_folder_refuses_a_file_in_the_way_before_the_block(tmp_path: Path) -> None:
     """As root, permissions stop nobody; a file does."""
     way = tmp_path / "runs"
     way.write_text("a file")

@@ -39,7 +39,7 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
 
 
 @pytest.mark.parametrize(("kind", "name"), [("source", "auto"), ("locator", "chain-of-backends")])
-def test_the_framework_offers_names_through_its_own_entry_point(kind, name):
+def test_framework_offers_names_through_its_own_entry_point(kind, name):
     entry = discover().find(kind, name)
     assert (entry.origin.plugin, entry.origin.entry_point, entry.origin.version) == (
         "photonpano",
@@ -169,7 +169,7 @@ def test_observers_are_kept_apart_from_components(install):
 
 
 @pytest.mark.parametrize("word", ["Beta", "beta_lab", "beta-lab", " beta.lab ,"])
-def test_a_disabled_plugin_is_a_row_and_is_not_imported(word, install, monkeypatch):
+def test_disabled_plugin_is_a_row_and_is_not_imported(word, install, monkeypatch):
     install("alpha", "1.2", GOOD)
     install("beta", "2.0", "raise SystemExit('imported')", distribution="beta-lab")
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", word)
@@ -180,7 +180,7 @@ def test_a_disabled_plugin_is_a_row_and_is_not_imported(word, install, monkeypat
     assert {row.origin.plugin for row in of_toys(catalog.rows)} == {"alpha"}
 
 
-def test_a_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
+def test_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "photonpano")
     catalog = discover()
