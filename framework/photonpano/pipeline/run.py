@@ -53,7 +53,8 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         LocationError: the motion could not be estimated.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
         PluginError: a component failed in its own way, or broke its contract.
-        OutputError: the run folder cannot be written. After any error the folder holds what it held before.
+        OutputError: the run folder cannot be written. An error before the last step, in which the files get their names,
+            leaves the folder as it was.
     """
     observers = Observers(plan.observers, plan.output.directory)
     context = Context(thread_count(plan.run.threads), progress or Quiet(), observers.level_finished)
