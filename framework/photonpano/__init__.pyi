@@ -16,6 +16,7 @@ from .contributions import InterpolatorContribution as InterpolatorContribution
 from .contributions import LocatorContribution as LocatorContribution
 from .contributions import MergerContribution as MergerContribution
 from .contributions import Recognised as Recognised
+from .contributions import RefinerContribution as RefinerContribution
 from .contributions import Requirement as Requirement
 from .contributions import ResamplerContribution as ResamplerContribution
 from .contributions import SourceContext as SourceContext
@@ -42,6 +43,8 @@ from .protocols import LinearlyCorrectedSource as LinearlyCorrectedSource
 from .protocols import Locator as Locator
 from .protocols import Merger as Merger
 from .protocols import PackedSource as PackedSource
+from .protocols import PanoramaView as PanoramaView
+from .protocols import Refiner as Refiner
 from .protocols import Resampler as Resampler
 from .protocols import Source as Source
 from .protocols import Trajectory as Trajectory
@@ -63,7 +66,9 @@ from .values import Homography as Homography
 from .values import Located as Located
 from .values import NotLocated as NotLocated
 from .values import Panorama as Panorama
+from .values import Refined as Refined
 from .values import Response as Response
+from .values import SpanResiduals as SpanResiduals
 from .values import StreamInfo as StreamInfo
 from .values import VirtualExposure as VirtualExposure
 

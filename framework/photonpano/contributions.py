@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
 from photonpano.errors import CaptureUnreadError
-from photonpano.protocols import Interpolator, Locator, Merger, Resampler, Source
+from photonpano.protocols import Interpolator, Locator, Merger, Refiner, Resampler, Source
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
@@ -60,7 +60,7 @@ def _not_recorded(what: str, value: DecisionValue, reason: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class StageContext:
-    """The run for which a resampler, merger, locator or interpolator is built.
+    """The run for which any component but a source is built.
 
     Attributes:
         stream: the capture's frames, size and rate.
@@ -188,7 +188,7 @@ class SourceContribution(Contribution):
 
 @dataclass(frozen=True, kw_only=True)
 class StageContribution(Contribution):
-    """Offers a component of one of the four stages.
+    """Offers a component that is built for a capture: of a stage of the levels, or a refiner.
 
     Attributes:
         check: finds problems of a config with a capture, from its description; reads no data, imports nothing heavy.
@@ -227,3 +227,11 @@ class InterpolatorContribution(StageContribution):
 
     kind: ClassVar[str] = "interpolator"
     build: Callable[[Any, StageContext], Interpolator]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinerContribution(StageContribution):
+    """Offers a refiner."""
+
+    kind: ClassVar[str] = "refiner"
+    build: Callable[[Any, StageContext], Refiner]

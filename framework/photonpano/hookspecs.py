@@ -21,6 +21,7 @@ from photonpano.contributions import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
+    RefinerContribution,
     ResamplerContribution,
     SourceContribution,
 )
@@ -198,6 +199,57 @@ def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: i
                 summary="The homography of the nearest located instant",
                 config=NearestConfig,
                 build=lambda config, context: Nearest(),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_refiners() -> Iterable[RefinerContribution]:  # type: ignore[empty-body]
+    """Offer refiners: they correct the motion after the last level, from residuals of short spans of frames.
+
+    Example:
+        ```python
+        import numpy as np
+        from pydantic import Field
+
+        from photonpano import Config, Refined, RefinerContribution, hookimpl
+        from photonpano.geometry import inverse, normalised
+
+
+        class JumpConfig(Config):
+            sigmas: float = Field(6.0, gt=0, description="smallest jump that is corrected, in standard deviations")
+
+
+        class Jump:
+            def __init__(self, sigmas):
+                self.sigmas = sigmas
+
+            def refine(self, source, trajectory, std_px, residuals, view):
+                covariances = np.linalg.pinv(residuals.information, hermitian=True)[:, :2, :2]
+                shifts = residuals.steps[:, :2]
+                variances = np.trace(covariances, axis1=1, axis2=2)
+                far = (variances > 0) & ((shifts**2).sum(axis=1) > self.sigmas**2 * variances)
+                if not far.any():
+                    return None
+                steps, std_px = np.tile(np.eye(3), (len(std_px), 1, 1)), std_px.copy()
+                for index in np.flatnonzero(far):
+                    frames = slice(residuals.spans[index].start, residuals.spans[index].stop)
+                    steps[frames, :2, 2], std_px[frames] = shifts[index], np.sqrt(variances[index])
+                motion = trajectory.at(np.arange(len(std_px)))
+                reference = np.abs(motion - np.eye(3)).sum(axis=(1, 2)).argmin()
+                moved = normalised(motion @ steps)
+                summary = f"jumps of up to {np.hypot(*shifts[far].T).max():.1f} px in {far.sum()} spans"
+                return Refined(normalised(inverse(moved[reference]) @ moved), std_px, summary)
+
+
+        @hookimpl
+        def photonpano_refiners():
+            yield RefinerContribution(
+                name="jump",
+                summary="Corrects single spans that are far off",
+                config=JumpConfig,
+                build=lambda config, context: Jump(config.sigmas),
             )
         ```
     """

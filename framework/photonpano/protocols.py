@@ -1,4 +1,4 @@
-"""The interfaces of the five components that plugins build."""
+"""The interfaces of the six components that plugins build."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from photonpano.values import (
     Homography,
     Located,
     NotLocated,
+    Refined,
     Response,
+    SpanResiduals,
     StreamInfo,
     VirtualExposure,
 )
@@ -193,5 +195,41 @@ class Interpolator(Protocol):
             instants: (N,) float64, increasing, in frames; N is at least 1.
             homographies: (N, 3, 3) float64, frame pixels to reference pixels.
             information: (N, 8, 8) inverse covariances of the parameters p1..p8, None if unknown.
+        """
+        ...
+
+
+class PanoramaView(Protocol):
+    """The panorama along a motion, as frames of the camera would see it."""
+
+    def predicted(self, instant: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Predict the frame of an instant: its mean count, and the variance of the count.
+
+        Returns:
+            Two images, both (H, W) float32, NaN where the panorama was not seen.
+        """
+        ...
+
+
+class Refiner(Protocol):
+    """Corrects the motion after the last level, from what the photons of a few frames show beyond it."""
+
+    def refine(
+        self, source: Source, trajectory: Trajectory, std_px: FloatArray, residuals: SpanResiduals, view: PanoramaView
+    ) -> Refined | None:
+        """Correct the motion, where it differs from what the photons show by more than their noise.
+
+        The framework renders the panorama along the refined motion, measures the residuals again, and calls the refiner again,
+        until it finds nothing more, for a certain number of rounds. It does not use a motion that explains the photons worse.
+
+        Args:
+            source: the capture.
+            trajectory: the motion so far; the homography of the reference frame is the identity.
+            std_px: (T,) expected corner error of each frame, in px of a frame; infinite where nothing was located.
+            residuals: what short spans of frames show beyond the trajectory.
+            view: the panorama along the trajectory.
+
+        Returns:
+            None if the photons show nothing to correct.
         """
         ...

@@ -24,6 +24,7 @@ KINDS = {
     "photonpano_mergers": ("merger", "naive-sum"),
     "photonpano_locators": ("locator", "never-found"),
     "photonpano_interpolators": ("interpolator", "nearest"),
+    "photonpano_refiners": ("refiner", "jump"),
 }
 
 

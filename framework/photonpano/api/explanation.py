@@ -120,7 +120,7 @@ class _Writer:
             if isinstance(value, dict) and value:
                 yield f"{indent}{key}:"
                 yield from self._mapping(value, path, f"{indent}  ")
-            elif value and re.fullmatch(r"corrections|(levels\.\d+\.)?locate\.fallback", path):
+            elif value and re.fullmatch(r"corrections|refine|(levels\.\d+\.)?locate\.fallback", path):
                 yield f"{indent}{key}:"
                 for index, item in enumerate(value):
                     yield from self._item(item, f"{path}.{index}", f"{indent}  ")
@@ -135,7 +135,7 @@ class _Writer:
 
     def _provider(self, path: str, value: Any) -> str:
         """Return which plugin provides a component, and the reason if the spec left the choice open."""
-        *_, section, key = ["", *re.sub(r"\.fallback\.\d+", "", path).split(".")]
+        *_, section, key = ["", *re.sub(r"(\.fallback)?\.\d+", "", path).split(".")]
         kinds = [kind.name for kind in KINDS.values() if kind.section == section]
         if key != "use" or not kinds:
             return ""

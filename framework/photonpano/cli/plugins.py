@@ -25,6 +25,7 @@ class KindName(StrEnum):
     MERGER = "merger"
     LOCATOR = "locator"
     INTERPOLATOR = "interpolator"
+    REFINER = "refiner"
 
 
 _KIND_NAMES = ", ".join(KindName)

@@ -11,6 +11,7 @@ from .homographies import normalised as normalised
 from .homographies import parameters as parameters
 from .homographies import rescaled as rescaled
 from .homographies import rescaling as rescaling
+from .homographies import step_motions as step_motions
 from .homographies import translation as translation
 from .plausibility import why_implausible as why_implausible
 from .sampling import Run as Run

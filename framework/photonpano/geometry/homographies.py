@@ -38,6 +38,23 @@ def translation(x: float, y: float) -> Homography:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
+def step_motions(steps: ArrayLike, shape: tuple[int, int]) -> Homography:
+    """Return the maps of small motions of a frame: (..., 4) to (..., 3, 3).
+
+    Args:
+        steps: shift along x and along y, in pixels; roll from x towards y, in radians; zoom, as a fraction.
+        shape: (height, width) of the frame, about whose centre it rolls and zooms.
+    """
+    x, y, roll, zoom = np.moveaxis(np.asarray(steps, dtype=np.float64), -1, 0)
+    centre = translation((shape[1] - 1) / 2, (shape[0] - 1) / 2)
+    motions = np.zeros((*x.shape, 3, 3))
+    motions[..., 0, 0] = motions[..., 1, 1] = (1 + zoom) * np.cos(roll)
+    motions[..., 1, 0] = (1 + zoom) * np.sin(roll)
+    motions[..., 0, 1] = -motions[..., 1, 0]
+    motions[..., 0, 2], motions[..., 1, 2], motions[..., 2, 2] = x, y, 1
+    return np.asarray(centre @ motions @ inverse(centre))
+
+
 @cache
 def rescaling(scale: float) -> Homography:
     """Return the map from pixels of an image to pixels of the same image rescaled: `(p + 0.5) * scale - 0.5`."""

@@ -139,6 +139,7 @@ def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
         yield from (("resample", level.resample), ("merge", level.merge), ("locate", level.locate))
         yield from (("locate", choice) for choice in level.fallbacks)
         yield "interpolate", level.interpolate
+    yield from (("refine", choice) for choice in plan.refine)
 
 
 def level_record(result: LevelResult) -> LevelRecord:

@@ -1,4 +1,4 @@
-"""The five kinds of components, and what each is called in hooks and in specs."""
+"""The six kinds of components, and what each is called in hooks and in specs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from photonpano.contributions import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
+    RefinerContribution,
     ResamplerContribution,
     SourceContribution,
 )
@@ -43,6 +44,7 @@ KINDS: Mapping[str, Kind] = {
         Kind("merger", "merge", "photonpano_mergers", MergerContribution),
         Kind("locator", "locate", "photonpano_locators", LocatorContribution),
         Kind("interpolator", "interpolate", "photonpano_interpolators", InterpolatorContribution),
+        Kind("refiner", "refine", "photonpano_refiners", RefinerContribution),
     )
 }
 """All kinds by name, in the order in which a run needs them."""

@@ -23,7 +23,7 @@ OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for k
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:
-    """Call the five hooks of one plugin that offer components, and check what they return.
+    """Call the hooks of one plugin that offer components, and check what they return.
 
     Args:
         plugin: a module, or any object, with hooks.

@@ -11,25 +11,27 @@ if TYPE_CHECKING:
     from photonpano.specs.plan import Choice, Plan
     from photonpano.values import StreamInfo
 
-STAGES = tuple(kind.section for kind in KINDS.values() if kind.section != "source")
+STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner"))
 """The sections of a spec that choose the components of a level, in the order of the loop."""
 
 
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
-    """Check a plan against its capture: every stage of every level, and the frame that the panorama lies in.
+    """Check a plan against its capture: every stage of every level, the refiners, and the frame that the panorama lies in.
 
     Reads no data. What levels share is reported once.
 
     Returns:
         The problems, each at its place in the spec; empty if there are none.
     """
-    sentences: dict[tuple[str, str], str] = {}
+    choices: dict[str, Choice] = {}
     for index, level in enumerate(plan.levels):
-        choices = {f"levels.{index}.{stage}": getattr(level, stage) for stage in STAGES}
+        choices |= {f"levels.{index}.{stage}": getattr(level, stage) for stage in STAGES}
         choices |= {f"levels.{index}.locate.fallback.{rank}": choice for rank, choice in enumerate(level.fallbacks)}
-        for where, choice in choices.items():
-            for sentence in complaints(choice, info):
-                sentences.setdefault((choice.contribution.name, sentence), where)
+    choices |= {f"refine.{index}": choice for index, choice in enumerate(plan.refine)}
+    sentences: dict[tuple[str, str], str] = {}
+    for where, choice in choices.items():
+        for sentence in complaints(choice, info):
+            sentences.setdefault((choice.contribution.name, sentence), where)
     problems = [plan.place(where).problem(sentence) for (_, sentence), where in sentences.items()]
     reference = plan.render.reference
     if isinstance(reference, int) and reference >= info.n_frames:

@@ -11,7 +11,16 @@ from photonpano.corrections import CORRECTIONS
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.schema_text import TolerantJsonSchema
 from photonpano.specs.aliases import LocatorAlias
-from photonpano.specs.resolution import DEFAULT_FALLBACK, DEFAULTS, LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
+from photonpano.specs.resolution import (
+    DEFAULT_FALLBACK,
+    DEFAULT_REFINER,
+    DEFAULTS,
+    LEVELS,
+    MAX_LEVELS,
+    SETTINGS,
+    UNTIL_CONVERGED,
+    VERSION,
+)
 from photonpano.specs.settings import LevelSettings, OutputSettings
 
 if TYPE_CHECKING:
@@ -24,6 +33,8 @@ SECTION = ["object", "null"]
 """A section may be left empty."""
 FALLBACK = "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}"
 """The description of the fallback of a locator."""
+REFINE = "the refiners that correct the motion after the last level, in order: one or a list, each a name or {use, with}"
+"""The description of the refiners, but for the default."""
 
 
 def json_schema(catalog: Catalog) -> Schema:
@@ -43,10 +54,10 @@ def json_schema(catalog: Catalog) -> Schema:
         own = [entry for entry in entries if entry.kind == kind.name]
         sections[kind.section] = _component(kind, own, schemas, DEFAULTS.get(kind.section))
         overrides[kind.section] = _component(kind, own, schemas, None)
-    single = [entry for entry in entries if entry.kind == "locator" and not isinstance(entry.contribution, LocatorAlias)]
-    locator = _component(KINDS["locator"], single, schemas, None) | {"type": "object", "required": ["use"]}
-    one = {"anyOf": [locator["properties"]["use"], locator]}
-    definitions["fallback"] = {"anyOf": [*one["anyOf"], {"type": "array", "items": one}, {"type": "null"}]}
+    one = _item(KINDS["locator"], entries, schemas)
+    definitions["fallback"] = _one_or_list(one)
+    refiners = _one_or_list(_item(KINDS["refiner"], entries, schemas))
+    sections["refine"] = {"description": f"{REFINE}; by default {DEFAULT_REFINER}"} | refiners
     for entry in entries:
         if isinstance(entry.contribution, LocatorAlias):
             definitions[_definition(schemas[entry.contribution.config])]["properties"]["backends"]["items"] = one
@@ -116,6 +127,18 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
+
+
+def _item(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema]) -> Schema:
+    """Return the schema of one component of a list: a name, or a mapping."""
+    own = [entry for entry in entries if entry.kind == kind.name and not isinstance(entry.contribution, LocatorAlias)]
+    component = _component(kind, own, schemas, None) | {"type": "object", "required": ["use"]}
+    return {"anyOf": [component["properties"]["use"], component]}
+
+
+def _one_or_list(item: Schema) -> Schema:
+    """Return the schema of a list of components, for which one alone may stand."""
+    return {"anyOf": [*item["anyOf"], {"type": "array", "items": item}, {"type": "null"}]}
 
 
 def _corrections(schemas: dict[type[BaseModel], Schema]) -> Schema:

@@ -62,6 +62,7 @@ class Plan:
         source: the capture.
         corrections: the corrections of its frames, in order.
         levels: one plan for each level, in order.
+        refine: the refiners that correct the motion after the last level, in order.
         until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
         graph: which pairs are registered, and what happens when the graph is disconnected.
         render: the panorama.
@@ -77,6 +78,7 @@ class Plan:
     source: Choice
     corrections: tuple[Correction, ...]
     levels: tuple[LevelPlan, ...]
+    refine: tuple[Choice, ...]
     until_converged: bool
     graph: GraphSettings
     render: RenderSettings

@@ -33,6 +33,8 @@ DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "direct", "
 """The components that a spec uses by default."""
 DEFAULT_FALLBACK = "opencv-sift"
 """The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks."""
+DEFAULT_REFINER = "short-spans"
+"""The refiner that corrects the motion, if it is installed and the spec names none."""
 KIND_OF = {kind.section: kind for kind in KINDS.values()}
 """The kind of component that a section chooses."""
 SETTINGS: dict[str, type[BaseModel]] = {
@@ -42,7 +44,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "run": RunSettings,
 }
 """The framework's own sections."""
-SECTIONS = ("version", "source", "corrections", *STAGES, "levels", *SETTINGS)
+SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
 _AGAIN = "would lose the same pairs again"
 
@@ -98,7 +100,8 @@ class _Resolver:
         root = spec.mapping(spec.data, "")
         if root is None:
             return None
-        spec.sections_of = self.sections_of(root)
+        refiners = self.items(KIND_OF["refine"], root.get("refine"), "refine", DEFAULT_REFINER)
+        spec.sections_of = self.sections_of(root, refiners)
         spec.check_keys(root, "", SECTIONS)
         if "version" not in root:
             spec.wrong_key("version", f"required: {VERSION}, the version of the format")
@@ -111,6 +114,7 @@ class _Resolver:
         spec.places = {name: spec.place(name) for name in STAGES} | spec.places
         corrections = resolved_corrections(root.get("corrections"), spec)
         stages = {name: self.stage(name, root.get(name), name) for name in STAGES}
+        refine = [self.item(KIND_OF["refine"], item, f"refine.{index}") for index, item in enumerate(refiners)]
         written = self.levels(root.get("levels"))
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
         settings: dict[str, Any] = {name: validate(model, root.get(name), name, spec) for name, model in SETTINGS.items()}
@@ -123,6 +127,7 @@ class _Resolver:
             "source": _component(source),
             "corrections": written_corrections(corrections),
             **chosen,
+            "refine": [_component(refiner) for refiner in refine if refiner],
             "levels": UNTIL_CONVERGED if until_converged else [_level(level, chosen) for level in levels if level],
             **{name: section.model_dump(mode="json") for name, section in settings.items()},
         }
@@ -130,6 +135,7 @@ class _Resolver:
             source,
             corrections,
             tuple(filter(None, levels)),
+            tuple(filter(None, refine)),
             until_converged,
             **settings,
             document=document,
@@ -139,11 +145,14 @@ class _Resolver:
             decisions=tuple(spec.decisions),
         )
 
-    def sections_of(self, root: dict[str, Any]) -> dict[str, list[str]]:
+    def sections_of(self, root: dict[str, Any], refiners: list[Any]) -> dict[str, list[str]]:
         """Return the sections in which each key may stand, for the components that the spec chooses."""
         keys = {f"{name}.with": self.keys_of(KIND_OF[name], _name(name, root.get(name))) for name in ("source", *STAGES)}
+        for index, item in enumerate(refiners):
+            where = f"refine.{index}.with" if isinstance(root.get("refine"), list) else "refine.with"
+            keys[where] = self.keys_of(KIND_OF["refine"], _name("refine", {"use": item} if isinstance(item, str) else item))
         keys |= {name: model.model_fields for name, model in SETTINGS.items()} | {"locate": ("fallback",)}
-        found: dict[str, list[str]] = {}
+        found = {name: [""] for name in SECTIONS}
         for section, own in keys.items():
             for key in own:
                 found.setdefault(key, []).append(section)
@@ -203,16 +212,26 @@ class _Resolver:
             if expanded is None or self.is_alias(kind, expanded, where):
                 return None
             section = expanded
-        fallback = section.get("fallback")
-        if name != "locate":
-            return section
-        if fallback is None:
-            default = "use" not in content and DEFAULT_FALLBACK in self.catalog.names(kind.name)
-            section["fallback"] = [DEFAULT_FALLBACK] if default else []
-        elif not isinstance(fallback, list):
-            section["fallback"] = [fallback]
-            spec.places = spec.places_under(f"{where}.fallback", f"{where}.fallback.0") | spec.places
+        if name == "locate":
+            default = None if "use" in content else DEFAULT_FALLBACK
+            section["fallback"] = self.items(kind, section.get("fallback"), f"{where}.fallback", default)
         return section
+
+    def items(self, kind: Kind, data: Any, where: str, default: str | None) -> list[Any]:
+        """Return what is written in a list of components; one alone is a list of it.
+
+        Args:
+            kind: the kind of the components.
+            data: the list; None stands for the default.
+            where: its path.
+            default: the component that is chosen if it is installed and nothing is written.
+        """
+        if data is None:
+            return [default] if default in self.catalog.names(kind.name) else []
+        if isinstance(data, list):
+            return data
+        self.spec.places = self.spec.places_under(where, f"{where}.0") | self.spec.places
+        return [data]
 
     def fallbacks(self, items: list[Any], where: str, first: Choice | None, inherited: bool) -> tuple[Choice, ...]:
         """Resolve the locators to which lost pairs are offered.
@@ -226,7 +245,7 @@ class _Resolver:
         tried = [] if first is None else [first]
         for index, item in enumerate(items):
             path = f"{where}.fallback.{index}"
-            choice = self.fallback(item, path)
+            choice = self.item(KIND_OF["locate"], item, path)
             if choice is None:
                 continue
             name = choice.contribution.name
@@ -238,22 +257,24 @@ class _Resolver:
                 self.spec.wrong_key(where, f"the fallback {name!r} has the same keys, and {_AGAIN}")
         return tuple(tried if first is None else tried[1:])
 
-    def fallback(self, item: Any, where: str) -> Choice | None:
-        """Resolve one locator to which lost pairs are offered."""
-        spec, kind = self.spec, KIND_OF["locate"]
+    def item(self, kind: Kind, item: Any, where: str) -> Choice | None:
+        """Resolve one component of a list: a name, or a mapping."""
+        spec = self.spec
         if isinstance(item, str):
             item = {"use": item}
             if where in spec.places:
                 spec.places = {f"{where}.use": spec.places[where]} | spec.places
         if not isinstance(item, dict):
-            spec.wrong(where, f"expected the name of a locator, or a mapping such as {{use: NAME}}, got {given(item)}")
+            spec.wrong(where, f"expected the name of a {kind.name}, or a mapping such as {{use: NAME}}, got {given(item)}")
             return None
         if self.is_alias(kind, item, where):
             return None
-        if "fallback" in item:
+        known = ["use", "with"]
+        if kind is KIND_OF["locate"] and "fallback" in item:
+            known.append("fallback")
             message = "a fallback cannot have a fallback; list all of them, in the order in which they are tried"
             spec.wrong_key(f"{where}.fallback", message)
-        spec.check_keys(item, where, ("use", "with", "fallback"), below=self.keys_of(kind, item.get("use")))
+        spec.check_keys(item, where, known, below=self.keys_of(kind, item.get("use")))
         return self.component(kind, item, where)
 
     def component(self, kind: Kind, section: dict[str, Any], where: str) -> Choice | None:

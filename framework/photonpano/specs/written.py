@@ -53,7 +53,7 @@ class WrittenSpec:
             chain that becomes a fallback, has an entry for its new path with the place where it was written.
         problems: what is wrong, so far.
         unreadable: the paths of values that could not be read; no further problem with them is reported.
-        sections_of: the sections in which a key may stand, such as `resample.with` for `group_size`.
+        sections_of: the sections in which a key may stand, such as `resample.with` for `group_size`; "" for a section itself.
         remark: added to the message of every problem.
         directory: what relative paths count from.
         catalog: what can be chosen.
@@ -122,6 +122,8 @@ class WrittenSpec:
         """Return the message for an unknown key: where it belongs, else the nearest of the keys that are known."""
         _, *inside_level = where.split(".", 2) if where.startswith("levels.") else ("", "", where)
         sections = [f"`{section}`" for section in self.sections_of.get(key, ()) if section != inside_level[-1]]
+        if "" in self.sections_of.get(key, ()):
+            return f"unknown key; `{key}` is a section of its own, not part of another"
         if sections:
             return f"unknown key; it belongs under {listed(sections, 'or')}"
         return f"unknown key; {suggestion(key, known) or 'no keys are allowed here'}"

@@ -5,6 +5,7 @@ from photonpano.values.capture import CaptureSummary, Decision, DecisionValue, S
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.motion import Edge, Located, NotLocated
+from photonpano.values.refinement import Refined, SpanResiduals
 
 __all__ = [
     "BoolArray",
@@ -22,7 +23,9 @@ __all__ = [
     "Located",
     "NotLocated",
     "Panorama",
+    "Refined",
     "Response",
+    "SpanResiduals",
     "StreamInfo",
     "VirtualExposure",
     "true_spans",

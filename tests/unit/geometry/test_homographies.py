@@ -17,6 +17,7 @@ from photonpano.geometry import (
     parameters,
     rescaled,
     rescaling,
+    step_motions,
     translation,
 )
 
@@ -30,6 +31,13 @@ points = st.lists(st.tuples(st.floats(-10, 600), st.floats(-10, 300)), min_size=
 def test_apply_divides_by_depth() -> None:
     tilted = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.001, 0.0, 1.0]])
     np.testing.assert_allclose(apply(tilted, [[100, 50], [0, 0]]), [[105 / 1.1, 50 / 1.1], [5, 0]])
+
+
+def test_step_motions_shift_roll_and_zoom_about_centre_of_frame() -> None:
+    shifted, rolled, zoomed = step_motions([[1, 2, 0, 0], [0, 0, np.pi / 2, 0], [0, 0, 0, 0.5]], (11, 21))
+    np.testing.assert_allclose(shifted, translation(1, 2))
+    np.testing.assert_allclose(apply(rolled, [[10, 5], [14, 5]]), [[10, 5], [10, 9]], atol=1e-12)
+    np.testing.assert_allclose(apply(zoomed, [[10, 5], [14, 7]]), [[10, 5], [16, 8]], atol=1e-12)
 
 
 def test_apply_takes_x_as_column_and_y_as_row() -> None:

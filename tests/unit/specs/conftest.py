@@ -11,6 +11,7 @@ from photonpano import (
     LocatorContribution,
     MergerContribution,
     Recognised,
+    RefinerContribution,
     Requirement,
     ResamplerContribution,
     SourceContribution,
@@ -82,6 +83,14 @@ class LucasKanadeConfig(Config):
     hold_frames: float = Field(0, ge=0, description="how long the velocity is held, in frames")
 
 
+class SpansConfig(Config):
+    span_frames: int = Field(8, ge=1, description="frames of a span")
+
+
+class DriftConfig(Config):
+    knots: int = Field(4, ge=2, description="of the spline")
+
+
 class MoodyConfig(Config):
     mood: str = ""
 
@@ -100,6 +109,10 @@ def missing_file(config):
 
 def npy(path):
     return Recognised({"path": path}, "its name ends in .npy") if path.suffix == ".npy" else None
+
+
+def too_few_spans(config, info):
+    return [f"a capture of {info.n_frames} frames has no two spans"] if 2 * config.span_frames > info.n_frames else []
 
 
 def too_few_frames(config, info):
@@ -128,6 +141,8 @@ CONTRIBUTIONS = [
     LocatorContribution(name="moody", summary="Toy", config=MoodyConfig, build=unbuilt),
     InterpolatorContribution(name="smoothing-spline", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
     InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
+    RefinerContribution(name="short-spans", summary="Toy", config=SpansConfig, build=unbuilt, check=too_few_spans),
+    RefinerContribution(name="drift", summary="Toy", config=DriftConfig, build=unbuilt),
 ]
 TWICE = LocatorContribution(name="twice", summary="Toy", config=DirectConfig, build=unbuilt)
 

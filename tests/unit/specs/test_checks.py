@@ -37,6 +37,14 @@ def test_check_stream_reports_levels_until_converged_once(catalog):
     ]
 
 
+def test_check_stream_reports_refiners_where_they_are_written(catalog):
+    spec = "version: 1\nsource: {use: simulator}\nresample: {with: {group_size: 50}}\n"
+    long = "{use: short-spans, with: {span_frames: 60}}"
+    for written, place in ((f"[drift, {long}]", "4:17: refine.1"), (long, "4:1: refine")):
+        plan = parse_spec(f"{spec}refine: {written}\n", catalog=catalog)
+        assert [str(each) for each in check_stream(plan, SHORT)] == [f"{place}: a capture of 100 frames has no two spans"]
+
+
 def test_check_stream_reports_fallbacks_where_they_are_written(catalog):
     class Sized(Config):
         at_least: int = Field(description="frames")

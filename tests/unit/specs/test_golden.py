@@ -50,9 +50,16 @@ def test_good_spec_resolves_to_document_that_resolves_to_itself(path, catalog, v
     plan = load_spec(path, catalog=catalog)
     again = parse_spec(json.loads(json.dumps(plan.document)), catalog=catalog)
     assert again.document == plan.document
-    assert (again.source, again.corrections, again.levels, again.graph, again.render, again.output, again.run) == (
-        (plan.source, plan.corrections, plan.levels, plan.graph, plan.render, plan.output, plan.run)
-    )
+    assert (
+        again.source,
+        again.corrections,
+        again.levels,
+        again.refine,
+        again.graph,
+        again.render,
+        again.output,
+        again.run,
+    ) == ((plan.source, plan.corrections, plan.levels, plan.refine, plan.graph, plan.render, plan.output, plan.run))
     validator.validate(plan.document)
 
 

@@ -122,6 +122,38 @@ def test_level_keeps_the_fallbacks_until_it_names_a_locator_or_fallbacks_of_its_
     assert plan.document["levels"][3]["locate"]["fallback"] == []
 
 
+@pytest.mark.parametrize(
+    ("written", "chosen"),
+    [
+        (None, ["short-spans"]),
+        ([], []),
+        ("drift", ["drift"]),
+        ({"use": "drift"}, ["drift"]),
+        (["drift", {"use": "short-spans"}, "drift"], ["drift", "short-spans", "drift"]),
+    ],
+)
+def test_refiners_are_a_list_in_order_and_short_spans_by_default(written, chosen, catalog):
+    plan = parse_spec(MINIMAL | {"refine": written}, catalog=catalog)
+    assert [choice.contribution.name for choice in plan.refine] == chosen
+    assert [each["use"] for each in plan.document["refine"]] == chosen
+    assert list(plan.document)[6:9] == ["interpolate", "refine", "levels"]
+
+
+def test_default_refiner_is_left_out_where_it_is_not_installed(catalog):
+    without = Catalog(tuple(entry for entry in catalog.rows if entry.name != "short-spans"))
+    assert parse_spec(MINIMAL, catalog=without).refine == ()
+    (message,) = messages(MINIMAL | {"refine": "short-spans"}, catalog=without)
+    assert message == "refine.0.use: there is no refiner 'short-spans'; known: drift"
+
+
+def test_places_of_refiners_are_found_by_their_paths_in_the_document(catalog):
+    spec = "version: 1\nsource: {use: simulator}\nrefine: {use: drift, with: {knots: 5}}"
+    places = parse_spec(spec, catalog=catalog).places
+    assert (places["refine.0.use"].column, places["refine.0.with.knots"].column) == (10, 29)
+    places = parse_spec(spec.replace("{use: drift, with: {knots: 5}}", "[drift, short-spans]"), catalog=catalog).places
+    assert (places["refine.0.use"].column, places["refine.1.use"].column) == (10, 17)
+
+
 def test_places_of_fallbacks_are_found_by_their_paths_in_the_document(catalog):
     """Where a fallback is one name or one mapping, the document has a list of mappings."""
     spec = (

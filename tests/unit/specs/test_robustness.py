@@ -15,6 +15,7 @@ SPEC = {
     "source": {"use": "simulator", "with": {"frames": 10, "size": [3, 4], "flip": {"rows": True}}},
     "resample": {"use": "midpoint", "with": {"group_size": 5, "stride": 2}},
     "locate": {"with": {"max_steps": 7}, "fallback": ["opencv-sift", {"use": "opencv-sift", "with": {"ratio": 0.9}}]},
+    "refine": ["drift", {"use": "short-spans", "with": {"span_frames": 4}}],
     "levels": [{"scale": 0.5, "locate": {"use": "direct", "with": {"max_steps": 3}, "fallback": "opencv-sift"}}, {}],
     "graph": {"skips": [1.0, 2.0], "disconnected": "largest"},
     "render": {"scale": 2.0, "reference": "first"},
