@@ -25,6 +25,7 @@ from photonpano_core.constant_groups import ConstantGroupsResampler
 from photonpano_core.group_size import AutoResampler
 from photonpano_core.grouping import shortest_of, too_short
 from photonpano_core.midpoint import MidpointResampler
+from photonpano_core.npy import NPY
 from photonpano_core.packed_npy import PACKED_NPY
 from photonpano_core.sliding_window import SlidingWindowResampler
 from photonpano_core.stratified import StratifiedResampler
@@ -39,8 +40,9 @@ Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
 @hookimpl
 def photonpano_sources() -> Iterator[SourceContribution]:
-    """Offer packed .npy captures."""
+    """Offer .npy captures, packed and not."""
     yield PACKED_NPY
+    yield NPY
 
 
 @hookimpl

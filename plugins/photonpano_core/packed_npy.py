@@ -18,6 +18,7 @@ from photonpano.reading import (
     is_gzip,
     npy_header,
     objections,
+    require_frames,
     require_whole,
     unpacked,
     unpacked_start,
@@ -81,10 +82,7 @@ def _layout(config: PackedNpyConfig) -> tuple[NpyHeader, FrameLayout]:
             f"{path} has the shape {header.shape}; a packed capture has 3 dimensions, frames, height and bytes of a row, and "
             "one of colour a fourth, of 3 channels"
         )
-    if min(header.shape) < 1:
-        raise InputError(f"{path} is empty: its shape is {header.shape} (frames, height, bytes of a row)")
-    if header.fortran_order:
-        raise InputError(f"{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)")
+    require_frames(path, header, "frames, height, bytes of a row")
     if colour and config.channel is None:
         raise InputError(f"{path} is a capture in colour, of shape {header.shape}; choose a channel: 0, 1 or 2")
     if not colour and config.channel is not None:

@@ -13,7 +13,7 @@ from photonpano.reading.files import (
     reading,
 )
 from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, unpacked_start
-from photonpano.reading.npy import NpyHeader, npy_header, require_whole
+from photonpano.reading.npy import NpyHeader, npy_header, require_frames, require_whole
 from photonpano.reading.packed_files import FrameFile, PackedFileSource
 from photonpano.reading.packed_layout import FrameLayout
 from photonpano.source_wrapper import Closing
@@ -39,6 +39,7 @@ __all__ = [
     "read_picture",
     "read_start",
     "reading",
+    "require_frames",
     "require_whole",
     "unpacked",
     "unpacked_start",

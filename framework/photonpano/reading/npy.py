@@ -81,6 +81,23 @@ def require_whole(path: Path, header: NpyHeader) -> None:
         )
 
 
+def require_frames(path: Path, header: NpyHeader, axes: str) -> None:
+    """Refuse an array without values, or one that is not in C order.
+
+    Args:
+        path: the file, for the message.
+        header: its header.
+        axes: the names of the axes, such as "frames, height, width".
+
+    Raises:
+        InputError: it is so.
+    """
+    if min(header.shape) < 1:
+        raise InputError(f"{path} is empty: its shape is {header.shape} ({axes})")
+    if header.fortran_order:
+        raise InputError(f"{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)")
+
+
 def _guess(path: Path) -> str:
     with path.open("rb") as file:
         start = file.read(4)

@@ -22,6 +22,43 @@ class TestPackedNpy(SourceConformance):
         return {"path": folder / "capture.npy", "width": frames.shape[2]}
 
 
+class TestNpyBits(SourceConformance):
+    contribution = CATALOG.find("source", "npy").contribution
+    config = {"holds": "bits"}
+    wrong = ({"path": "there-is-no-such-file.npy"},)
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        np.save(folder / "capture.npy", frames.astype(bool))
+        return {"path": folder / "capture.npy"}
+
+
+class TestNpyBitsFramesLast(TestNpyBits):
+    config = {"holds": "bits", "frames": "last"}
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        np.save(folder / "capture.npy", np.ascontiguousarray(np.moveaxis(frames * np.uint8(255), 0, -1)))
+        return {"path": folder / "capture.npy"}
+
+
+class TestNpySums(SourceConformance):
+    contribution = CATALOG.find("source", "npy").contribution
+    config = {"holds": "sums", "frames_per_sum": 1023}
+    bit_depth = 10
+    wrong = ({"path": "there-is-no-such-file.npy"},)
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        np.save(folder / "capture.npy", frames.astype(">i8"))
+        return {"path": folder / "capture.npy"}
+
+
+class TestNpySumsFramesLast(TestNpySums):
+    config = {"holds": "sums", "frames_per_sum": 1023, "frames": "last"}
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        np.save(folder / "capture.npy", np.ascontiguousarray(np.moveaxis(frames, 0, -1)))
+        return {"path": folder / "capture.npy"}
+
+
 class TestMidpoint(ResamplerConformance):
     contribution = CATALOG.find("resampler", "midpoint").contribution
     config = {"group_size": 100}

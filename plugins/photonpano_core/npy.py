@@ -1,0 +1,206 @@
+"""Source `npy`: frames in a .npy file, a pixel to a value: zeros and ones, or sums of binary frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from photonpano import Config, FrameSpan, InputError, SourceContribution, SpecPath, StreamInfo
+from photonpano.photometry import BinarySumResponse
+from photonpano.reading import (
+    BinarySource,
+    Closing,
+    FrameLayout,
+    NpyHeader,
+    OpenFiles,
+    gzipped_npy_header,
+    is_gzip,
+    npy_header,
+    objections,
+    require_frames,
+    require_whole,
+    unpacked,
+)
+
+_READ_BYTES = 4 * 1024**2
+"""Bytes of the frames that are read at once."""
+
+
+class NpyConfig(Config):
+    """A capture in one .npy file: integers or bool (frames, height, width), a pixel to a value."""
+
+    path: SpecPath = Field(description="the .npy file; a file compressed with gzip is unpacked once, to a file beside it")
+    holds: Literal["bits", "sums"] = Field(
+        description="bits: binary frames, of 0 and 1, of 0 and 255, or bool; sums: each frame is the sum of binary frames"
+    )
+    frames_per_sum: int | None = Field(
+        None, ge=1, le=65535, description="number of binary frames in each sum; required for sums"
+    )
+    frames: Literal["first", "last"] = Field(
+        "first", description="the axis of the frames: first for (frames, height, width), last for (height, width, frames)"
+    )
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames (or sums) a second, in Hz; leave it out if unknown")
+
+    @model_validator(mode="after")
+    def _sums_have_a_number(self) -> Self:
+        if self.holds == "sums" and self.frames_per_sum is None:
+            raise ValueError("sums need frames_per_sum, the number of binary frames in each")
+        if self.holds == "bits" and self.frames_per_sum is not None:
+            raise ValueError("frames_per_sum is for sums; leave it out, or write holds: sums")
+        return self
+
+
+class _Values:
+    """Reads the values of frames in a .npy file, from any thread."""
+
+    def __init__(self, path: Path, header: NpyHeader, frames_last: bool) -> None:
+        n_frames, height, width = header.shape[-1:] + header.shape[:-1] if frames_last else header.shape
+        self.path = path
+        self.shape = n_frames, height, width
+        self.frame_bytes = height * width * header.dtype.itemsize
+        self.files = OpenFiles()
+        self._header = header
+        # Frames along the last axis are scattered over the file.
+        self._scattered = np.memmap(path, header.dtype, "r", header.offset, header.shape) if frames_last else None
+
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the frames of a span, (n, H, W), a few at a time, and their places in the span."""
+        for block in span.blocks(max(1, _READ_BYTES // self.frame_bytes)):
+            yield slice(block.start - span.start, block.stop - span.start), self._read(block)
+
+    def _read(self, span: FrameSpan) -> NDArray[Any]:
+        if self._scattered is not None:
+            return np.ascontiguousarray(np.moveaxis(self._scattered[..., span.start : span.stop], -1, 0))
+        values = np.empty((len(span), *self.shape[1:]), self._header.dtype)
+        self.files.read(self.path, self._header.offset + span.start * self.frame_bytes, values.view(np.uint8))
+        return values
+
+    def require(self, wrong: NDArray[np.bool_], values: NDArray[Any], first: int, remedy: str) -> None:
+        """Raise for the first of the values, of frames from `first` on, that is wrong."""
+        if wrong.any():
+            frame, row, column = np.argwhere(wrong)[0].tolist()
+            raise InputError(
+                f"{self.path} holds the value {values[frame, row, column]} in frame {first + frame}, row {row}, column "
+                f"{column}; {remedy}"
+            )
+
+
+class NpyBits(BinarySource):
+    """Binary frames, a pixel to a value.
+
+    Raises:
+        InputError: when frames are read: a value is not a bit.
+    """
+
+    def __init__(self, values: _Values, frame_rate_hz: float | None) -> None:
+        n_frames, height, width = values.shape
+        super().__init__(n_frames, FrameLayout((height, width), (height, -(-width // 8))), frame_rate_hz)
+        self._values = values
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span, packed: see `BinarySource`."""
+        for place, values in self._values.blocks(span):
+            if values.max() > 1 or values.min() < 0:
+                wrong = (values != 0) & (values != 1) & (values != 255)
+                self._values.require(wrong, values, span.start + place.start, "bits are 0 and 1, or 0 and 255")
+            yield place, np.packbits(values != 0, axis=2)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._values.files.close()
+
+
+class NpySums(Closing):
+    """Sums of binary frames: a `photonpano.Source`.
+
+    Raises:
+        InputError: when frames are read: a value cannot be a sum of so many binary frames.
+    """
+
+    def __init__(self, values: _Values, binary_frames: int, frame_rate_hz: float | None) -> None:
+        self.info = StreamInfo(*values.shape, frame_rate_hz, "intensity", binary_frames.bit_length())
+        self.response = BinarySumResponse(binary_frames)
+        self.valid = np.ones(self.info.frame_shape, np.bool_)
+        self.valid.flags.writeable = False
+        self._values = values
+
+    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        for _, sums in self._pieces(span):
+            counts += sums.sum(axis=0, dtype=np.uint32)
+        return counts
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """Return the frames of a span: (n, H, W), each the sum of binary frames."""
+        self.info.require(span)
+        shape = len(span), *self.info.frame_shape
+        frames = np.empty(shape, np.uint8) if self.info.bit_depth <= 8 else np.empty(shape, np.uint16)
+        for place, sums in self._pieces(span):
+            frames[place] = sums
+        return frames
+
+    def _pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        most = self.response.n
+        for place, values in self._values.blocks(span):
+            if values.max() > most or values.min() < 0:
+                remedy = f"sums of frames_per_sum: {most} go from 0 to {most}; correct frames_per_sum"
+                self._values.require((values < 0) | (values > most), values, span.start + place.start, remedy)
+            yield place, values
+
+    def close(self) -> None:
+        """Close the file."""
+        self._values.files.close()
+
+
+def _header(config: NpyConfig) -> NpyHeader:
+    """Return the header of the capture.
+
+    Raises:
+        InputError: the file is missing, damaged, or does not agree with the config.
+    """
+    path = config.path
+    header = gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
+    if header.dtype.kind not in "bui":
+        raise InputError(
+            f"{path} holds {header.dtype} values; {config.holds} are bool or whole numbers: convert them with "
+            f"cube.astype({_TYPES[config.holds]})"
+        )
+    if len(header.shape) != 3:
+        raise InputError(f"{path} has the shape {header.shape}; a capture has 3 dimensions, frames, height and width")
+    require_frames(path, header, "height, width, frames" if config.frames == "last" else "frames, height, width")
+    if not is_gzip(path):
+        require_whole(path, header)
+    return header
+
+
+_TYPES = {"bits": "bool", "sums": "numpy.uint16"}
+
+
+def _open(config: NpyConfig) -> NpyBits | NpySums:
+    header = _header(config)
+    path = unpacked(config.path) if is_gzip(config.path) else config.path
+    values = _Values(path, header, config.frames == "last")
+    if config.frames_per_sum is None:
+        return NpyBits(values, config.frame_rate_hz)
+    return NpySums(values, config.frames_per_sum, config.frame_rate_hz)
+
+
+def _check(config: NpyConfig) -> Sequence[str]:
+    return objections(_header, config)
+
+
+NPY = SourceContribution(
+    name="npy",
+    summary="Frames in a .npy file, a pixel to a value: zeros and ones, or sums of binary frames",
+    config=NpyConfig,
+    build=lambda config, _: _open(config),
+    check=_check,
+    suffixes=(".npy", ".gz"),
+)
