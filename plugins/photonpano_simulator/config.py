@@ -1,4 +1,4 @@
-"""The config of the simulator: scene, camera path, sensor."""
+"""The config of the simulator: scene, camera path, lens, sensor, and what disturbs a capture."""
 
 from __future__ import annotations
 
@@ -31,20 +31,27 @@ class PhotoScene(Config):
 Frequency = Annotated[float, Field(gt=0, le=1e6)]
 Rate = Annotated[float, Field(gt=0, le=100)]
 Side = Annotated[int, Field(ge=8, le=8192)]
+Size = Annotated[float, Field(gt=0, le=10)]
+Place = Annotated[float, Field(ge=-10, le=10)]
+Speed = Annotated[float, Field(ge=-100, le=100)]
 
 
 class Shake(Config):
-    """The trembling of a hand: along x, along y and as a roll, three sines each, with phases by chance."""
+    """Tremor along x, along y and as a roll: a sum of sines each, with random phases."""
 
     rms_px: float = Field(1.0, gt=0, le=100, description="root mean square of the displacement along x, and along y, in px")
     roll_rms_deg: float = Field(0.05, ge=0, le=5, description="root mean square of the roll about the optical axis, in degrees")
-    frequencies_hz: tuple[Frequency, Frequency, Frequency] = Field(
-        (25.0, 90.0, 210.0), description="three frequencies, in Hz; each has a third of the power"
+    frequencies_hz: tuple[Frequency, ...] = Field(
+        (25.0, 90.0, 210.0),
+        min_length=1,
+        max_length=64,
+        description="frequencies of the sines, in Hz, which share the power equally; the default is a hand's tremor, and a "
+        "motor or a fan adds frequencies up to thousands",
     )
 
 
 class _Path(Config):
-    shake: Shake | None = Field(None, description="tremor of a hand, added to the path; none by default")
+    shake: Shake | None = Field(None, description="tremor of the camera, added to the path; none by default")
 
 
 class _Aimed(Config):
@@ -106,6 +113,35 @@ class FilePath(_Path):
     )
 
 
+class Lens(Config):
+    """What the lens of the camera does to the image.
+
+    A pixel at the distance r from the middle of the frame, in half-diagonals of the frame, shows what a lens without
+    distortion images at the distance `r / (1 + k1 r^2 + k2 r^4)` in the same direction (the division model of Fitzgibbon,
+    CVPR 2001). The light that reaches it is `1 - vignette r^2` of that in the middle.
+    """
+
+    k1: float = Field(
+        0.0,
+        ge=-0.2,
+        le=0.2,
+        description="radial distortion: relative displacement at the corner, where -0.03 is a barrel of 3 %. A pixel at r "
+        "half-diagonals from the middle shows what an ideal lens images at r / (1 + k1 r^2 + k2 r^4)",
+    )
+    k2: float = Field(0.0, ge=-0.2, le=0.2, description="radial distortion of fourth order, see k1")
+    vignette: float = Field(
+        0.0, ge=0, le=1, description="fraction of the light that is lost at the corner; it grows with the square of r"
+    )
+
+
+class Dirt(Config):
+    """Specks on the window of the sensor, which stand still in the frame."""
+
+    specks: int = Field(20, ge=1, le=10_000, description="number of specks, at random places")
+    radius_px: float = Field(6.0, gt=0, le=1000, description="standard deviation of the Gaussian shape of a speck, in px")
+    loss: float = Field(0.8, gt=0, le=1, description="fraction of the light that is lost in the middle of a speck")
+
+
 class Sensor(Config):
     """A single-photon camera: a pixel of a frame is 1 if it detected at least one photon."""
 
@@ -121,6 +157,13 @@ class Sensor(Config):
         description="dark counts per frame of a hot pixel, drawn log-uniformly between these two",
     )
     mask_hot_pixels: bool = Field(False, description="whether hot pixels are masked")
+    gain_std: float = Field(
+        0.0,
+        ge=0,
+        le=0.3,
+        description="standard deviation of the sensitivity of the pixels, relative to its mean; it does not change with time",
+    )
+    dirt: Dirt | None = Field(None, description="specks on the window of the sensor; none by default")
 
 
 class IntensitySensor(Config):
@@ -142,6 +185,40 @@ class IntensitySensor(Config):
     )
 
 
+class FrameObject(Config):
+    """A rectangle in front of the scene, with a texture of its own."""
+
+    size: tuple[Size, Size] = Field(
+        (0.5, 0.5), description="width and height, as shares of those of the frame; (0.5, 0.5) covers a quarter of it"
+    )
+    at: tuple[Place, Place] = Field(
+        (0.5, 0.5),
+        description="(x, y) of its middle when it appears, as shares of the width and the height of the frame, whose middle "
+        "is (0.5, 0.5)",
+    )
+    moves_px: tuple[Speed, Speed] = Field(
+        (0.0, 0.0), description="its own motion, (x, y) in px per frame; (0, 0) stands still, like a dirty window"
+    )
+    follows: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="its share in the motion of the scene through the frame: 0 stays in the frame, 1 is fixed to the scene, "
+        "more is nearer to the camera",
+    )
+    flux: float = Field(1.0, ge=0, le=1000, description="its mean flux, relative to the mean of the scene")
+    seed: int = Field(0, ge=0, description="another seed is another texture")
+    first: int = Field(0, ge=0, description="index of the frame in which it appears")
+    frames: int | None = Field(None, ge=1, description="number of frames in which it is there; by default all that follow")
+
+
+class FrameRange(Config):
+    """Successive frames, counted before any are dropped or repeated."""
+
+    at: int = Field(ge=0, description="index of the first frame, counted before any are dropped or repeated")
+    frames: int = Field(1, ge=1, le=10_000_000, description="number of frames")
+
+
 class SimulationConfig(Config):
     """What simulations of all cameras share."""
 
@@ -156,11 +233,23 @@ class SimulationConfig(Config):
         description="incident photons per pixel per frame, averaged over the scene; the sensor detects "
         "quantum_efficiency times as many",
     )
-    n_frames: int = Field(2000, ge=1, le=10_000_000, description="number of frames")
+    drift: float = Field(
+        1.0,
+        ge=1e-3,
+        le=1e3,
+        description="light of the last frame divided by that of the first; between them it changes exponentially",
+    )
+    n_frames: int = Field(2000, ge=1, le=10_000_000, description="number of frames that the camera takes")
     frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")
     frame_rate_hz: float = Field(96_800.0, gt=0, le=1e9, description="frames a second, in Hz")
     focal_length_px: float = Field(4464.0, ge=100, le=1e6, description="focal length of the camera, in px")
-    seed: int | None = Field(None, ge=0, description="seed of photons, hot pixels and shake; by default the seed of the run")
+    lens: Lens = Field(Lens(), description="the lens of the camera")
+    objects: tuple[FrameObject, ...] = Field((), max_length=100, description="rectangles in front of the scene")
+    drops: tuple[FrameRange, ...] = Field((), description="frames that are missing in the capture")
+    repeats: tuple[FrameRange, ...] = Field(
+        (), description="frames that the capture holds twice: all of the range, and then all of it again"
+    )
+    seed: int | None = Field(None, ge=0, description="seed of photons, pixels and shake; by default the seed of the run")
 
 
 class SimulatorConfig(SimulationConfig):
@@ -179,6 +268,6 @@ class CameraSimulatorConfig(SimulationConfig):
         description="incident photons per pixel per frame, averaged over the scene; the sensor detects "
         "quantum_efficiency times as many",
     )
-    n_frames: int = Field(200, ge=1, le=10_000_000, description="number of frames")
+    n_frames: int = Field(200, ge=1, le=10_000_000, description="number of frames that the camera takes")
     frame_rate_hz: float = Field(500.0, gt=0, le=1e9, description="frames a second, in Hz")
     sensor: IntensitySensor = Field(IntensitySensor(), description="the camera")

@@ -25,13 +25,19 @@ def _build(config: SimulatorConfig | CameraSimulatorConfig, context: SourceConte
 
 
 def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
-    """Look for missing files, and for a path that leaves the scene where its size is known."""
+    """Look for missing files, for wrong ranges of frames, and for a path that leaves the scene where its size is known."""
+    from photonpano_simulator.delivery import delivered
+
     files = [config.sensor.dark_rates, config.sensor.hot_pixels] if isinstance(config.sensor, Sensor) else []
     if isinstance(config.scene, PhotoScene):
         files.append(config.scene.file)
     if isinstance(config.path, FilePath):
         files.append(config.path.file)
     problems = [missing_file(file) for file in files if file is not None and not file.is_file()]
+    try:
+        delivered(config)
+    except InputError as error:
+        problems.append(str(error))
     if isinstance(config.scene, StreetScene) and not isinstance(config.path, FilePath):
         from photonpano_simulator.paths import camera_path
 

@@ -19,6 +19,7 @@ class IntensityCamera:
         bits: bits of a level.
         exposure: fraction of the frame period during which the shutter is open.
         valid: (H, W) bool, all True.
+        gains: (H, W) float32, the sensitivity of each pixel, all 1.
     """
 
     kind: Literal["intensity"] = "intensity"
@@ -30,6 +31,7 @@ class IntensityCamera:
         noise = float(np.hypot(config.read_noise, photons_per_level / np.sqrt(12)))
         self.response = IntensityResponse(photons_per_level, config.black_level, self._top, noise)
         self.valid: NDArray[np.bool_] = np.ones(frame_shape, np.bool_)
+        self.gains: NDArray[np.float32] = np.ones(frame_shape, np.float32)
 
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
         """Take a frame.

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import apply, corners, normalised
+from photonpano.geometry import apply, inverse, normalised
 from photonpano.reading import read_array
 from photonpano_simulator.config import (
     FilePath,
@@ -25,6 +25,7 @@ from photonpano_simulator.config import (
     SimulationConfig,
     SplinePath,
 )
+from photonpano_simulator.lens import outline
 from photonpano_simulator.sensor import Draw, generator
 
 _DENSE = 100_000
@@ -50,8 +51,14 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
         shaking = _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
         homographies = homographies @ frame @ shaking @ np.linalg.inv(frame)
     homographies = normalised(homographies)
-    _require_inside(homographies, config.frame_shape, scene_shape)
+    _require_inside(homographies, outline(config.lens, config.frame_shape), scene_shape)
     return homographies
+
+
+def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return how far the scene has moved through the middle of the frame since the first frame: (T, 2) px."""
+    middle = _middle(frame_shape)
+    return np.asarray(apply(inverse(homographies), apply(homographies[0], middle[None]))[:, 0] - middle)
 
 
 def _centres(path: PanPath | ScanPath | LoopPath | SplinePath | HandShakePath, n_frames: int) -> FloatArray:
@@ -145,7 +152,7 @@ def _shake_rotations(shake: Shake, n_frames: int, frame_rate_hz: float, focal: f
     phases = rng.uniform(0, 2 * np.pi, (3, len(shake.frequencies_hz), 1))
     phase = 2 * np.pi * np.asarray(shake.frequencies_hz)[:, None] * np.arange(n_frames) / frame_rate_hz
     # The sum of n sines of amplitude sqrt(2 / n) has the root mean square 1.
-    x, y, roll = np.sqrt(2 / len(phases[0])) * np.sin(phase + phases).sum(axis=1)
+    x, y, roll = np.sqrt(2 / len(shake.frequencies_hz)) * np.sin(phase + phases).sum(axis=1)
     roll = np.deg2rad(shake.roll_rms_deg) * roll
     zero, one = np.zeros(n_frames), np.ones(n_frames)
     rolls = _stacked([[np.cos(roll), -np.sin(roll), zero], [np.sin(roll), np.cos(roll), zero], [zero, zero, one]])
@@ -157,8 +164,8 @@ def _stacked(rows: list[list[FloatArray]]) -> FloatArray:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def _require_inside(homographies: FloatArray, frame_shape: tuple[int, int], scene_shape: tuple[int, int]) -> None:
-    frame = corners(frame_shape)
+def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tuple[int, int]) -> None:
+    """Require that the outline of the frame, (N, 2), lies in the scene."""
     x, y = np.moveaxis(apply(homographies, frame), -1, 0)
     height, width = scene_shape
     worst = np.stack([-x, x - (width - 1), -y, y - (height - 1)]).max(axis=2)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from photonpano import InputError
 from photonpano.photometry import BinaryResponse
 from photonpano.reading import read_array
-from photonpano_simulator.config import Sensor
+from photonpano_simulator.config import Dirt, Sensor
 
 _MINUS_RANGE = np.float32(2.0**8 - 2.0**32)
 """The range of the draws, negated: 2^32 - 2^8 is the largest number below 2^32 that float32 represents."""
@@ -25,6 +25,9 @@ class Draw(IntEnum):
     HOT_PIXELS = 1
     SHAKE = 2
     PATH = 3
+    GAINS = 4
+    DIRT = 5
+    TEXTURE = 6
 
 
 def generator(seed: int, draw: Draw, index: int = 0) -> np.random.Generator:
@@ -41,6 +44,7 @@ class SpadSensor:
         dark_rates: (H, W) float32, dark counts per frame period, those of hot pixels included.
         hot: (H, W) bool, the hot pixels.
         valid: (H, W) bool, False for hot pixels if the config masks them.
+        gains: (H, W) float32, the sensitivity of each pixel, dirt included; 1 for an ideal one.
 
     Raises:
         InputError: a file of rates or of hot pixels cannot be used.
@@ -64,6 +68,7 @@ class SpadSensor:
         self.dark_rates[self.hot] += hot_rates[self.hot]
         self._minus_dark_rates = -self.dark_rates
         self.valid: NDArray[np.bool_] = ~self.hot if config.mask_hot_pixels else np.ones(frame_shape, np.bool_)
+        self.gains = _gains(config, frame_shape, seed)
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the sensor: `dark_rates` and `hot_pixels`."""
@@ -83,6 +88,26 @@ class SpadSensor:
         n_pixels = flux.size
         draws = rng.integers(0, 2**64, -(-n_pixels // 2), dtype=np.uint64).view(np.uint32)[:n_pixels]
         return draws.reshape(flux.shape) < threshold
+
+
+def _gains(config: Sensor, frame_shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
+    """Return the sensitivity of each pixel: (H, W)."""
+    deviations = generator(seed, Draw.GAINS).standard_normal(frame_shape)
+    gains = np.maximum(1 + config.gain_std * deviations, 0)
+    if config.dirt is not None:
+        gains *= _light_through(config.dirt, frame_shape, generator(seed, Draw.DIRT))
+    return gains.astype(np.float32)
+
+
+def _light_through(dirt: Dirt, frame_shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return the share of the light that passes the specks: (H, W)."""
+    height, width = frame_shape
+    through = np.ones(frame_shape)
+    for x, y in rng.uniform((0, 0), (width, height), (dirt.specks, 2)):
+        across = np.exp(-((np.arange(width) - x) ** 2) / (2 * dirt.radius_px**2))
+        down = np.exp(-((np.arange(height) - y) ** 2) / (2 * dirt.radius_px**2))
+        through *= 1 - dirt.loss * np.outer(down, across)
+    return through
 
 
 def _read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:

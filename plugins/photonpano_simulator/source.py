@@ -7,11 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, SourceContext, StreamInfo
-from photonpano.geometry import corner_displacements, inverse
+from photonpano.geometry import apply, corner_displacements, corners, inverse
 from photonpano.reading import Closing
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, SimulatorConfig
+from photonpano_simulator.delivery import delivered
 from photonpano_simulator.intensity import IntensityCamera
-from photonpano_simulator.paths import camera_path
+from photonpano_simulator.lens import distorts, pixel_grid, transmission, undistorted
+from photonpano_simulator.objects import DrawnObject
+from photonpano_simulator.paths import camera_path, scene_motion
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.sensor import Draw, SpadSensor, generator
 
@@ -23,20 +26,32 @@ class SimulatorSource(Closing):
     between the pixels of the scene is interpolated linearly; pixels of the camera have no extent.
 
     Raises:
-        InputError: a file cannot be used, or the camera path leaves the scene.
+        InputError: a file cannot be used, the camera path leaves the scene, or frames are dropped that do not exist.
     """
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> None:
         self._seed = context.seed if config.seed is None else config.seed
-        self._scene = scene_flux(config.scene, config.flux * config.sensor.quantum_efficiency)
+        flux = config.flux * config.sensor.quantum_efficiency
+        self._scene = scene_flux(config.scene, flux)
         height, width = self._scene.shape
         self._homographies = camera_path(config, (height, width), self._seed)
+        self._taken = delivered(config)
+        self._lens = config.lens
+        self._points = None
+        if distorts(config.lens):
+            self._points = undistorted(config.lens, pixel_grid(config.frame_shape), config.frame_shape)
+        motion = scene_motion(self._homographies, config.frame_shape) if config.objects else np.zeros((config.n_frames, 2))
+        self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
+        self._light = config.drift ** np.linspace(0, 1, config.n_frames)
         self._sensor: SpadSensor | IntensityCamera
         if isinstance(config.sensor, IntensitySensor):
             self._sensor = IntensityCamera(config.sensor, config.frame_shape)
         else:
             self._sensor = SpadSensor(config.sensor, config.frame_shape, self._seed)
-        self.info = StreamInfo(config.n_frames, *config.frame_shape, config.frame_rate_hz, self._sensor.kind, self._sensor.bits)
+        self._gains = transmission(config.lens, config.frame_shape) * self._sensor.gains
+        self._is_uniform = bool(np.all(self._gains == 1)) and config.drift == 1
+        kind, bits = self._sensor.kind, self._sensor.bits
+        self.info = StreamInfo(len(self._taken), *config.frame_shape, config.frame_rate_hz, kind, bits)
         self.response = self._sensor.response
         self.valid: NDArray[np.bool_] = self._sensor.valid
         self.valid.flags.writeable = False
@@ -66,23 +81,42 @@ class SimulatorSource(Closing):
             Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres.
 
         Returns:
-            `homographies` (T, 3, 3) float64; `scene` (Hs, Ws) float32, the flux that is detected, in photons per pixel per
-            frame period, without dark counts; `frame_shape` (2,); `frame_rate_hz` (); `seed` (); of a single-photon camera also
-            `dark_rates` (H, W) float32, dark counts per frame period, and `hot_pixels` (H, W) bool.
+            `homographies` (T, 3, 3) float64, those of a lens without distortion; `scene` (Hs, Ws) float32, the flux that is
+            detected, in photons per pixel per frame period, without dark counts; `frame_shape` (2,); `frame_rate_hz` ();
+            `seed` (); of a single-photon camera also `dark_rates` (H, W) float32, dark counts per frame period, and
+            `hot_pixels` (H, W) bool. Captures that are disturbed have more: `distortion` (2,), k1 and k2 of the lens, and
+            `undistorted_corners` (4, 2), where a lens without distortion images the corners of the frame; `gains` (H, W)
+            float32, vignetting, sensitivity and dirt; `light` (T,), relative to the first frame; `taken` (T,), the index of
+            each frame before drops and repeats.
         """
-        return {
-            "homographies": self._homographies,
+        truth: dict[str, NDArray[np.generic]] = {
+            "homographies": self._homographies[self._taken],
             "scene": self._scene,
             "frame_shape": np.array(self.info.frame_shape),
             "frame_rate_hz": np.array(self.info.frame_rate_hz),
             "seed": np.array(self._seed),
             **self._sensor.truth(),
         }
+        if self._points is not None:
+            truth["distortion"] = np.array([self._lens.k1, self._lens.k2])
+            truth["undistorted_corners"] = undistorted(self._lens, corners(self.info.frame_shape), self.info.frame_shape)
+        if (self._gains != 1).any():
+            truth["gains"] = self._gains
+        if (self._light != 1).any():
+            truth["light"] = self._light[self._taken]
+        if not np.array_equal(self._taken, np.arange(len(self._homographies))):
+            truth["taken"] = self._taken
+        return truth
 
     def _frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
-        views = [self._view(homography) for homography in self._while_open(index)]
+        taken = int(self._taken[index])
+        views = [self._view(homography) for homography in self._while_open(taken)]
         flux = views[0] if len(views) == 1 else np.mean(views, axis=0)
-        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, index))
+        for each in self._objects:
+            each.draw(flux, taken)
+        if not self._is_uniform:
+            flux *= self._gains * np.float32(self._light[taken])
+        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
 
     def _while_open(self, index: int) -> NDArray[np.float64]:
         """Return homographies of a frame while its shutter is open, (n, 3, 3): evenly spaced in time, about a pixel apart."""
@@ -100,11 +134,14 @@ class SimulatorSource(Closing):
     def _view(self, homography: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the flux of the scene in a frame, (H, W)."""
         height, width = self.info.frame_shape
-        return cv2.warpPerspective(
-            self._scene,
-            homography,
-            (width, height),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            # The path lies inside the scene, up to rounding errors.
-            borderMode=cv2.BORDER_REPLICATE,
-        ).astype(np.float32, copy=False)
+        # The path lies inside the scene, up to rounding errors.
+        border = cv2.BORDER_REPLICATE
+        if self._points is None:
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            view = cv2.warpPerspective(self._scene, homography, (width, height), flags=flags, borderMode=border)
+        else:
+            x, y = np.moveaxis(apply(homography, self._points.reshape(-1, 2)).reshape(height, width, 2), -1, 0).astype(
+                np.float32
+            )
+            view = cv2.remap(self._scene, x, y, cv2.INTER_LINEAR, borderMode=border)
+        return view.astype(np.float32, copy=False)

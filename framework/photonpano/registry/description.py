@@ -8,7 +8,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from photonpano.registry.kinds import KINDS
-from photonpano.registry.schema_text import alternatives, bounds_words, config_schema, discriminator, type_words, word
+from photonpano.registry.schema_text import (
+    alternatives,
+    bounds_words,
+    config_schema,
+    discriminator,
+    subschema,
+    type_words,
+    word,
+)
 from photonpano.text import listed
 
 if TYPE_CHECKING:
@@ -30,7 +38,8 @@ class ConfigRow:
     """One key of a config, in words.
 
     Attributes:
-        key: the key under `with`; that of a mapping in a mapping with dots, such as `filter.size`.
+        key: the key under `with`; that of a mapping in a mapping with dots, such as `filter.size`, and that of a mapping in a
+            list with brackets, such as `filters[].size`.
         type: such as "integer" or "first, last or number".
         default: as it is written in YAML, or "computed"; None if the key is required.
         bounds: such as "at least 1"; empty if there are none.
@@ -64,7 +73,7 @@ def config_rows(config: type[BaseModel]) -> tuple[ConfigRow, ...]:
 
 
 def _rows(schema: Schema, root: Schema, prefix: str = "", depth: int = 0) -> list[ConfigRow]:
-    """Return the rows of a mapping, and below each those of the mappings in it.
+    """Return the rows of a mapping, and below each those of the mappings in it, be they in a list.
 
     A row that only some alternatives of a union have names them at its end.
     """
@@ -83,7 +92,8 @@ def _rows(schema: Schema, root: Schema, prefix: str = "", depth: int = 0) -> lis
             default = None if required else flow(field["default"]) if "default" in field else _COMPUTED
             meaning = " ".join(field.get("description", "").split())
             row = ConfigRow(f"{prefix}{key}", type_words(field, root), default, bounds_words(field, root), meaning)
-            for each in (row, *_rows(field, root, f"{row.key}.", depth + 1)):
+            in_list = _rows(subschema(field, 0, root), root, f"{row.key}[].", depth + 1)
+            for each in (row, *_rows(field, root, f"{row.key}.", depth + 1), *in_list):
                 found.setdefault(each, []).append(str(tag))
     for row, owners in found.items():
         note = "" if len(owners) == len(options) else f" ({listed(owners)})"

@@ -24,6 +24,21 @@ class TestSimulator(SourceConformance):
     )
 
 
+class TestDisturbedSimulator(SourceConformance):
+    contribution = CATALOG.find("source", "simulator").contribution
+    config = {
+        **SMALL,
+        "path": {"kind": "pan", "length_px": 40},
+        "lens": {"k1": -0.05, "vignette": 0.5},
+        "objects": [{"size": [0.3, 0.5], "moves_px": [0.5, 0]}],
+        "drops": [{"at": 20, "frames": 5}],
+        "repeats": [{"at": 40, "frames": 3}],
+        "sensor": {"gain_std": 0.05, "dirt": {}},
+        "drift": 0.5,
+    }
+    wrong = ({"drops": [{"at": 50, "frames": 20}]},)
+
+
 class TestConventionalCamera(SourceConformance):
     contribution = CATALOG.find("source", "camera-simulator").contribution
     config = {**SMALL, "path": {"kind": "pan", "length_px": 90}, "sensor": {"exposure": 0.5}}

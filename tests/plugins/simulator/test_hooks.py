@@ -66,6 +66,14 @@ def test_check_refuses_path_that_leaves_the_street() -> None:
     assert problem == "there is no file nowhere.npy; check the path"
 
 
+def test_check_refuses_dropped_frames_that_do_not_exist() -> None:
+    assert problems(drops=[{"at": 1990, "frames": 20}], repeats=[{"at": 2000}]) == [
+        "drops names the frames 1990 to 2009, but the camera takes 2000 frames (0 to 1999); shorten the range, "
+        "or raise n_frames",
+    ]
+    assert problems(drops=[{"at": 0, "frames": 2000}]) == ["drops leaves none of the 2000 frames; drop fewer of them"]
+
+
 @pytest.mark.parametrize(
     ("settings", "place"),
     [
@@ -77,7 +85,12 @@ def test_check_refuses_path_that_leaves_the_street() -> None:
         ({"sensor": {"hot_rate": (0, 1)}}, "sensor"),
         ({"path": {"kind": "zigzag"}}, "path"),
         ({"path": {"kind": "pan", "rows": 3}}, "path"),
-        ({"path": {"kind": "pan", "shake": {"frequencies_hz": (1, 2)}}}, "path"),
+        ({"path": {"kind": "pan", "shake": {"frequencies_hz": ()}}}, "path"),
+        ({"lens": {"k1": 0.3}}, "lens"),
+        ({"lens": {"vignette": 1.1}}, "lens"),
+        ({"objects": [{"size": (0, 1)}]}, "objects"),
+        ({"drops": [{"frames": 3}]}, "drops"),
+        ({"drift": 0}, "drift"),
         ({"exposure": 1}, "exposure"),
     ],
 )

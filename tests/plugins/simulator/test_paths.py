@@ -128,6 +128,15 @@ def test_shake_has_rms_and_frequencies_of_the_config() -> None:
     assert (homographies({"kind": "hand-shake", "shake": shake}, 1000, seed=1, frame_rate_hz=1000) != maps).any()
 
 
+def test_shake_of_any_number_of_sines_shares_the_power_equally() -> None:
+    for frequencies in ((70,), (20, 70), (10, 40, 70, 150, 300)):
+        shake = {"rms_px": 2.0, "frequencies_hz": frequencies}
+        moved = centres(homographies({"kind": "hand-shake", "shake": shake}, 1000, frame_rate_hz=1000)) - MIDDLE
+        for axis in (0, 1):
+            power = np.abs(np.fft.rfft(moved[:, axis])) ** 2 * 2 / 1000**2
+            np.testing.assert_allclose(power[list(frequencies)], 4 / len(frequencies), rtol=0.01)
+
+
 def test_shake_is_added_to_a_path() -> None:
     still = homographies({"kind": "pan", "length_px": 300})
     shaken = homographies({"kind": "pan", "length_px": 300, "shake": {"rms_px": 1}})
@@ -166,6 +175,13 @@ def test_impossible_paths_are_refused(path: dict[str, Any], message: str) -> Non
     with pytest.raises(InputError) as caught:
         homographies(path)
     assert str(caught.value) == message
+
+
+def test_path_is_refused_if_the_distorted_frame_leaves_the_scene() -> None:
+    path = {"kind": "pan", "length_px": 1500}
+    assert homographies(path).shape == (2001, 3, 3)
+    with pytest.raises(InputError, match=r"leaves the scene of 2048x1365 px by 12\.2 px at the right"):
+        homographies(path, lens={"k1": -0.1})
 
 
 def saved(path: Path, array: np.ndarray) -> Path:

@@ -44,6 +44,7 @@ class LocatorConfig(Config):
     search: Near | Far = Field(Near(radius_px=7), discriminator="kind", description="where to look")
     label: str | None = Field(None, description="a text for records")
     masks: tuple[str, ...] = Field(("yes", "a b"), description="files")
+    passes: tuple[Inner, ...] = ()
 
 
 def unbuilt(config, context):
@@ -74,6 +75,8 @@ def test_config_rows_have_type_default_and_bounds():
         ConfigRow("search.map", "path", None, "", "(far)"),
         ConfigRow("label", "text or null", "null", "", "a text for records"),
         ConfigRow("masks", "list of texts", '["yes", "a b"]', "", "files"),
+        ConfigRow("passes", "list of mappings", "[]", "", ""),
+        ConfigRow("passes[].depth", "integer", "1", "", ""),
     )
 
 
@@ -91,6 +94,7 @@ def test_snippet_is_yaml_with_the_defaults():
             search: {kind: near, seed: 0, radius_px: 7}  # where to look
             label: null  # a text for records
             masks: ["yes", "a b"]  # files
+            passes: []
         """)
     section = YAML(typ="safe", pure=True).load(written)["locate"]
     assert section.pop("use") == "my-locator"
@@ -190,6 +194,6 @@ class Nest(Config):
 
 def test_config_rows_of_recursive_config_end():
     tree, nest = config_rows(Tree), config_rows(Nest)
-    assert tree == (ConfigRow("children", "list of mappings", "[]", "", ""),)
+    assert tree[1] == ConfigRow("children[].children", "list of mappings", "[]", "", "")
     assert nest[1] == ConfigRow("inner.inner", "mapping or null", "null", "", "")
-    assert len(nest) == 4
+    assert len(tree) == len(nest) == 4
