@@ -15,7 +15,7 @@ from photonpano import FrameSpan, Group, PluginError, hookspecs, registry, run
 from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.specs import parse_spec
-from photonpano.testing import ResamplerConformance
+from photonpano.testing import RefinerConformance, ResamplerConformance
 
 HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}
 KINDS = {
@@ -115,6 +115,13 @@ class TestHalves(ResamplerConformance):
     """The example of a resampler keeps what resamplers promise, also for a capture of one frame."""
 
     contribution = contributions_of(example_of("photonpano_resamplers"))[0]
+    hook_module = "photonpano.hookspecs"
+
+
+class TestJump(RefinerConformance):
+    """The example of a refiner keeps what refiners promise."""
+
+    contribution = contributions_of(example_of("photonpano_refiners"))[0]
     hook_module = "photonpano.hookspecs"
 
 

@@ -12,7 +12,7 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-for _name in ("conformance", "stages", "sources", "resamplers", "mergers", "locators", "interpolators"):
+for _name in ("conformance", "stages", "sources", "resamplers", "mergers", "locators", "interpolators", "refiners"):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 
 

@@ -1,4 +1,4 @@
-"""Checks of the components of all four stages: they are built before any frame is read, and read-only inputs are enough."""
+"""Checks of components of stages, and of refiners: they are built before frames are read, and accept read-only inputs."""
 
 from __future__ import annotations
 

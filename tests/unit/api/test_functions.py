@@ -11,8 +11,9 @@ import pytest
 import typer
 
 import photonpano
-from photonpano import Plan, capture_plan, convert, explain, info, parse_spec, simulate
+from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, info, parse_spec, simulate
 from photonpano.cli.app import app
+from photonpano.record.run_json import plugin_records
 
 
 @pytest.fixture
@@ -67,3 +68,28 @@ def test_explain_of_plan_from_python_is_a_spec(capture: Plan) -> None:
     text = explain(plan)
     assert text.startswith("# the spec as it will run, on 40 binary frames of 8x13 at 100 Hz\n")
     assert parse_spec(text).document == plan.document
+
+
+def test_refiners_are_explained_and_recorded_with_their_plugins(capture: Plan) -> None:
+    class Drift(Config):
+        knots: int = 4
+
+    drift = RefinerContribution(name="drift", summary="Toy", config=Drift, build=lambda *_: None)
+    catalog = discover().including(drift)
+    spec = {**capture.document, "resample": {"with": {"group_size": 8}}, "refine": []}
+    plan = parse_spec(spec, overrides=["refine=[drift, {use: drift, with: {knots: 9}}]"], catalog=catalog)
+    lines = explain(plan, catalog=catalog).splitlines()
+    start = lines.index("refine:")
+    assert lines[start : start + 7] == [
+        "refine:",
+        f"  - use: drift  # {__name__} unreleased, --set",
+        "    with:",
+        "      knots: 4  # default",
+        f"  - use: drift  # {__name__} unreleased, --set",
+        "    with:",
+        "      knots: 9  # --set",
+    ]
+    assert [each for each in plugin_records(plan) if each["stage"] == "refine"] == [
+        {"stage": "refine", "use": "drift", "plugin": __name__, "version": "unreleased"}
+    ]
+    assert "refine: []  # default" in explain(parse_spec(spec)).splitlines()
