@@ -1,0 +1,139 @@
+"""The scores of tests/benchmarks/trust.py, which itself takes too long to run here."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonpano.geometry import translation
+from photonpano_simulator.config import SimulatorConfig
+
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "trust.py"
+SHAPE = (60, 90)
+N = 400
+
+
+@pytest.fixture(scope="module")
+def trust() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("trust_benchmark", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # as dataclasses look it up
+    spec.loader.exec_module(module)
+    return module
+
+
+def result(**keys: Any) -> dict[str, Any]:
+    """Return the result of an honest run of the undisturbed pan."""
+    scores = {"mean_px": 0.1, "max_px": 0.3, "rms_px": 0.1, "std_px": 0.1, "within_2": 1.0, "within_3": 1.0}
+    said = {"row": "clean pan", "seed": 0, "exit_code": 0, "message": "", "verdict": None, "warnings": [], "seconds": 5.0}
+    return said | scores | keys
+
+
+def test_figures_of_trajectory_with_known_errors(trust: ModuleType) -> None:
+    true = np.array([translation(0.1 * frame, 5) for frame in range(N)])
+    # Signs that alternate: no alignment of the planes removes such errors.
+    errors = np.tile([0.1, -0.1, 0.5, -0.5, 0.1, -0.1, 0.5, -0.5], N // 8)
+    estimated = {
+        "homographies": np.array([each @ translation(error, 0) for each, error in zip(true, errors, strict=True)]),
+        "std_px": np.tile([0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.1, 0.1], N // 8),
+        "located": np.ones(N, bool),
+        "frame_shape": np.array(SHAPE),
+    }
+    figures = trust.figures_of(estimated, {"homographies": true, "frame_shape": np.array(SHAPE)})
+    assert figures["mean_px"] == pytest.approx(0.3, rel=0.03)
+    assert figures["rms_px"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2) / 2), rel=0.03)
+    assert figures["max_px"] == pytest.approx(0.5, rel=0.1)
+    assert figures["std_px"] == pytest.approx(0.175)
+    # 0.1 px of 0.2 px; 0.5 px of 0.2 px, which is 2.5; and 0.5 px of 0.1 px, which is 5.
+    assert (figures["within_2"], figures["within_3"]) == (0.5, 0.75)
+
+
+def test_frames_that_are_not_located_are_not_scored(trust: ModuleType) -> None:
+    true = np.array([translation(0.1 * frame, 5) for frame in range(N)])
+    wrong = true.copy()
+    wrong[300:] = np.eye(3)
+    located = np.arange(N) < 300
+    estimated = {"homographies": wrong, "std_px": np.full(N, 0.1), "located": located, "frame_shape": np.array(SHAPE)}
+    figures = trust.figures_of(estimated, {"homographies": true, "frame_shape": np.array(SHAPE)})
+    assert figures["max_px"] < 1e-6
+    assert figures["located"] == 0.75
+
+
+def test_trajectory_of_other_frames_has_no_figures(trust: ModuleType) -> None:
+    true = {"homographies": np.tile(np.eye(3), (5, 1, 1)), "frame_shape": np.array([60, 90])}
+    assert trust.figures_of({"homographies": np.tile(np.eye(3), (4, 1, 1)), "frame_shape": np.array([60, 90])}, true) == {}
+    assert trust.figures_of({"homographies": np.tile(np.eye(3), (5, 1, 1)), "frame_shape": np.array([60, 720])}, true) == {}
+
+
+def test_errors_are_scored_through_the_distortion(trust: ModuleType) -> None:
+    """A run that moves the corners as the distorted image does is right, though its homographies are not the camera's."""
+    true = np.array([translation(0.1 * frame, 5) for frame in range(N)])
+    middle = np.array([44.5, 29.5])
+    corners = np.array([[0, 0], [89, 0], [89, 59], [0, 59]])
+    truth = {"homographies": true, "frame_shape": np.array(SHAPE), "undistorted_corners": middle + (corners - middle) / 0.97}
+    said = {"std_px": np.full(N, 0.1), "located": np.ones(N, bool), "frame_shape": np.array(SHAPE)}
+    seen = true @ trust.at_the_corners(truth["undistorted_corners"], SHAPE)
+    assert trust.figures_of({"homographies": seen, **said}, truth)["max_px"] < 1e-6
+    assert trust.figures_of({"homographies": true, **said}, truth)["mean_px"] > 0.2
+
+
+@pytest.mark.parametrize(
+    ("keys", "honest"),
+    [
+        ({}, True),
+        ({"within_2": 0.94}, False),
+        ({"within_3": 0.98}, False),
+        ({"std_px": 0.31}, False),
+        ({"within_3": 0.5, "verdict": {"status": "trusted", "reasons": []}}, False),
+        ({"within_3": 0.5, "verdict": {"status": "doubtful", "reasons": []}}, True),
+        ({"exit_code": None}, False),
+    ],
+)
+def test_run_is_honest_if_its_claim_holds_or_is_doubted(trust: ModuleType, keys: dict[str, Any], honest: bool) -> None:
+    assert trust.is_honest(result(**keys)) is honest
+
+
+def test_refused_run_is_honest_and_trusted_one_without_score_is_not(trust: ModuleType) -> None:
+    refused = {key: value for key, value in result(exit_code=1).items() if not key.endswith(("_px", "_2", "_3"))}
+    assert trust.is_honest(refused)
+    assert not trust.is_honest(refused | {"exit_code": 0})
+
+
+def test_table_has_a_row_for_each_kind_of_capture(trust: ModuleType) -> None:
+    doubted = {"status": "doubtful", "reasons": [{"what": "the light at the corners is low"}]}
+    lines = trust.table(
+        [
+            result(),
+            result(row="vignette 80%", mean_px=0.4, max_px=0.9, std_px=0.2, rms_px=0.4, verdict=doubted),
+            result(row="vignette 80%", seed=1, within_2=0.5, within_3=0.6, below_oracle_db=0.25),
+        ]
+    ).splitlines()
+    assert lines[2] == "| clean pan | 0.100 (0.30) | 0.100 | 100% / 100% | 1.00 | - | - | - | 1 of 1 | 5 s |"
+    assert lines[3] == (
+        "| vignette 80% | 0.250 (0.90) | 0.150 | 50% / 60% | 0.60 | 4.00 | 0.25 dB | 1 doubtful, 1 - | 1 of 2 | 5 s |"
+    )
+    assert lines[5:] == ["2 of 3 runs are honest.", "", "- vignette 80%, seed 0: the light at the corners is low"]
+
+
+def test_results_are_kept_for_captures_of_one_size(trust: ModuleType, tmp_path: Path) -> None:
+    file = tmp_path / "trust.json"
+    assert trust.remembered(file, trust.SMALL) == []
+    trust.write(file, [result()], trust.SMALL)
+    assert trust.remembered(file, trust.SMALL) == [result()]
+    assert json.loads(file.read_text())["frame_shape"] == [128, 192]
+    assert "| clean pan |" in file.with_suffix(".md").read_text()
+    with pytest.raises(SystemExit, match="holds results of frames of"):
+        trust.remembered(file, trust.FULL)
+
+
+def test_rows_are_captures_that_the_simulator_makes(trust: ModuleType) -> None:
+    for size in (trust.FULL, trust.SMALL):
+        for row in trust.ROWS.values():
+            SimulatorConfig.model_validate(trust.bases(size)[row.base] | row.changes(size))
