@@ -17,7 +17,7 @@ from photonpano_simulator.config import SimulatorConfig
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "trust.py"
 SHAPE = (60, 90)
-N = 400
+N = 240  # all of which align the planes
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +47,9 @@ def test_figures_of_trajectory_with_known_errors(trust: ModuleType) -> None:
         "frame_shape": np.array(SHAPE),
     }
     figures = trust.figures_of(estimated, {"homographies": true, "frame_shape": np.array(SHAPE)})
-    assert figures["mean_px"] == pytest.approx(0.3, rel=0.03)
-    assert figures["rms_px"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2) / 2), rel=0.03)
-    assert figures["max_px"] == pytest.approx(0.5, rel=0.1)
+    assert figures["mean_px"] == pytest.approx(0.3, rel=0.01)
+    assert figures["rms_px"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2) / 2), rel=0.01)
+    assert figures["max_px"] == pytest.approx(0.5, rel=0.02)
     assert figures["std_px"] == pytest.approx(0.175)
     # 0.1 px of 0.2 px; 0.5 px of 0.2 px, which is 2.5; and 0.5 px of 0.1 px, which is 5.
     assert (figures["within_2"], figures["within_3"]) == (0.5, 0.75)
@@ -58,8 +58,8 @@ def test_figures_of_trajectory_with_known_errors(trust: ModuleType) -> None:
 def test_frames_that_are_not_located_are_not_scored(trust: ModuleType) -> None:
     true = np.array([translation(0.1 * frame, 5) for frame in range(N)])
     wrong = true.copy()
-    wrong[300:] = np.eye(3)
-    located = np.arange(N) < 300
+    wrong[180:] = np.eye(3)
+    located = np.arange(N) < 180
     estimated = {"homographies": wrong, "std_px": np.full(N, 0.1), "located": located, "frame_shape": np.array(SHAPE)}
     figures = trust.figures_of(estimated, {"homographies": true, "frame_shape": np.array(SHAPE)})
     assert figures["max_px"] < 1e-6
