@@ -178,13 +178,7 @@ class _Resolver:
             return _Stage()
         n_problems = len(spec.problems)
         choice = self.component(KIND_OF[name], section, where)
-        fallbacks: tuple[Choice, ...] = ()
-        if name == "locate":
-            inherited = base is not None and content.get("fallback") is None
-            if base is not None and inherited and choice == base.choice:
-                fallbacks = base.fallbacks
-            else:
-                fallbacks = self.fallbacks(section["fallback"], where, choice, inherited)
+        fallbacks = self.fallbacks(section["fallback"], where, choice) if name == "locate" else ()
         if base is not None:  # a problem of the base is reported again only for a key that the level itself writes
             old, new = spec.problems[:n_problems], spec.problems[n_problems:]
             reported = {(each.where.removeprefix(name), each.message) for each in old}
@@ -209,7 +203,7 @@ class _Resolver:
         spec.check_keys(content, where, known, below=self.keys_of(kind, section.get("use")))
         if alias := self.alias(kind, section.get("use")):
             expanded = alias.expand(section, where, spec)
-            if expanded is None or self.is_alias(kind, expanded, where):
+            if expanded is None:
                 return None
             section = expanded
         if name == "locate":
@@ -233,29 +227,22 @@ class _Resolver:
         self.spec.places = self.spec.places_under(where, f"{where}.0") | self.spec.places
         return [data]
 
-    def fallbacks(self, items: list[Any], where: str, first: Choice | None, inherited: bool) -> tuple[Choice, ...]:
-        """Resolve the locators to which lost pairs are offered.
-
-        Args:
-            items: for each locator its name, or a mapping.
-            where: the path of the section.
-            first: the locator that the section chooses.
-            inherited: the items are those that a level goes on from.
-        """
-        tried = [] if first is None else [first]
+    def fallbacks(self, items: list[Any], where: str, first: Choice | None) -> tuple[Choice, ...]:
+        """Resolve the locators to which the pairs that the first one lost are offered."""
+        found: list[Choice] = []
         for index, item in enumerate(items):
             path = f"{where}.fallback.{index}"
             choice = self.item(KIND_OF["locate"], item, path)
             if choice is None:
                 continue
-            name = choice.contribution.name
-            if choice not in tried:
-                tried.append(choice)
-            elif not inherited:
-                self.spec.wrong_key(path, f"{name!r} with the same keys is tried before, and {_AGAIN}")
-            elif choice == first:
+            name, is_own = choice.contribution.name, self.spec.place(path).where.startswith(where)
+            if choice == first and not is_own:  # it became the same by what a level changes
                 self.spec.wrong_key(where, f"the fallback {name!r} has the same keys, and {_AGAIN}")
-        return tuple(tried if first is None else tried[1:])
+            elif choice in (first, *found):
+                self.spec.wrong_key(path, f"{name!r} with the same keys is tried before, and {_AGAIN}")
+            else:
+                found.append(choice)
+        return tuple(found)
 
     def item(self, kind: Kind, item: Any, where: str) -> Choice | None:
         """Resolve one component of a list: a name, or a mapping."""
@@ -266,8 +253,6 @@ class _Resolver:
                 spec.places = {f"{where}.use": spec.places[where]} | spec.places
         if not isinstance(item, dict):
             spec.wrong(where, f"expected the name of a {kind.name}, or a mapping such as {{use: NAME}}, got {given(item)}")
-            return None
-        if self.is_alias(kind, item, where):
             return None
         known = ["use", "with"]
         if kind is KIND_OF["locate"] and "fallback" in item:
@@ -307,6 +292,10 @@ class _Resolver:
         except PluginError as error:
             self.spec.wrong(f"{where}.use", str(error))
             return None
+        if isinstance(entry.contribution, Alias):  # one that stands where it may has been spelled out
+            message = f"{use!r} cannot be part of a chain or a fallback; list the {kind.name}s themselves"
+            self.spec.wrong_key(where, message)
+            return None
         if entry.unavailable:
             self.spec.wrong(f"{where}.use", entry.unavailable)
         return entry
@@ -319,14 +308,6 @@ class _Resolver:
         """Return the alias with this name, None if there is none."""
         offered = (entry.contribution for entry in self.catalog.entries(kind.name, name))
         return next((each for each in offered if isinstance(each, Alias)), None)
-
-    def is_alias(self, kind: Kind, section: dict[str, Any], where: str) -> bool:
-        """Return whether a section names an alias, and report it: what an alias stands for is no alias itself."""
-        name = section.get("use")
-        found = self.alias(kind, name) is not None
-        if found:
-            self.spec.wrong_key(where, f"{name!r} cannot be part of a chain or a fallback; list the {kind.name}s themselves")
-        return found
 
     def levels(self, data: Any) -> list[Any]:
         """Return what is written for each level."""
