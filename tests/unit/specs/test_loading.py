@@ -9,6 +9,7 @@ import pytest
 
 from photonpano import SpecError
 from photonpano.registry import Catalog
+from photonpano.registry.description import snippet
 from photonpano.specs import load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
@@ -137,6 +138,13 @@ def test_refiners_are_a_list_in_order_and_short_spans_by_default(written, chosen
     assert [choice.contribution.name for choice in plan.refine] == chosen
     assert [each["use"] for each in plan.document["refine"]] == chosen
     assert list(plan.document)[6:9] == ["interpolate", "refine", "levels"]
+
+
+def test_snippet_of_a_refiner_is_a_section_of_a_spec(catalog):
+    drift = catalog.find("refiner", "drift").contribution
+    assert snippet(drift) == "refine:\n  use: drift\n  with:\n    knots: 4  # of the spline\n"
+    plan = parse_spec(f"version: 1\nsource: {{use: simulator}}\n{snippet(drift)}", catalog=catalog)
+    assert [choice.contribution for choice in plan.refine] == [drift]
 
 
 def test_default_refiner_is_left_out_where_it_is_not_installed(catalog):
