@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 
 from photonpano import FrameSpan, Group, StageContext, StreamInfo, discover, evaluate, load_spec, open_source, parse_spec, run
 from photonpano.captures.writing import truth_path, write_packed
-from photonpano.evaluation import FrameTrajectory
 from photonpano.geometry import (
+    FrameTrajectory,
     corner_displacements,
     corners,
     from_parameters,

@@ -93,6 +93,17 @@ class RobustMergeConfig(Config):
     )
 
 
+class ShortSpansConfig(Config):
+    """Keys of `short-spans`."""
+
+    smallest_px: float = Field(
+        0.03,
+        ge=0,
+        le=10,
+        description="smallest motion that is corrected: its root mean square over the capture, in px of a frame",
+    )
+
+
 class SplatConfig(Config):
     """`splat` has no keys."""
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 from photonpano import (
     InterpolatorContribution,
     MergerContribution,
+    RefinerContribution,
     ResamplerContribution,
     SourceContribution,
     hookimpl,
@@ -17,6 +18,7 @@ from photonpano_core.configs import (
     MidpointConfig,
     PhotonMleConfig,
     RobustMergeConfig,
+    ShortSpansConfig,
     SlidingWindowConfig,
     SplatConfig,
     StratifiedConfig,
@@ -33,7 +35,7 @@ from photonpano_core.stratified import StratifiedResampler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from photonpano import Interpolator, Merger, Resampler, StageContext, StreamInfo
+    from photonpano import Interpolator, Merger, Refiner, Resampler, StageContext, StreamInfo
 
 Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
@@ -128,6 +130,17 @@ def photonpano_interpolators() -> Iterator[InterpolatorContribution]:
     )
 
 
+@hookimpl
+def photonpano_refiners() -> Iterator[RefinerContribution]:
+    """Offer the refiner that sees what moves inside a group."""
+    yield RefinerContribution(
+        name="short-spans",
+        summary="Tremor inside groups, from the shifts of spans of a few frames against the panorama",
+        config=ShortSpansConfig,
+        build=_build_short_spans,
+    )
+
+
 def _resampler(
     name: str,
     summary: str,
@@ -195,3 +208,9 @@ def _build_lie(config: InterpolatorConfig, context: StageContext) -> Interpolato
     from photonpano_core.lie import LieInterpolator
 
     return LieInterpolator(config, context.stream.frame_shape)
+
+
+def _build_short_spans(config: ShortSpansConfig, context: StageContext) -> Refiner:
+    from photonpano_core.short_spans import ShortSpansRefiner
+
+    return ShortSpansRefiner(config, context.stream.frame_shape, context.stream.frame_rate_hz)

@@ -34,8 +34,7 @@ from photonpano import (
     open_source,
     parse_spec,
 )
-from photonpano.evaluation import FrameTrajectory
-from photonpano.geometry import apply, corner_displacements, corners, inverse, normalised
+from photonpano.geometry import FrameTrajectory, apply, corner_displacements, corners, inverse, normalised
 from photonpano.protocols import KnowsTruth
 from photonpano.registry import Catalog
 from photonpano_core.configs import PhotonMleConfig

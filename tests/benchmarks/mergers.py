@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext
-from photonpano.evaluation import FrameTrajectory
-from photonpano.geometry import translation
+from photonpano.geometry import FrameTrajectory, translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
 from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.photon_mle import PhotonMleMerger

@@ -27,8 +27,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from photonpano import FrameSpan, SourceContext
-from photonpano.evaluation import FrameTrajectory, load_truth
-from photonpano.geometry import inverse
+from photonpano.evaluation import load_truth
+from photonpano.geometry import FrameTrajectory, inverse
 from photonpano.protocols import Source
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.midpoint import MidpointResampler

@@ -4,11 +4,10 @@ from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import Truth, load_truth
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
-from photonpano.evaluation.trajectory import FrameTrajectory, TrajectoryScore, corner_errors
+from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 
 __all__ = [
     "Evaluation",
-    "FrameTrajectory",
     "ImageScore",
     "Renderer",
     "TrajectoryScore",

@@ -11,8 +11,8 @@ import numpy as np
 from photonpano.errors import InputError
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
-from photonpano.evaluation.trajectory import FrameTrajectory, TrajectoryScore, corner_errors
-from photonpano.geometry import Canvas, inverse, normalised
+from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
+from photonpano.geometry import Canvas, FrameTrajectory, inverse, normalised
 from photonpano.protocols import Trajectory
 from photonpano.values import Panorama
 

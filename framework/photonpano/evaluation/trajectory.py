@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from photonpano.geometry import align_planes, corner_displacements
 from photonpano.values import BoolArray, FloatArray, Homography
@@ -73,23 +72,3 @@ def corner_errors(
         max_px=float(compared.max()),
         located_share=float(counted.mean()),
     )
-
-
-class FrameTrajectory:
-    """A trajectory given at every frame: linear between frames, constant beyond the first and last.
-
-    Args:
-        homographies: (T, 3, 3) float64, frame pixels to reference pixels, h33 = 1.
-    """
-
-    def __init__(self, homographies: FloatArray) -> None:
-        self._homographies = np.asarray(homographies, dtype=np.float64)
-
-    def at(self, frame_indices: ArrayLike) -> FloatArray:
-        """Return the homographies of N instants, in frames: (N, 3, 3)."""
-        last = len(self._homographies) - 1
-        instants = np.clip(np.asarray(frame_indices, dtype=np.float64), 0, last)
-        before = np.floor(instants).astype(int)
-        share = (instants - before)[..., None, None]
-        after = np.minimum(before + 1, last)
-        return np.asarray((1 - share) * self._homographies[before] + share * self._homographies[after])

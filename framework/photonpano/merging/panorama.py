@@ -235,6 +235,7 @@ def render_panorama(
     memory: int,
     write_tile: Callable[[Tile, Panorama, Canvas], object],
     context: Context,
+    ready: Panorama | None = None,
 ) -> RenderedPanorama:
     """Render the frames of a span, in tiles if the panorama exceeds the memory.
 
@@ -246,6 +247,7 @@ def render_panorama(
         memory: bytes that rendering may take.
         write_tile: called with each tile, its flux and weight, and the whole canvas.
         context: threads and progress.
+        ready: the same frames, merged along the same motion; it is used if it lies on the same canvas.
 
     Raises:
         CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
@@ -255,7 +257,10 @@ def render_panorama(
     canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory)
     tiles, reduction = tiles_of(canvas, memory)
     gathered = Thumbnail(canvas, reduction)
-    rendered = render_tiles(source, trajectory, span, tiles, options.tolerance_px, context)
+    if ready is not None and len(tiles) == 1 and _lies_on(ready, canvas):
+        rendered = iter([ready])
+    else:
+        rendered = render_tiles(source, trajectory, span, tiles, options.tolerance_px, context)
     for tile, part in zip(tiles, rendered, strict=True):
         write_tile(tile, part, canvas)
         gathered.add(tile, part)
@@ -264,6 +269,10 @@ def render_panorama(
     picture = tone_mapped(thumbnail.flux, white_flux)
     seconds = time.perf_counter() - start
     return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, gathered.coverage_share, seconds)
+
+
+def _lies_on(panorama: Panorama, canvas: Canvas) -> bool:
+    return panorama.flux.shape == canvas.shape and np.array_equal(panorama.canvas, canvas.transform)
 
 
 def _gib(size: float) -> str:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from photonpano.contributions import SourceContext, StageContext, install_command
 from photonpano.corrections import corrected_source
@@ -19,6 +19,9 @@ from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.threads import thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
+
+if TYPE_CHECKING:
+    from photonpano.residuals.refinement import NamedRefiner
 
 HALVED_LEVELS = 2
 """With `scale: auto`, the first two levels are located at half size."""
@@ -108,6 +111,22 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
         )
         for number, level in enumerate(plan.levels, start=1)
     )
+
+
+def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
+    """Build the refiners of a plan, in order.
+
+    Args:
+        plan: which refiners.
+        source: the capture.
+        decisions: receives the decisions that they take.
+    """
+    from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
+
+    context = StageContext(
+        source.info, source.response, plan.run.seed, thread_count(plan.run.threads), decide=_recorder(decisions)
+    )
+    return tuple(NamedRefiner(choice.contribution.name, _built(choice, context), choice.label) for choice in plan.refine)
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:

@@ -15,13 +15,15 @@ from photonpano.errors import InputError
 from photonpano.merging.panorama import render_panorama
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.loop import estimate_motion
-from photonpano.pipeline.components import build_levels, open_source
+from photonpano.pipeline.components import build_levels, build_refiners, open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.protocols import Source
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
+from photonpano.residuals.refinement import refine
+from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
 
@@ -66,18 +68,22 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         one_thread_inside(),
         notify_on_first_compile(partial(context.progress.note, COMPILING)),
     ):
-        start = time.perf_counter()
+        start, memory = time.perf_counter(), int(plan.run.memory)
         _require_photons(plan, source)
         decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)
         results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged)
         motion = motion_of_frames(results, source.info, reference)
+        refiners = build_refiners(plan, source, decisions)
+        explained = refine(source, motion, refiners, plan.render.tolerance_px, memory, context)
+        verdict = judge(explained, results)
+        motion = explained.motion
         panorama = render_panorama(
-            source, motion.trajectory, motion.span, plan.render, int(plan.run.memory), folder.write_tile, context
+            source, motion.trajectory, motion.span, plan.render, memory, folder.write_tile, context, explained.panorama
         )
         observers.rendered(panorama.canvas, panorama.seconds)
-        record = record_of(plan, source.info, decisions, results, motion, panorama, time.perf_counter() - start)
+        record = record_of(plan, source.info, decisions, results, explained, verdict, panorama, time.perf_counter() - start)
         folder.write_results(panorama, motion, record)
         folder.write_report(render_report(record, motion, panorama))
         finished(record)

@@ -24,9 +24,14 @@ from photonpano.record.schema import (
     MotionRecord,
     PairRecord,
     PluginRecord,
+    ReasonRecord,
+    RefinementRecord,
     RescuedRecord,
     RunRecord,
+    VerdictRecord,
 )
+from photonpano.residuals.refinement import Explained, Refinement
+from photonpano.residuals.verdict import Reason, Verdict
 from photonpano.specs.plan import Choice, Plan
 from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, StreamInfo, true_spans
 
@@ -42,7 +47,8 @@ def record_of(
     stream: StreamInfo,
     decisions: Sequence[Decision],
     levels: Sequence[LevelResult],
-    motion: FrameMotion,
+    explained: Explained,
+    verdict: Verdict,
     panorama: RenderedPanorama,
     seconds: float,
 ) -> RunRecord:
@@ -53,10 +59,12 @@ def record_of(
         stream: the capture.
         decisions: the choices that the spec left open.
         levels: the results of the loop.
-        motion: the motion of every frame.
+        explained: the motion of every frame, and what refiners did.
+        verdict: whether it is trusted.
         panorama: the panorama.
         seconds: time that the run took.
     """
+    motion = explained.motion
     if plan.until_converged:
         decisions = [*decisions, levels_decision(levels)]
     return {
@@ -87,7 +95,9 @@ def record_of(
             "seconds": round(panorama.seconds, 3),
         },
         "motion": motion_record(motion.std_px),
-        "warnings": [*level_warnings(levels), *motion_warnings(motion)],
+        "refinements": [refinement_record(each) for each in explained.refinements],
+        "verdict": verdict_record(verdict),
+        "warnings": [*level_warnings(levels), *motion_warnings(motion), *refinement_warnings(explained.refinements)],
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
     }
@@ -194,6 +204,41 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
         return None
     worst = int(known[np.argmax(std_px[known])])
     return {"std_px": float(std_px[known].mean()), "worst_std_px": float(std_px[worst]), "worst_frame": worst}
+
+
+def verdict_record(verdict: Verdict) -> VerdictRecord:
+    """Describe a verdict."""
+    reasons = [_reason(reason) for reason in verdict.reasons]
+    return {"status": verdict.status, "reasons": reasons, "residual_ratio": verdict.residual_ratio}
+
+
+def _reason(reason: Reason) -> ReasonRecord:
+    return {
+        "what": reason.what,
+        "figure": reason.figure,
+        "threshold": reason.threshold,
+        "where": reason.where,
+        "what_to_do": reason.what_to_do,
+    }
+
+
+def refinement_record(refinement: Refinement) -> RefinementRecord:
+    """Describe what a refiner did."""
+    return {
+        "use": refinement.name,
+        "rounds": list(refinement.rounds),
+        "change_px": refinement.change_px,
+        "kept_out": refinement.kept_out or None,
+    }
+
+
+def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
+    """Warn of refiners whose motion was not used."""
+    return [
+        f"the motion of the refiner {each.name!r} is not used, since it explains the photons worse: {each.kept_out}"
+        for each in refinements
+        if each.kept_out
+    ]
 
 
 def levels_decision(results: Sequence[LevelResult]) -> Decision:

@@ -109,6 +109,40 @@ class PanoramaRecord(TypedDict):
     seconds: float
 
 
+class RefinementRecord(TypedDict):
+    """What a refiner did: the summary of each correction, and the mean displacement of the corners.
+
+    `kept_out` is why its last motion was not used, None if it was.
+    """
+
+    use: str
+    rounds: Sequence[str]
+    change_px: float
+    kept_out: str | None
+
+
+class ReasonRecord(TypedDict):
+    """Why a run is doubtful: the number that decided, the largest that is trusted, where, and what to do."""
+
+    what: str
+    figure: float
+    threshold: float
+    where: str
+    what_to_do: str
+
+
+class VerdictRecord(TypedDict):
+    """Whether motion and panorama explain the photons.
+
+    `status` is "trusted" or "doubtful". `residual_ratio` is the scatter of the shifts of short spans of frames, in units of
+    what noise explains: about 1 if nothing is left. None if there are too few frames to tell.
+    """
+
+    status: str
+    reasons: Sequence[ReasonRecord]
+    residual_ratio: float | None
+
+
 class RunRecord(TypedDict):
     """The content of `run.json`.
 
@@ -128,6 +162,8 @@ class RunRecord(TypedDict):
     decisions: Sequence[DecisionRecord]
     levels: Sequence[LevelRecord]
     motion: MotionRecord | None
+    refinements: Sequence[RefinementRecord]
+    verdict: VerdictRecord | None
     panorama: PanoramaRecord | None
     warnings: Sequence[str]
     seconds: float

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from photonpano import discover
-from photonpano.testing import InterpolatorConformance, MergerConformance, ResamplerConformance, SourceConformance
+from photonpano.testing import (
+    InterpolatorConformance,
+    MergerConformance,
+    RefinerConformance,
+    ResamplerConformance,
+    SourceConformance,
+)
 
 CATALOG = discover()
 
@@ -128,3 +134,7 @@ class TestLie(InterpolatorConformance):
 class TestSmoothingSpline(InterpolatorConformance):
     contribution = CATALOG.find("interpolator", "smoothing-spline").contribution
     tolerance_px = 3.0
+
+
+class TestShortSpans(RefinerConformance):
+    contribution = CATALOG.find("refiner", "short-spans").contribution

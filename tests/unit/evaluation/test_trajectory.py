@@ -5,8 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonpano.evaluation import FrameTrajectory, corner_errors
-from photonpano.geometry import align_planes, apply, corners, from_parameters, inverse, normalised, rescaling, translation
+from photonpano.evaluation import corner_errors
+from photonpano.geometry import (
+    FrameTrajectory,
+    align_planes,
+    apply,
+    corners,
+    from_parameters,
+    inverse,
+    normalised,
+    rescaling,
+    translation,
+)
 
 
 def jittered(motion: np.ndarray, sigma_px: float, seed: int = 1) -> np.ndarray:

@@ -1,0 +1,192 @@
+"""Sum, over blocks of pixels, what a panorama predicts of a span of frames and what was observed. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.compiling import compiled
+from photonpano.geometry.sampling import run_from, sample_run, visible_columns
+
+BLOCK_PX = 16
+"""Side of a block, px."""
+GXX, GXY, GYY, GX_R, GY_R, GX_M, GY_M, M_M, M_R, R, V, M = range(12)
+"""Sums of a block. With residual r, predicted count m, its gradient (gx, gy) along x and y, and the variance v of r: gx gx / v,
+gx gy / v, gy gy / v, gx r / v, gy r / v, gx m / v, gy m / v, m m / v, m r / v, r, v, m."""
+N_SUMS = 12
+_FEWEST_PHOTONS = 1.0
+"""A block with a smaller variance than this, in counts squared, is left out of the misfit: it is not normally distributed."""
+
+
+def n_blocks(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the number of blocks along y and x of a (height, width) image; the last ones may be cut off."""
+    return -(-shape[0] // BLOCK_PX), -(-shape[1] // BLOCK_PX)
+
+
+@compiled
+def sample_view(
+    mean: NDArray[np.float32], precision: NDArray[np.float32], to_canvas: NDArray[np.float64], into: NDArray[np.float32]
+) -> None:
+    """Interpolate two images of a canvas at the pixels of a frame: (2, h, w); NaN where the canvas ends."""
+    height, width = into.shape[1:]
+    for y in range(height):
+        first, last = visible_columns(to_canvas, y, 0.0, mean.shape[1] - 1.0, 0.0, mean.shape[0] - 1.0, width)
+        into[:, y, :first] = np.nan
+        into[:, y, last:] = np.nan
+        x = first
+        while x < last:
+            run = run_from(to_canvas, x, y, last - x, mean.shape[0], mean.shape[1])
+            sample_run(mean, run, into[0, y, x : x + run.size])
+            sample_run(precision, run, into[1, y, x : x + run.size])
+            x += run.size
+
+
+@compiled
+def add_block_sums(
+    counts: NDArray[np.float32],
+    dark: NDArray[np.float32],
+    n_frames: float,
+    mean: NDArray[np.float32],
+    precision: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    pixel_residual: NDArray[np.float32],
+    pixel_mean: NDArray[np.float32],
+) -> None:
+    """Add the sums of a span to blocks. The border pixels of a frame are left out, for they have no gradient.
+
+    Args:
+        counts: (H, W) summed counts, NaN for masked pixels.
+        dark: (H, W) variance of the count of a frame beside that of `precision`, such as that of dark counts.
+        n_frames: frames of the span.
+        mean: (H, W) expected count of a frame, NaN where unknown.
+        precision: (H, W) 1 / variance of the count of a frame; 0 or NaN where unknown.
+        sums: (h, w, 12), see `n_blocks`; added to.
+        pixel_residual: (H, W) sum of residuals; added to.
+        pixel_mean: (H, W) sum of expected counts; added to.
+    """
+    height, width = mean.shape
+    n = np.float32(n_frames)
+    half = np.float32(0.5) * n
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(1, height - 1):
+        row, above, below = mean[y], mean[y - 1], mean[y + 1]
+        lit, weights, extra = counts[y], precision[y], dark[y]
+        total_r, total_m = pixel_residual[y], pixel_mean[y]
+        for block in range((width + BLOCK_PX - 1) // BLOCK_PX):
+            start, stop = max(1, block * BLOCK_PX), min(width - 1, (block + 1) * BLOCK_PX)
+            size = stop - start
+            here, left, right = row[start:stop], row[start - 1 : stop - 1], row[start + 1 : stop + 1]
+            up, down = above[start:stop], below[start:stop]
+            k, p, e = lit[start:stop], weights[start:stop], extra[start:stop]
+            tr, tm = total_r[start:stop], total_m[start:stop]
+            xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
+            for t in range(size):
+                m, gx, gy = here[t] * n, (right[t] - left[t]) * half, (down[t] - up[t]) * half
+                r = k[t] - m
+                w = p[t] / (n * (one + e[t] * p[t]))
+                seen = gx + gy + r
+                ok = seen == seen and w > zero
+                w = w if ok else zero
+                m = m if ok else zero
+                gx = gx if ok else zero
+                gy = gy if ok else zero
+                r = r if ok else zero
+                v = one / w if ok else zero
+                wx, wy, wm = w * gx, w * gy, w * m
+                xx += wx * gx
+                xy += wx * gy
+                yy += wy * gy
+                xr += wx * r
+                yr += wy * r
+                xm += wx * m
+                ym += wy * m
+                mm += wm * m
+                mr += wm * r
+                rr += r
+                vv += v
+                ms += m
+                tr[t] += r
+                tm[t] += m
+            cell = sums[y // BLOCK_PX, block]
+            cell[0] += xx
+            cell[1] += xy
+            cell[2] += yy
+            cell[3] += xr
+            cell[4] += yr
+            cell[5] += xm
+            cell[6] += ym
+            cell[7] += mm
+            cell[8] += mr
+            cell[9] += rr
+            cell[10] += vv
+            cell[11] += ms
+
+
+@compiled
+def fold(
+    sums: NDArray[np.float32],
+    lever: NDArray[np.float64],
+    places: NDArray[np.int64],
+    variance_share: float,
+    normal: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    blocks: NDArray[np.float64],
+    block_misfit: NDArray[np.float64],
+    block_count: NDArray[np.float64],
+    cell_misfit: NDArray[np.float64],
+    cell_count: NDArray[np.float64],
+) -> float:
+    """Add up the blocks of a span: the equations of its motion and gain, and squared residual / variance.
+
+    Args:
+        sums: (h, w, 12) of the span.
+        lever: (h, w, 2) centres of the blocks, relative to the centre of the frame.
+        places: (h, w, 2) square of the panorama, x and y, on which each block lies.
+        variance_share: expected variance of residuals, relative to that of the photons.
+        normal: (5, 5), added to: see `Residuals`.
+        gradient: (5,), added to.
+        blocks: (h, w, 12) sums over time, added to.
+        block_misfit: (h, w), added to.
+        block_count: (h, w), added to.
+        cell_misfit: squares of the panorama, added to.
+        cell_count: added to.
+
+    Returns:
+        Mean over the blocks of squared residual / variance; 1 if no block has photons enough.
+    """
+    height, width = sums.shape[:2]
+    total, n = 0.0, 0.0
+    moves = np.zeros((4, 2))
+    for y in range(height):
+        for x in range(width):
+            cell = sums[y, x]
+            if cell[V] <= 0:
+                continue
+            moves[0, 0] = moves[1, 1] = 1
+            moves[2, 0], moves[2, 1] = -lever[y, x, 1], lever[y, x, 0]
+            moves[3, 0], moves[3, 1] = lever[y, x, 0], lever[y, x, 1]
+            for i in range(4):
+                a, b = moves[i]
+                for j in range(4):
+                    c, d = moves[j]
+                    normal[i, j] += a * c * cell[GXX] + (a * d + b * c) * cell[GXY] + b * d * cell[GYY]
+                mixed = a * cell[GX_M] + b * cell[GY_M]
+                normal[i, 4] += mixed
+                normal[4, i] += mixed
+                gradient[i] += a * cell[GX_R] + b * cell[GY_R]
+            normal[4, 4] += cell[M_M]
+            gradient[4] += cell[M_R]
+            for s in range(N_SUMS):
+                blocks[y, x, s] += cell[s]
+            if cell[V] < _FEWEST_PHOTONS:
+                continue
+            misfit = float(cell[R]) ** 2 / (float(cell[V]) * variance_share)
+            total += misfit
+            n += 1
+            block_misfit[y, x] += misfit
+            block_count[y, x] += 1
+            i, j = places[y, x, 1], places[y, x, 0]
+            if 0 <= i < cell_misfit.shape[0] and 0 <= j < cell_misfit.shape[1]:
+                cell_misfit[i, j] += misfit
+                cell_count[i, j] += 1
+    return total / n if n > 0 else 1.0

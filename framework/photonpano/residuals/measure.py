@@ -1,0 +1,259 @@
+"""Measure what the panorama does not explain: one pass over the frames, summed over time, sensor and panorama."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from photonpano.context import Context
+from photonpano.geometry import apply, corner_displacements, corners, inverse
+from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, fold, n_blocks
+from photonpano.residuals.prediction import Prediction
+from photonpano.threads import in_order
+from photonpano.values import FloatArray, FluxImage, FrameSpan, SpanResiduals
+
+N_STEPS = 4
+"""Steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span."""
+_NOISE_PX = 0.025
+"""Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it."""
+_SHORTEST, _LONGEST = 8, 64
+"""Fewest and most frames of a span, if the motion is slow."""
+_MAX_MOTION_PX = 2.0
+"""A span is short enough that the image moves by no more than this."""
+_FEWEST_SPANS = 64
+"""A capture is divided into at least this many spans, if it has the frames."""
+_BATCH = 64
+"""Spans that a thread measures at a time."""
+_PROBES = 8
+"""Instants at which the noise of a shift is predicted."""
+_PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
+"""Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
+changes by less than a factor of 10."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Observed minus predicted photons, summed in four ways.
+
+    Attributes:
+        spans: S spans of frames, in order, that together are the located frames.
+        instants: (S,) their centres.
+        normal: (S, 5, 5) matrices of the least-squares equations of the spans: shift along x and y in px, roll in radians,
+            zoom and gain as fractions.
+        gradient: (S, 5) right-hand sides of these equations.
+        misfit: (S,) mean over the blocks of a span of squared residual / variance, expected to be 1.
+        blocks: (h, w, 12) sums over time, for each block of the sensor: see `block_sums`.
+        block_misfit: (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen.
+        pixel_gain: (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted.
+        pixel_mean: (H, W) predicted photons of each pixel, all spans together.
+        cell_misfit: (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was
+            seen.
+        cell_count: (H', W') number of blocks that fell on each square.
+        frames_seen: frames that saw a place of the panorama, the median over its pixels.
+        frame_shape: (height, width) of a frame.
+    """
+
+    spans: tuple[FrameSpan, ...]
+    instants: FloatArray
+    normal: FloatArray
+    gradient: FloatArray
+    misfit: FloatArray
+    blocks: FloatArray
+    block_misfit: FloatArray
+    pixel_gain: FluxImage
+    pixel_mean: FluxImage
+    cell_misfit: FloatArray
+    cell_count: FloatArray
+    frames_seen: float
+    frame_shape: tuple[int, int]
+
+    def steps(self) -> SpanResiduals:
+        """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
+        kept, gain = self.normal[:, :N_STEPS, :N_STEPS], self.normal[:, N_STEPS, N_STEPS]
+        mixed = self.normal[:, :N_STEPS, N_STEPS]
+        weight = 1 / (gain + _PRIOR[N_STEPS])
+        information = kept - mixed[:, :, None] * mixed[:, None, :] * weight[:, None, None]
+        right = self.gradient[:, :N_STEPS] - mixed * (weight * self.gradient[:, N_STEPS])[:, None]
+        steps = np.linalg.solve(information + np.diag(_PRIOR[:N_STEPS]), right[..., None])[..., 0]
+        return SpanResiduals(self.spans, steps, information)
+
+    def gains(self) -> tuple[FloatArray, FloatArray]:
+        """Return the relative brightness of each span minus 1, and its standard deviation by photon noise: (S,) each."""
+        information = self.normal + np.diag(_PRIOR)
+        covariance = np.linalg.inv(information)
+        solved = np.einsum("sij,sj->si", covariance, self.gradient)
+        return solved[:, N_STEPS], np.sqrt(covariance[:, N_STEPS, N_STEPS])
+
+
+def measure(source: Source, span: FrameSpan, prediction: Prediction, context: Context) -> Residuals:
+    """Compare the frames of a span with what the panorama predicts.
+
+    Args:
+        source: the capture.
+        span: the located frames.
+        prediction: the panorama along the motion.
+        context: threads and progress; the result does not depend on the number of threads.
+    """
+    spans = spans_of(span, prediction)
+    homographies = prediction.trajectory.at([each.centre for each in spans])
+    batches = [slice(first, first + _BATCH) for first in range(0, len(spans), _BATCH)]
+    work = partial(_measured, source, prediction, spans, homographies)
+    total: _Batch | None = None
+    results: list[tuple[FloatArray, ...]] = []
+    with context.progress.stage("residuals", len(span), "frames") as advance:
+        for batch, part in zip(batches, in_order(work, batches, context.threads), strict=True):
+            results.append((part.normal, part.gradient, part.misfit))
+            total = part if total is None else total.plus(part)
+            advance(sum(map(len, spans[batch])))
+    assert total is not None
+    normal, gradient, misfit = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel_gain = np.where(total.pixel_mean > 0, 1 + total.pixel_residual / total.pixel_mean, np.float32(np.nan))
+        return Residuals(
+            spans,
+            np.array([each.centre for each in spans]),
+            normal,
+            gradient,
+            misfit,
+            total.blocks,
+            total.block_misfit / total.block_count,
+            np.asarray(pixel_gain, np.float32),
+            total.pixel_mean,
+            total.cell_misfit / total.cell_count,
+            total.cell_count,
+            prediction.frames_seen,
+            prediction.frame_shape,
+        )
+
+
+def spans_of(span: FrameSpan, prediction: Prediction) -> tuple[FrameSpan, ...]:
+    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion.
+
+    Args:
+        span: the frames to divide.
+        prediction: the panorama along the motion.
+    """
+    frames = np.arange(span.start, span.stop)
+    homographies = prediction.trajectory.at(frames)
+    speed = 0.0
+    if len(frames) > 1:
+        moved = corner_displacements(inverse(homographies[:-1]) @ homographies[1:], np.eye(3), prediction.frame_shape)
+        speed = float(np.quantile(moved.mean(axis=-1), 0.95))
+    probes = np.linspace(0, len(frames) - 1, _PROBES).astype(int)
+    noise_px = _shift_noise_px(prediction, homographies[probes])
+    wanted = np.clip(np.ceil((noise_px / _NOISE_PX) ** 2), _SHORTEST, _LONGEST)
+    size = int(min(wanted, _MAX_MOTION_PX / max(speed, 1e-9), len(frames) / _FEWEST_SPANS))
+    size = max(1, size)
+    bounds = [*range(span.start, span.stop - size + 1, size), span.stop]
+    return tuple(FrameSpan(start, stop) for start, stop in pairwise(bounds))
+
+
+def _shift_noise_px(prediction: Prediction, homographies: FloatArray) -> float:
+    """Return the standard deviation of the shift of a single frame by photon noise, the median over some frames."""
+    images = np.empty((2, *prediction.frame_shape), np.float32)
+    nothing = np.zeros(prediction.frame_shape, np.float32)
+    noises = []
+    for homography in homographies:
+        prediction.view(homography, images)
+        sums = np.zeros((*n_blocks(prediction.frame_shape), N_SUMS), np.float32)
+        add_block_sums(nothing, nothing, 1.0, images[0], images[1], sums, nothing.copy(), nothing.copy())
+        xx, xy, yy = sums[..., :3].sum(axis=(0, 1), dtype=np.float64)
+        information = np.array([[xx, xy], [xy, yy]]) + 1e-12 * np.eye(2)
+        noises.append(float(np.sqrt(np.trace(np.linalg.inv(information)) / 2)))
+    return float(np.median(noises))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Batch:
+    """The sums of some spans; see `Residuals`. The counts are numbers of blocks."""
+
+    normal: FloatArray
+    gradient: FloatArray
+    misfit: FloatArray
+    blocks: FloatArray
+    block_misfit: FloatArray
+    block_count: FloatArray
+    pixel_residual: FluxImage
+    pixel_mean: FluxImage
+    cell_misfit: FloatArray
+    cell_count: FloatArray
+
+    def plus(self, other: _Batch) -> _Batch:
+        """Return the sums over both; `normal`, `gradient` and `misfit` are kept apart, and not used here."""
+        return _Batch(
+            self.normal,
+            self.gradient,
+            self.misfit,
+            self.blocks + other.blocks,
+            self.block_misfit + other.block_misfit,
+            self.block_count + other.block_count,
+            self.pixel_residual + other.pixel_residual,
+            self.pixel_mean + other.pixel_mean,
+            self.cell_misfit + other.cell_misfit,
+            self.cell_count + other.cell_count,
+        )
+
+
+def _measured(
+    source: Source, prediction: Prediction, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice
+) -> _Batch:
+    shape = prediction.frame_shape
+    grid, cells = n_blocks(shape), n_blocks(prediction.mean.shape)
+    spans, homographies = spans[batch], homographies[batch]
+    height, width = shape
+    row, column = np.mgrid[: grid[0], : grid[1]]
+    middle = np.stack([_middles(column, width), _middles(row, height)], axis=-1)
+    lever = middle - corners(shape).mean(axis=0)
+    corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
+    zeros = np.zeros(shape, np.uint32)
+    # Counts of the dark add their noise, although they are subtracted.
+    dark = np.zeros(shape, np.float32) if corrected is None else np.maximum(-corrected(zeros, 1), 0)
+    masked = None if source.valid.all() else np.where(source.valid, np.float32(0), np.float32(np.nan))
+    total = _Batch(
+        np.zeros((len(spans), 5, 5)),
+        np.zeros((len(spans), 5)),
+        np.zeros(len(spans)),
+        np.zeros((*grid, N_SUMS)),
+        np.zeros(grid),
+        np.zeros(grid),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(cells),
+        np.zeros(cells),
+    )
+    images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
+    for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
+        raw = source.counts(span)
+        counts = raw.astype(np.float32) if corrected is None else corrected(raw, len(span))
+        if masked is not None:
+            counts = counts + masked
+        prediction.view(homography, images)
+        sums[:] = 0
+        add_block_sums(counts, dark, float(len(span)), images[0], images[1], sums, total.pixel_residual, total.pixel_mean)
+        places = np.floor(apply(prediction.canvas @ homography, middle.reshape(-1, 2)) / BLOCK_PX).astype(np.int64)
+        # The photons of the span are part of the panorama, so that the residual is less than their noise.
+        own = min(0.5, len(span) / max(prediction.frames_seen, 1.0))
+        total.misfit[index] = fold(
+            sums,
+            lever,
+            places.reshape(*grid, 2),
+            1 - own,
+            total.normal[index],
+            total.gradient[index],
+            total.blocks,
+            total.block_misfit,
+            total.block_count,
+            total.cell_misfit,
+            total.cell_count,
+        )
+    return total
+
+
+def _middles(index: np.ndarray, length: int) -> FloatArray:
+    """Return the coordinates of the centres of blocks; the last one may be cut off by the border of the frame."""
+    return np.asarray((index * BLOCK_PX + np.minimum((index + 1) * BLOCK_PX, length) - 1) / 2, np.float64)

@@ -1,0 +1,125 @@
+"""Predict the photons of frames from the panorama and the motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.geometry import corners
+from photonpano.protocols import Trajectory
+from photonpano.residuals.block_sums import sample_view
+from photonpano.values import FluxImage, Homography, Panorama, Response
+
+_BLUR_PX = 0.7
+"""Standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture."""
+_INTERPOLATION_PX2 = 1 / 6
+"""Variance of the kernel of one linear interpolation, averaged over the fractions of a pixel."""
+_MANY_FRAMES = 1e4
+"""Frames for which the variance of a count is derived; it is then divided by them."""
+_STRAIGHT_RUN_PX = 64
+"""From this length of straight runs on, the compiled interpolation is faster than OpenCV's."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """The panorama as the camera would see it from any instant: a `PanoramaView`.
+
+    The panorama is smoothed, and then sharpened by as much as smoothing and interpolation have blurred it, to second order. So
+    its noise is low and its edges are where they were.
+
+    Attributes:
+        canvas: (3, 3), pixels of the reference plane to pixels of the two images.
+        mean: (H, W) float32, expected count of a frame; NaN where the panorama was not seen.
+        precision: (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen.
+        trajectory: the motion.
+        frame_shape: (height, width) of a frame.
+        frames_seen: frames that saw a place of the panorama, the median over its pixels.
+    """
+
+    canvas: Homography
+    mean: FluxImage
+    precision: FluxImage
+    trajectory: Trajectory
+    frame_shape: tuple[int, int]
+    frames_seen: float
+
+    @classmethod
+    def of(cls, panorama: Panorama, response: Response, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Prediction:
+        """Make the prediction of a panorama.
+
+        Args:
+            panorama: flux and weight, rendered along the trajectory.
+            response: the response of the camera.
+            trajectory: frame pixels to reference pixels.
+            frame_shape: (height, width) of a frame.
+        """
+        seen = panorama.weight > 0
+        share = _smoothed(seen.astype(np.float32))
+        lit = _smoothed(np.where(seen, panorama.flux, np.float32(0)))
+        flux = np.asarray(lit / np.maximum(share, np.float32(1e-6)), np.float32)
+        # Next to an unseen pixel, the second derivative is unknown.
+        inside = cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
+        blur = np.float32(_BLUR_PX**2 + _INTERPOLATION_PX2)
+        sharp = np.maximum(flux - blur / 2 * cv2.Laplacian(flux, cv2.CV_32F, ksize=1), 0)
+        mean = response.mean_count(np.asarray(sharp, np.float32))
+        mean[~inside] = np.nan
+        precision = np.asarray(1 / _variance(flux, response), np.float32)
+        precision[~inside] = 0
+        frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
+        return cls(panorama.canvas, mean, precision, trajectory, frame_shape, frames_seen)
+
+    def view(self, homography: Homography, into: NDArray[np.float32]) -> None:
+        """Sample both images at the pixels of a frame.
+
+        Args:
+            homography: (3, 3), frame pixels to reference pixels.
+            into: (2, H, W) float32, output: mean and precision, NaN where the panorama was not seen.
+        """
+        to_canvas = np.ascontiguousarray(self.canvas @ homography)
+        if self._straight(to_canvas):
+            sample_view(self.mean, self.precision, to_canvas, into)
+            return
+        height, width = self.frame_shape
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        for image, place in zip((self.mean, self.precision), into, strict=True):
+            cv2.warpPerspective(image, to_canvas, (width, height), place, flags, cv2.BORDER_CONSTANT, float("nan"))
+
+    def predicted(self, instant: float) -> tuple[FluxImage, FluxImage]:
+        """Predict the frame of an instant: see `PanoramaView`."""
+        images = np.empty((2, *self.frame_shape), np.float32)
+        self.view(self.trajectory.at([instant])[0], images)
+        mean, precision = images
+        known = np.isfinite(mean) & (precision > 0)
+        mean[~known] = np.nan
+        return mean, np.divide(1, precision, out=np.full_like(precision, np.nan), where=known)
+
+    def _straight(self, to_canvas: Homography) -> bool:
+        """Return whether neighbours on a row of the frame lie at neighbours on the canvas, over long runs."""
+        x, y = corners(self.frame_shape).T
+        depth = to_canvas[2, 0] * x + to_canvas[2, 1] * y + to_canvas[2, 2]
+        u = (to_canvas[0, 0] * x + to_canvas[0, 1] * y + to_canvas[0, 2]) / depth
+        v = (to_canvas[1, 0] * x + to_canvas[1, 1] * y + to_canvas[1, 2]) / depth
+        along = np.abs(to_canvas[0, 0] / depth - u * to_canvas[2, 0] / depth - 1)
+        across = np.abs(to_canvas[1, 0] / depth - v * to_canvas[2, 0] / depth)
+        return bool(max(along.max(), across.max()) < 1 / _STRAIGHT_RUN_PX)
+
+
+def _smoothed(image: FluxImage) -> FluxImage:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
+def _variance(flux: FluxImage, response: Response) -> FluxImage:
+    """Return the variance of the count of a frame, for any response.
+
+    On the stabilised scale the noise is known; the derivative of that scale by the mean count converts it.
+    """
+    floor = max(1e-4 * float(flux.max(initial=0)), 1e-7)
+    low, high = np.maximum(flux * np.float32(0.98), floor), np.maximum(flux * np.float32(1.02), 2 * floor)
+    counts = response.mean_count(high) - response.mean_count(low)
+    steps = response.stabilised(high, _MANY_FRAMES) - response.stabilised(low, _MANY_FRAMES)
+    per_step = counts / np.maximum(steps, np.float32(1e-9))
+    std = response.stabilised_std(_MANY_FRAMES) * np.abs(per_step)
+    return np.asarray(np.maximum(_MANY_FRAMES * std**2, 1e-7), np.float32)

@@ -1,0 +1,73 @@
+"""Motion that is left in the residuals beyond photon noise: its size, frame by frame, and its ratio to the noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from photonpano.geometry import corners
+from photonpano.residuals.measure import Residuals
+from photonpano.values import FloatArray
+
+SYSTEMATIC_PX = 0.015
+"""Error of measured shifts where frames and panorama are interpolated at different fractions of a pixel."""
+_SMOOTH_SPANS = 25
+"""The ratio is that of motion faster than this many spans."""
+_LOCAL_SPANS = 33
+"""The size is averaged over this many spans."""
+_SIGNIFICANT = 3.0
+"""Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations."""
+
+
+def residual_ratio(residuals: Residuals) -> float:
+    """Return the scatter of the shifts of short spans, divided by what photon noise and interpolation explain.
+
+    It is 1 where the motion is all there is, and 24 at a tremor of 1 px. Slow changes are left out, since the panorama follows
+    them. NaN for fewer than 50 spans.
+    """
+    steps, variances = _series(residuals)
+    shifts, expected = steps[:, :2], variances[:, :2]
+    known = np.isfinite(expected).all(axis=1)
+    if known.sum() < 2 * _SMOOTH_SPANS:
+        return float("nan")
+    ratios = shifts[known] / np.sqrt(expected[known])
+    kernel = np.ones(_SMOOTH_SPANS) / _SMOOTH_SPANS
+    slow = np.stack([np.convolve(np.pad(each, _SMOOTH_SPANS // 2, mode="edge"), kernel, "valid") for each in ratios.T], axis=1)
+    return float(np.sqrt(np.mean((ratios - slow) ** 2) / (1 - 1 / _SMOOTH_SPANS)))
+
+
+def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
+    """Return the corner error that the residuals show beyond photon noise, for every frame: (n_frames,).
+
+    It is the root mean square over 33 spans around the frame, 0 where noise explains it.
+
+    Args:
+        residuals: of the motion.
+        n_frames: frames of the capture.
+    """
+    steps, variances = _series(residuals)
+    known = np.isfinite(variances).all(axis=1)
+    if known.sum() < 2:
+        return np.zeros(n_frames)
+    squares, noise = (steps[known] ** 2).sum(axis=1), variances[known].sum(axis=1)
+    spread = 2 * (variances[known] ** 2).sum(axis=1)
+    size = min(_LOCAL_SPANS, len(squares))
+    kernel = np.ones(size) / size
+    left, right = (size - 1) // 2, size // 2
+    local, floor, width = (
+        np.convolve(np.pad(each, (left, right), mode="reflect"), kernel, "valid") for each in (squares, noise, spread)
+    )
+    excess = local - floor
+    found = np.where(excess > _SIGNIFICANT * np.sqrt(width / size), np.sqrt(np.maximum(excess, 0)), 0)
+    return np.interp(np.arange(n_frames), residuals.instants[known], found)
+
+
+def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of the spans as motions of a corner in px, and their expected variances: (S, 4) each."""
+    shape = corners(residuals.frame_shape)
+    radius_px = float(np.linalg.norm(shape[0] - shape.mean(axis=0)))
+    to_px = np.array([1, 1, radius_px, radius_px])
+    found = residuals.steps()
+    information = np.maximum(np.diagonal(found.information, axis1=1, axis2=2), 0)
+    with np.errstate(divide="ignore"):
+        variances = to_px**2 / information + SYSTEMATIC_PX**2
+    return found.steps * to_px, variances

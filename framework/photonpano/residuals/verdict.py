@@ -1,0 +1,298 @@
+"""The verdict on a run: tests of the residuals and of the motion, each with a known rate of false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX, GXY, GY_R, GYY, M, R, V
+from photonpano.residuals.measure import Residuals
+from photonpano.residuals.refinement import Explained
+from photonpano.values import BoolArray, FloatArray
+
+MAX_RATIO = 2.0
+"""Scatter of the shifts of short spans, in units of what noise explains."""
+MAX_MISFIT, MAX_CONTRAST = 1.1, 0.02
+"""Mean squared residual / variance of blocks, and the part of the light that it stands for: both must be exceeded."""
+MAX_MOVING_SHARE = 0.03
+"""Share of the panorama whose photons change over time."""
+MAX_GAIN = 0.03
+"""Root mean square of the relative brightness, over the blocks of the sensor or over the spans of the capture."""
+MAX_HOT_SHARE = 0.005
+"""Share of the pixels that count far more, or far fewer, photons than the panorama predicts."""
+MAX_DEFORMATION_PX = 0.1
+"""Root mean square of the shifts of blocks of the sensor that no motion of the whole frame explains."""
+MAX_STD_PX = 1.0
+"""Mean expected error of the motion."""
+MAX_CONTRADICTIONS = 0.1
+"""Share of the pairs of the last level that were dropped because they contradict the others."""
+_SIGMAS = 6.0
+"""A place stands out if it exceeds what is expected by this many standard deviations."""
+_FEWEST = 16
+"""Blocks that must have fallen on a square of the panorama."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a run is doubtful.
+
+    Attributes:
+        what: what was found, in a clause.
+        figure: the number that decided.
+        threshold: the largest number that is trusted.
+        where: the frames, pixels or places, in a clause; empty if it is everywhere.
+        what_to_do: advice, in a clause.
+    """
+
+    what: str
+    figure: float
+    threshold: float
+    where: str
+    what_to_do: str
+
+    def __str__(self) -> str:
+        where = f" ({self.where})" if self.where else ""
+        return f"{self.what}{where}: {self.figure:.3g}, trusted up to {self.threshold:g}; {self.what_to_do}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether motion and panorama explain the photons.
+
+    Attributes:
+        status: "trusted" or "doubtful".
+        reasons: why it is doubtful, the most telling first.
+        residual_ratio: scatter of the shifts of short spans, in units of what noise explains; None if it is unknown.
+    """
+
+    status: Literal["trusted", "doubtful"]
+    reasons: tuple[Reason, ...]
+    residual_ratio: float | None
+
+
+def judge(explained: Explained, levels: Sequence[LevelResult]) -> Verdict:
+    """Test the result of a run.
+
+    Args:
+        explained: motion and residuals.
+        levels: the results of the loop; empty if they are not known.
+    """
+    residuals, motion = explained.residuals, explained.motion
+    tests: list[Callable[[], Reason | None]] = [
+        lambda: _photons(residuals),
+        lambda: _moving(residuals),
+        lambda: _fast_motion(explained.ratio),
+        lambda: _light(residuals),
+        lambda: _sensor(residuals),
+        lambda: _hot_pixels(residuals),
+        lambda: _deformation(residuals),
+        lambda: _uncertain(motion),
+        lambda: _contradictions(levels),
+    ]
+    reasons = tuple(reason for test in tests if (reason := test()) is not None)
+    ratio = explained.ratio if np.isfinite(explained.ratio) else None
+    return Verdict("doubtful" if reasons else "trusted", reasons, ratio)
+
+
+def _photons(residuals: Residuals) -> Reason | None:
+    misfit = float(residuals.misfit.mean())
+    sums = residuals.blocks.sum(axis=(0, 1))
+    per_span = sums / max(len(residuals.spans), 1)
+    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
+    # The squared residual of a block beyond its variance, as a part of its photons.
+    contrast = float(np.sqrt(max(misfit - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
+    if misfit <= MAX_MISFIT or contrast <= MAX_CONTRAST:
+        return None
+    return Reason(
+        "the panorama does not explain the photons: they differ from its prediction by more than their noise",
+        misfit,
+        MAX_MISFIT,
+        f"on average by {contrast:.0%} of the light",
+        "look at the maps of the report; the motion may be wrong, or the scene changes",
+    )
+
+
+def _moving(residuals: Residuals) -> Reason | None:
+    counted = residuals.cell_count >= _FEWEST
+    if not counted.any():
+        return None
+    expected = 1 + _SIGMAS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
+    changing = counted & (residuals.cell_misfit > np.maximum(expected, 1.5))
+    share = float(changing.sum() / counted.sum())
+    if share <= MAX_MOVING_SHARE:
+        return None
+    return Reason(
+        "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
+        share,
+        MAX_MOVING_SHARE,
+        _box(changing, "px of the panorama"),
+        "merge with robust-merge, or mask what moves; the motion may be that of the thing instead of the scene",
+    )
+
+
+def _fast_motion(ratio: float) -> Reason | None:
+    if not ratio > MAX_RATIO:
+        return None
+    return Reason(
+        "the image moves within groups by more than the motion that was found",
+        ratio,
+        MAX_RATIO,
+        "scatter of the shifts of short spans over their noise",
+        "use the refiner short-spans, or smaller groups (resample.with.group_size)",
+    )
+
+
+def _light(residuals: Residuals) -> Reason | None:
+    gains, stds = residuals.gains()
+    change = float(np.sqrt(max(float(np.mean(gains**2 - stds**2)), 0)))
+    if change <= MAX_GAIN:
+        return None
+    span = residuals.spans[int(np.argmax(np.abs(gains) / np.maximum(stds, 1e-9)))]
+    return Reason(
+        "the light changes over time",
+        change,
+        MAX_GAIN,
+        f"most at {span}",
+        "keep the light steady, or shorten the capture",
+    )
+
+
+def _sensor(residuals: Residuals) -> Reason | None:
+    sums = residuals.blocks
+    seen = sums[..., M] > 0
+    gain = np.divide(sums[..., R], sums[..., M], out=np.zeros(seen.shape), where=seen)
+    noise = np.divide(sums[..., V], sums[..., M] ** 2, out=np.zeros(seen.shape), where=seen)
+    change = float(np.sqrt(max(np.mean((gain**2 - noise)[seen]), 0))) if seen.any() else 0.0
+    if change <= MAX_GAIN:
+        return None
+    worst = np.unravel_index(np.argmax(np.abs(gain)), gain.shape)
+    return Reason(
+        "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
+        change,
+        MAX_GAIN,
+        f"most at pixel ({worst[1] * BLOCK_PX + BLOCK_PX // 2}, {worst[0] * BLOCK_PX + BLOCK_PX // 2}) of the frame",
+        "mask these pixels (corrections: mask), or divide by a flat field",
+    )
+
+
+def _hot_pixels(residuals: Residuals) -> Reason | None:
+    predicted = residuals.pixel_mean
+    known = predicted > 0
+    excess = np.abs(residuals.pixel_gain - 1) * predicted
+    outlier = known & (excess > _SIGMAS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
+    share = float(outlier.sum() / max(known.sum(), 1))
+    if share <= MAX_HOT_SHARE:
+        return None
+    return Reason(
+        "single pixels count far more, or far fewer, photons than the panorama predicts",
+        share,
+        MAX_HOT_SHARE,
+        f"{int(outlier.sum())} pixels",
+        "mask them (corrections: hot-pixels)",
+    )
+
+
+def _deformation(residuals: Residuals) -> Reason | None:
+    field, information = block_shifts(residuals)
+    known = information[..., 0, 0] > 0
+    if known.sum() < 12:
+        return None
+    rms, kind = _unexplained_field(field[known], information[known], _unit_places(known))
+    if rms <= MAX_DEFORMATION_PX:
+        return None
+    return Reason(
+        f"frames are deformed as no motion of the whole frame explains{kind}",
+        rms,
+        MAX_DEFORMATION_PX,
+        "px, over the frame",
+        "correct the lens before, or use its middle only (corrections: crop)",
+    )
+
+
+def block_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+    """Return the mean shift of each block of the sensor against the panorama, and its information.
+
+    Returns:
+        (h, w, 2) in px, and (h, w, 2, 2) inverse covariances by photon noise, 0 where a block carries no shift.
+    """
+    sums = residuals.blocks
+    information = np.stack([sums[..., [GXX, GXY]], sums[..., [GXY, GYY]]], axis=-2)
+    right = sums[..., [GX_R, GY_R]]
+    determined = np.linalg.det(information) > 1e-6 * np.trace(information, axis1=-2, axis2=-1) ** 2
+    information = np.where(determined[..., None, None], information, 0)
+    field = np.linalg.solve(np.where(determined[..., None, None], information, np.eye(2)), right[..., None])[..., 0]
+    return np.where(determined[..., None], field, 0), information
+
+
+def _unit_places(known: BoolArray) -> FloatArray:
+    """Return the centres of blocks relative to the centre of the frame, in half diagonals: (N, 2)."""
+    y, x = np.nonzero(known)
+    places = np.stack([x - (known.shape[1] - 1) / 2, y - (known.shape[0] - 1) / 2], axis=-1)
+    return np.asarray(places / np.linalg.norm([(known.shape[1] - 1) / 2, (known.shape[0] - 1) / 2]))
+
+
+def _unexplained_field(field: FloatArray, information: FloatArray, places: FloatArray) -> tuple[float, str]:
+    """Fit a cubic radial field and an affine one to shifts; return the rms of the radial part in px if it is significant."""
+    x, y = places.T
+    radius = (places**2).sum(axis=1)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    columns = [
+        np.stack([one, zero], axis=-1),
+        np.stack([zero, one], axis=-1),
+        *(np.stack([each, zero], axis=-1) for each in (x, y)),
+        *(np.stack([zero, each], axis=-1) for each in (x, y)),
+        np.stack([x * radius, y * radius], axis=-1),
+    ]
+    design = np.stack(columns, axis=-1)
+    normal = np.einsum("nip,nij,njq->pq", design, information, design) + 1e-9 * np.eye(len(columns))
+    right = np.einsum("nip,nij,nj->p", design, information, field)
+    covariance = np.linalg.inv(normal)
+    found = covariance @ right
+    radial = float(found[-1])
+    if abs(radial) < _SIGMAS * np.sqrt(covariance[-1, -1]):
+        return 0.0, ""
+    shifts = design[..., -1] * radial
+    return float(np.sqrt(np.mean((shifts**2).sum(axis=-1)))), ", growing with the distance from the centre as with a lens"
+
+
+def _uncertain(motion: FrameMotion) -> Reason | None:
+    known = motion.std_px[motion.located]
+    mean = float(known.mean()) if len(known) else float("inf")
+    if mean <= MAX_STD_PX:
+        return None
+    if not np.isfinite(mean):
+        return Reason(
+            "no motion is known", 0.0, MAX_STD_PX, "a single exposure was located", "use smaller groups, or more light"
+        )
+    worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
+    return Reason(
+        "the expected error of the motion is large", mean, MAX_STD_PX, f"px on average, most at frame {worst}", "use more light"
+    )
+
+
+def _contradictions(levels: Sequence[LevelResult]) -> Reason | None:
+    if not levels:
+        return None
+    located = levels[-1].located
+    share = len(located.solution.outliers) / max(len(located.edges), 1)
+    if share <= MAX_CONTRADICTIONS:
+        return None
+    return Reason(
+        "pairs of exposures contradict each other, as where a scene repeats",
+        share,
+        MAX_CONTRADICTIONS,
+        f"{len(located.solution.outliers)} of {len(located.edges)} pairs of the last level",
+        "look at the path in the report; use a slower motion, or smaller groups",
+    )
+
+
+def _box(cells: BoolArray, unit: str) -> str:
+    y, x = np.nonzero(cells)
+    low, high = (int(np.quantile(y, q) * BLOCK_PX) for q in (0.05, 0.95))
+    left, right = (int(np.quantile(x, q) * BLOCK_PX) for q in (0.05, 0.95))
+    return f"mostly x {left} to {right + BLOCK_PX}, y {low} to {high + BLOCK_PX} in {unit}"

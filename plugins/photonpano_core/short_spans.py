@@ -1,0 +1,156 @@
+"""Refine the motion by the shifts of short spans of frames, where they exceed photon noise: tremor inside a group."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.interpolate import CubicSpline
+
+from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
+from photonpano.geometry import corners, inverse, normalised, step_motions
+from photonpano_core.configs import ShortSpansConfig
+
+_WINDOW_SPANS = 128
+"""Longest window of the spectra, in spans: the tremor may change from one window to the next."""
+_FEWEST_SPANS = 16
+"""Fewer spans than this have no spectrum."""
+_SIGNIFICANT = 3.0
+"""A frequency is corrected if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies."""
+_SYSTEMATIC_PX = 0.015
+"""Shifts are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
+_NAMED_LINES = 3
+"""Frequencies that a summary names at most."""
+_NAMED_SHARE = 0.003
+"""A frequency is named if its peak has at least this share of the power."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Filtered:
+    """One mode of the motion after a Wiener filter.
+
+    Attributes:
+        signal: (S,) what exceeds the noise.
+        std: (S,) the noise that the filter let through, as an expected error.
+    """
+
+    signal: FloatArray
+    std: FloatArray
+
+
+class ShortSpansRefiner:
+    """Corrects shift, roll and zoom of the frames by a Wiener filter of the steps of short spans.
+
+    The spectrum of the steps is estimated in windows that overlap by half. The noise of the steps is known from the photons,
+    so the spectrum of the motion is what exceeds it. Each frequency of each window is multiplied by signal / (signal + noise)
+    if it is significant, by 0 if not (Wiener 1949).
+    """
+
+    def __init__(self, config: ShortSpansConfig, frame_shape: tuple[int, int], frame_rate_hz: float | None) -> None:
+        """Take the (height, width) of a frame, and the frames per second, None if unknown."""
+        self._config = config
+        self._shape = frame_shape
+        self._rate = frame_rate_hz
+        self._radius_px = float(np.linalg.norm(corners(frame_shape)[0] - corners(frame_shape).mean(axis=0)))
+
+    def refine(
+        self, source: Source, trajectory: Trajectory, std_px: FloatArray, residuals: SpanResiduals, view: PanoramaView
+    ) -> Refined | None:
+        """Correct the motion: see `Refiner`."""
+        del source, view
+        if len(residuals.spans) < _FEWEST_SPANS:
+            return None
+        to_px = np.array([1, 1, self._radius_px, self._radius_px])
+        variances = _variances(residuals.information) * to_px**2
+        steps = residuals.steps * to_px
+        modes = [_filtered(steps[:, mode], variances[:, mode]) for mode in range(steps.shape[1])]
+        shift_px = float(np.sqrt(sum(np.mean(mode.signal**2) for mode in modes)))
+        if shift_px < self._config.smallest_px:
+            return None
+        frames = np.arange(len(std_px))
+        instants = np.array([span.centre for span in residuals.spans])
+        at = np.clip(frames, instants[0], instants[-1])
+        corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1))(at) / to_px
+        motions = trajectory.at(frames)
+        reference = int(np.abs(motions - np.eye(3)).max(axis=(1, 2)).argmin())
+        refined = motions @ step_motions(corrections, self._shape)
+        shifts = np.stack([mode.signal for mode in modes[:2]], axis=1)
+        noise = np.interp(frames, instants, np.sqrt(sum(mode.std**2 for mode in modes)))
+        return Refined(
+            normalised(inverse(refined[reference]) @ refined),
+            np.hypot(std_px, noise),
+            f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(shifts, instants)}",
+        )
+
+    def _frequencies(self, shifts: FloatArray, instants: FloatArray) -> str:
+        """Return the strongest frequencies of (S, 2) shifts, as the end of a sentence."""
+        spectrum = np.fft.rfft(shifts * np.hanning(len(shifts))[:, None], axis=0)
+        power = (np.abs(spectrum) ** 2).sum(axis=1)
+        found: list[int] = []
+        total = power.sum()
+        while len(found) < _NAMED_LINES and power.max() > _NAMED_SHARE * total:
+            peak = int(power.argmax())
+            found.append(peak)
+            power[max(0, int(peak * 0.8) - 2) : int(peak * 1.25) + 3] = 0
+        cycles = np.array(sorted(peak for peak in found if peak > 1)) / (len(shifts) * float(np.median(np.diff(instants))))
+        if not len(cycles):
+            return ""
+        if self._rate is None:
+            return f", mostly with periods of {', '.join(f'{1 / each:.0f}' for each in cycles)} frames"
+        return f", mostly at {', '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
+
+
+def _variances(information: FloatArray) -> FloatArray:
+    """Return the variances of (S, 4) steps; infinite where the photons do not determine one."""
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 0))
+    known = scale > 0
+    unit = information / np.where(known, scale, 1)[:, :, None] / np.where(known, scale, 1)[:, None, :]
+    inverted = np.linalg.pinv(unit, hermitian=True)
+    variances = np.diagonal(inverted, axis1=1, axis2=2) / np.where(known, scale, 1) ** 2
+    return np.where(known & (variances > 0), variances, np.inf)
+
+
+def _filtered(steps: FloatArray, variances: FloatArray) -> _Filtered:
+    """Filter a series of steps by its own spectrum, window by window.
+
+    Args:
+        steps: (S,) in px.
+        variances: (S,) of their photon noise; infinite where a step is unknown.
+    """
+    size = min(_WINDOW_SPANS, 2 ** int(np.log2(len(steps))))
+    known = np.isfinite(variances)
+    if known.sum() < size // 2:
+        return _Filtered(np.zeros(len(steps)), np.zeros(len(steps)))
+    # A step of large noise, over a dark place, would drown its window: it counts for less.
+    typical = float(np.median(variances[known]))
+    trust = np.where(known, typical / (typical + np.maximum(variances - typical, 0)), 0.0)
+    noise = (
+        np.where(known, np.minimum(variances, typical / np.maximum(trust, 1e-9)), 0.0) * trust**2 + _SYSTEMATIC_PX**2 * trust**2
+    )
+    half = size // 2
+    n_windows = -(-len(steps) // half) + 1
+    end = (n_windows + 1) * half - len(steps) - half
+    series, variance = (np.pad(each, (half, end), mode="reflect") for each in (steps * trust, noise))
+    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size)
+    windows = np.fft.rfft(sliding_window_view(series, size)[::half] * taper)
+    expected = sliding_window_view(variance, size)[::half] @ taper**2
+    excess = np.abs(windows) ** 2 / np.maximum(expected, 1e-30)[:, None]
+    mean = _mean_of_neighbours(excess)
+    gain = np.where(mean > _SIGNIFICANT, 1 - 1 / np.maximum(mean, 1), 0)
+    restored = np.fft.irfft(windows * gain, size) * taper
+    # Each frequency between the first and the last counts twice, for its negative.
+    weights = np.r_[1, np.full(half - 1, 2), 1] / size
+    let_through = (gain * weights).sum(axis=1) * expected / (size / 2)
+    signal, spread = np.zeros(len(series)), np.zeros(len(series))
+    for window in range(len(windows)):
+        place = slice(window * half, window * half + size)
+        signal[place] += restored[window]
+        spread[place] += let_through[window] * taper**2
+    inner = slice(half, half + len(steps))
+    return _Filtered(signal[inner], np.sqrt(spread[inner]))
+
+
+def _mean_of_neighbours(image: FloatArray) -> FloatArray:
+    """Return the mean of 3 x 3 values; the border is repeated."""
+    return np.asarray(sliding_window_view(np.pad(image, 1, mode="edge"), (3, 3)).mean(axis=(2, 3)))
