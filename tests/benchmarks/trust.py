@@ -29,8 +29,7 @@ import cv2
 import numpy as np
 
 from photonpano import PhotonpanoError, SpecError, evaluate, parse_spec, run, simulate
-from photonpano.evaluation import corner_errors
-from photonpano.geometry import corners, translation
+from photonpano.evaluation import Truth, corner_errors, load_truth
 
 Settings: TypeAlias = dict[str, Any]
 FRAME_RATE_HZ = 96_800
@@ -230,36 +229,31 @@ def measured(name: str, seed: int, size: Size) -> Result:
         result["seconds"] = time.perf_counter() - start
         result["warnings"] = list(done.record["warnings"])
         result["verdict"] = done.record.get("verdict")
-        with np.load(done.directory / "trajectory.npz") as found, np.load(cube.with_suffix(".truth.npz")) as truth:
-            estimated, true = dict(found), dict(truth)
-        result |= figures_of(estimated, true)
-        # The scene behind a distorting lens is not what the panorama shows.
-        if "distortion" not in true and "mean_px" in result:
+        truth_file = cube.with_suffix(".truth.npz")
+        with np.load(done.directory / "trajectory.npz") as found:
+            result |= figures_of(dict(found), load_truth(truth_file))
+        if "mean_px" in result:
             with suppress(PhotonpanoError, ValueError):
-                result["below_oracle_db"] = evaluate(done.directory, cube.with_suffix(".truth.npz")).below_oracle_db
+                result["below_oracle_db"] = evaluate(done.directory, truth_file).below_oracle_db
     return result
 
 
-def figures_of(estimated: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> Result:
+def figures_of(estimated: dict[str, np.ndarray], truth: Truth) -> Result:
     """Compare the trajectory of a run, and the errors that it claims, with the truth.
 
     Args:
         estimated: content of `trajectory.npz`.
-        truth: content of the truth of the capture.
+        truth: of the capture.
 
     Returns:
         `mean_px`, `max_px` and `rms_px` of the corner errors of the located frames, the mean `std_px`, the shares
         `within_2` and `within_3` of the frames whose error is at most 2 and 3 of their std_px, and the share `located`.
         Nothing if the run took the frames for others than they are.
     """
-    true = np.asarray(truth["homographies"])
-    frame_shape = tuple(int(side) for side in truth["frame_shape"])
-    if len(estimated["homographies"]) != len(true) or tuple(estimated["frame_shape"]) != frame_shape:
+    if len(estimated["homographies"]) != len(truth.homographies) or tuple(estimated["frame_shape"]) != truth.frame_shape:
         return {}
-    if "undistorted_corners" in truth:
-        true = true @ at_the_corners(truth["undistorted_corners"], frame_shape)
     located = estimated["located"].astype(bool)
-    score = corner_errors(estimated["homographies"], true, frame_shape, located)
+    score = corner_errors(estimated["homographies"], truth.homographies, truth.frame_shape, located)
     errors, std = score.errors_px[located], estimated["std_px"][located]
     return {
         "mean_px": score.mean_px,
@@ -270,14 +264,6 @@ def figures_of(estimated: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -
         "within_3": float(np.mean(errors <= 3 * std)),
         "located": score.located_share,
     }
-
-
-def at_the_corners(undistorted: np.ndarray, frame_shape: tuple[int, int]) -> np.ndarray:
-    """Return the map that does what a distorting lens does at the four corners: a scaling about the middle of the frame."""
-    around = corners(frame_shape)
-    middle = around.mean(axis=0)
-    scale = np.linalg.norm(undistorted - middle) / np.linalg.norm(around - middle)
-    return translation(*middle) @ np.diag([scale, scale, 1.0]) @ translation(*-middle)
 
 
 def status(result: Result) -> str:

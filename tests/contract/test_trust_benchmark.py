@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonpano.evaluation import Truth
 from photonpano.geometry import translation
 from photonpano_simulator.config import SimulatorConfig
 
@@ -46,7 +47,7 @@ def test_figures_of_trajectory_with_known_errors(trust: ModuleType) -> None:
         "located": np.ones(N, bool),
         "frame_shape": np.array(SHAPE),
     }
-    figures = trust.figures_of(estimated, {"homographies": true, "frame_shape": np.array(SHAPE)})
+    figures = trust.figures_of(estimated, Truth(true, SHAPE, None))
     assert figures["mean_px"] == pytest.approx(0.3, rel=0.01)
     assert figures["rms_px"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2) / 2), rel=0.01)
     assert figures["max_px"] == pytest.approx(0.5, rel=0.02)
@@ -61,27 +62,16 @@ def test_frames_that_are_not_located_are_not_scored(trust: ModuleType) -> None:
     wrong[180:] = np.eye(3)
     located = np.arange(N) < 180
     estimated = {"homographies": wrong, "std_px": np.full(N, 0.1), "located": located, "frame_shape": np.array(SHAPE)}
-    figures = trust.figures_of(estimated, {"homographies": true, "frame_shape": np.array(SHAPE)})
+    figures = trust.figures_of(estimated, Truth(true, SHAPE, None))
     assert figures["max_px"] < 1e-6
     assert figures["located"] == 0.75
 
 
 def test_trajectory_of_other_frames_has_no_figures(trust: ModuleType) -> None:
-    true = {"homographies": np.tile(np.eye(3), (5, 1, 1)), "frame_shape": np.array([60, 90])}
-    assert trust.figures_of({"homographies": np.tile(np.eye(3), (4, 1, 1)), "frame_shape": np.array([60, 90])}, true) == {}
-    assert trust.figures_of({"homographies": np.tile(np.eye(3), (5, 1, 1)), "frame_shape": np.array([60, 720])}, true) == {}
-
-
-def test_errors_are_scored_through_the_distortion(trust: ModuleType) -> None:
-    """A run that moves the corners as the distorted image does is right, though its homographies are not the camera's."""
-    true = np.array([translation(0.2 * frame, 5) for frame in range(N)])
-    middle = np.array([44.5, 29.5])
-    corners = np.array([[0, 0], [89, 0], [89, 59], [0, 59]])
-    truth = {"homographies": true, "frame_shape": np.array(SHAPE), "undistorted_corners": middle + (corners - middle) / 0.97}
-    said = {"std_px": np.full(N, 0.1), "located": np.ones(N, bool), "frame_shape": np.array(SHAPE)}
-    seen = true @ trust.at_the_corners(truth["undistorted_corners"], SHAPE)
-    assert trust.figures_of({"homographies": seen, **said}, truth)["max_px"] < 1e-6
-    assert trust.figures_of({"homographies": true, **said}, truth)["mean_px"] > 0.2
+    truth = Truth(np.tile(np.eye(3), (5, 1, 1)), SHAPE, None)
+    for frames, shape in ((4, SHAPE), (5, (60, 720))):
+        estimated = {"homographies": np.tile(np.eye(3), (frames, 1, 1)), "frame_shape": np.array(shape)}
+        assert trust.figures_of(estimated, truth) == {}
 
 
 @pytest.mark.parametrize(

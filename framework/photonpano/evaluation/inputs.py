@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.geometry import normalised
+from photonpano.geometry import corners, normalised, translation
 from photonpano.reading import read_arrays
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
@@ -21,7 +21,7 @@ class Truth:
     """True motion and scene of a simulated capture.
 
     Attributes:
-        homographies: (T, 3, 3), frame pixels to pixels of the scene.
+        homographies: (T, 3, 3), frame pixels to pixels of the scene; exact at the corners of the frame if the lens distorts.
         frame_shape: (height, width) of a frame.
         scene: (H, W) float32, photons per pixel per frame; None if only the motion is known.
     """
@@ -54,18 +54,21 @@ def load_truth(path: Path) -> Truth:
     """Read the truth of a simulated capture.
 
     Args:
-        path: an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`.
+        path: an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`. If the lens distorts,
+            `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
 
     Raises:
         InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
     """
-    arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), ("scene",))
+    optional = ("scene", "undistorted_corners")
+    arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), optional)
     scene = arrays.get("scene")
     if scene is not None and (scene.ndim != 2 or not scene.size):
         raise InputError(f"{path}: scene must be an image (height, width), got the shape {scene.shape}")
+    frame_shape = _frame_shape(path, arrays)
     return Truth(
-        homographies=_homographies(path, arrays),
-        frame_shape=_frame_shape(path, arrays),
+        homographies=_homographies(path, arrays) @ _lens(path, arrays, frame_shape),
+        frame_shape=frame_shape,
         scene=None if scene is None else scene.astype(np.float32, copy=False),
     )
 
@@ -147,6 +150,18 @@ def _homographies(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:
     except (ValueError, np.linalg.LinAlgError) as error:
         raise InputError(f"{path}: homographies must be finite and invertible") from error
     return homographies
+
+
+def _lens(path: Path, arrays: Mapping[str, NDArray[Any]], frame_shape: tuple[int, int]) -> Homography:
+    """Return what the lens does to the corners of the frame, a scaling about its middle."""
+    if "undistorted_corners" not in arrays:
+        return np.eye(3)
+    undistorted, distorted = arrays["undistorted_corners"], corners(frame_shape)
+    if undistorted.shape != (4, 2) or not np.isfinite(undistorted).all():
+        raise InputError(f"{path}: undistorted_corners must be four finite points (x, y), got {undistorted.tolist()}")
+    middle = distorted.mean(axis=0)
+    scale = np.linalg.norm(undistorted - middle) / np.linalg.norm(distorted - middle)
+    return translation(*middle) @ np.diag([scale, scale, 1.0]) @ translation(*-middle)
 
 
 def _frame_shape(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[int, int]:

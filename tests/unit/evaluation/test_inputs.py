@@ -7,6 +7,7 @@ import pytest
 
 from photonpano import InputError
 from photonpano.evaluation import evaluate, load_truth
+from photonpano.geometry import apply, corners, normalised
 
 NO_ARCHIVE = "truth.npz is not a truth as `photonpano simulate` writes it: it is no .npy or .npz file of plain numbers"
 
@@ -52,8 +53,8 @@ def test_load_truth_names_missing_arrays(capture):
     del capture.true["homographies"]
     capture.write()
     assert failure(capture) == (
-        "truth.npz lacks homographies; a truth as `photonpano simulate` writes it contains homographies, frame_shape, scene; "
-        "this file contains frame_shape, scene"
+        "truth.npz lacks homographies; a truth as `photonpano simulate` writes it contains homographies, frame_shape, scene, "
+        "undistorted_corners; this file contains frame_shape, scene"
     )
 
 
@@ -85,7 +86,7 @@ def test_load_truth_refuses_single_array(capture):
         np.save(file, capture.true["homographies"])
     assert failure(capture) == (
         "truth.npz lacks homographies and frame_shape; a truth as `photonpano simulate` writes it contains homographies, "
-        "frame_shape, scene; this file contains an array without a name"
+        "frame_shape, scene, undistorted_corners; this file contains an array without a name"
     )
 
 
@@ -99,6 +100,11 @@ def test_load_truth_refuses_single_array(capture):
         ("frame_shape", np.array([60, 0]), "frame_shape must be two positive integers (height, width), got [60, 0]"),
         ("scene", np.zeros((4, 4, 3)), "scene must be an image (height, width), got the shape (4, 4, 3)"),
         ("scene", np.array(["a"]), "scene must contain numbers"),
+        (
+            "undistorted_corners",
+            np.zeros((3, 2)),
+            "undistorted_corners must be four finite points (x, y), got [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]",
+        ),
         ("scene", np.zeros((4, 4)), "the scene is dark, so that the panorama cannot be compared with it"),
     ],
 )
@@ -158,3 +164,17 @@ def test_load_truth_returns_written_arrays(capture):
     np.testing.assert_array_equal(truth.homographies, capture.true["homographies"])
     np.testing.assert_array_equal(truth.scene, capture.true["scene"])
     assert truth.frame_shape == (60, 90)
+
+
+def test_run_on_distorted_frames_is_right_where_it_moves_the_corners_as_they_appear(capture):
+    """A corner of a barrel of 3 % shows what an ideal lens images 1 / 0.97 times as far from the middle."""
+    middle, corner = np.array([44.5, 29.5]), np.array([89.0, 59.0])
+    capture.true["undistorted_corners"] = middle + (corners((60, 90)) - middle) / 0.97
+    capture.write()
+    assert evaluate(capture.folder, capture.truth).trajectory.mean_px > 0.1
+    truth = load_truth(capture.truth)
+    expected = apply(capture.true["homographies"], [middle, middle + (corner - middle) / 0.97])
+    np.testing.assert_allclose(apply(truth.homographies, [middle, corner]), expected)
+    capture.trajectory["homographies"] = normalised(capture.gauge @ truth.homographies)
+    capture.write()
+    assert evaluate(capture.folder, capture.truth).trajectory.max_px < 1e-6
