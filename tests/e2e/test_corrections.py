@@ -167,3 +167,16 @@ def test_forecast_includes_corrections(raw: Path, dark_file: Path) -> None:
     plan = parse_spec(spec_of(raw, *GEOMETRY, {"dark-counts": {"dark": str(dark_file)}}) | {"levels": 1})
     with build_source(plan) as source:
         assert forecast(plan, source).canvas[0] < 200
+
+
+def test_run_masks_hot_pixels_by_itself(simulated: Callable[..., Path], tmp_path: Path) -> None:
+    """With them in it, the run locks onto the pixels, which do not move: 13 px off when this was written."""
+    capture = simulated(flux=0.03, sensor={"hot_fraction": 0.1, "dark_rate": 0.001, "hot_rate": [0.3, 2.0]})
+    spec = spec_of(capture)
+    assert scored(spec, capture, tmp_path / "as-read").trajectory.mean_px > 5
+    del spec["corrections"]
+    assert scored(spec, capture, tmp_path / "auto").trajectory.mean_px < 1
+    record = json.loads((tmp_path / "auto" / "run" / "run.json").read_text())
+    assert record["spec"]["corrections"] == "auto"
+    masked = next(each for each in record["decisions"] if each["what"] == "still_pixels")
+    assert masked["value"] == pytest.approx(0.1 * SHAPE[0] * SHAPE[1], rel=0.15)

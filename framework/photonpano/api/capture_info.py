@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from photonpano.captures.summary import require_photons, saturated_share, summarise
-from photonpano.corrections import HotPixels
+from photonpano.corrections import CorrectedSource, HotPixels, without_still_pixels
 from photonpano.errors import InputError
 from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.protocols import Source
@@ -19,6 +19,8 @@ from photonpano.values import CaptureSummary, StreamInfo
 
 HOT_SHARE = 0.001
 """Share of hot pixels above which the warnings recommend a mask."""
+STANDING_SHARE = 0.5
+"""Share of the frame that stands still above which nothing is masked by itself."""
 SATURATED_SHARE = 0.01
 """Share of pixels saturated in every frame above which the warnings recommend less light."""
 
@@ -42,6 +44,9 @@ class CaptureInfo:
         speed_how: how the speed was measured, or why not.
         unused_share: share of the pixels that are masked.
         hot_share: share of the other pixels that the correction `hot-pixels` would mask.
+        still_share: share of them that the correction `still-pixels` would mask, as a run with `corrections: auto` does.
+        standing_share: share of the frame that stands still, of the parts that show motion or rest.
+        still_how: what stands still, or why nothing is masked.
         saturated_share: share of them that have their highest value in every frame looked at.
         group_size: frames of a group that `group_size: auto` chooses; None if the capture is too short.
         group_size_reason: the reason for that choice.
@@ -63,6 +68,9 @@ class CaptureInfo:
     speed_how: str
     unused_share: float
     hot_share: float
+    still_share: float
+    standing_share: float
+    still_how: str
     saturated_share: float
     group_size: int | None
     group_size_reason: str
@@ -85,11 +93,18 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
     Raises:
         InputError: the capture cannot be read.
     """
-    with build_source(plan) as source:
+    with build_source(plan) as read:
+        marked = without_still_pixels(read)
+        source = marked if plan.masks_still_pixels else read
         with one_thread_inside():
             summary = summarise(source, thread_count(plan.run.threads))
         stream, rate = source.info, source.info.frame_rate_hz
         size, reason = _group_size(plan, source, summary, catalog)
+        with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
+            hot = read.valid & ~other.valid
+        still = read.valid & ~marked.valid
+        decisions = marked.decisions if isinstance(marked, CorrectedSource) else ()
+        decided = {each.what: each for each in decisions}
         found = CaptureInfo(
             source=plan.source.contribution.name,
             reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
@@ -103,25 +118,23 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             flux=summary.flux,
             speed_px=summary.speed_px,
             speed_how=summary.how,
-            unused_share=1 - float(source.valid.mean()),
-            hot_share=_hot_share(plan, source),
+            unused_share=1 - float(read.valid.mean()),
+            hot_share=float(hot[read.valid].mean()),
+            still_share=float(still[read.valid].mean()),
+            standing_share=float(decided["standing_share"].value) if decided else 0.0,
+            still_how=decided["still_pixels"].reason if decided else "not measured",
             saturated_share=saturated_share(source),
             group_size=size,
             group_size_reason=reason,
             warnings=(),
             spec=_spec(plan),
         )
-        return replace(found, warnings=tuple(_warnings(source, found)))
+        return replace(found, warnings=tuple(_warnings(source, found, float(hot[source.valid].mean()))))
 
 
 def percent(share: float) -> str:
     """Write a share as a percentage of two digits."""
     return f"{100 * share:.2g} %"
-
-
-def _hot_share(plan: Plan, source: Source) -> float:
-    with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as masked:
-        return 1 - float(masked.valid[source.valid].mean())
 
 
 def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Catalog | None) -> tuple[int | None, str]:
@@ -134,14 +147,17 @@ def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Ca
     return next((int(each.value), each.reason) for each in decisions if each.what == "group_size")
 
 
-def _warnings(source: Source, found: CaptureInfo) -> Iterator[str]:
+def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[str]:
     try:
         require_photons(source)
     except InputError as error:
         yield str(error)
         return
-    if found.hot_share > HOT_SHARE:
-        yield f"about {percent(found.hot_share)} of the pixels are hot; mask them with the correction hot-pixels"
+    if hot_left > HOT_SHARE:
+        yield f"about {percent(hot_left)} of the pixels are hot; mask them with the correction hot-pixels"
+    if found.standing_share > STANDING_SHARE:
+        share = f"{found.standing_share:.0%}"
+        yield f"{share} of the frame stands still; if the camera moved, mask what is not the scene with the correction mask"
     if found.saturated_share > SATURATED_SHARE:
         share = percent(found.saturated_share)
         yield f"{share} of the pixels have their highest value in every frame, so that their flux is unknown; expose less"
@@ -153,8 +169,7 @@ def _spec(plan: Plan) -> dict[str, Any]:
     """Return the spec of the capture, without defaults."""
     keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
     spec = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
-    corrections = plan.document["corrections"]
-    return spec | ({"corrections": corrections} if corrections else {})
+    return spec | ({} if plan.masks_still_pixels else {"corrections": plan.document["corrections"]})
 
 
 def _relative(value: Any) -> Any:

@@ -16,6 +16,7 @@ from photonpano.corrections.hot_pixels import THRESHOLD
 from photonpano.errors import InputError, OutputError
 from photonpano.pipeline.components import build_source
 from photonpano.specs import Plan
+from photonpano.specs.corrections import written_corrections
 from photonpano.values import BoolArray, FluxImage, StreamInfo
 
 BRIGHT = 0.1
@@ -79,5 +80,5 @@ def dark(plan: Plan, output: Path | str, threshold: float = THRESHOLD, progress:
     if info.kind == "binary" and np.median(measured.rates[valid]) > BRIGHT:
         warnings.append(f"half of the pixels count more than {BRIGHT:g} photons per frame; was the lens covered?")
     uses = {"hot-pixels": "dark", "dark-counts": "dark"} if output.suffix == ".npz" else {"mask": "file"}
-    corrections = [*plan.document["corrections"], *({name: {key: str(output)}} for name, key in uses.items())]
+    corrections = [*written_corrections(plan.corrections), *({name: {key: str(output)}} for name, key in uses.items())]
     return DarkMeasurement(output, info, measured.rates, valid, hot & valid, limit, corrections, tuple(warnings))

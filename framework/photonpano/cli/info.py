@@ -57,5 +57,6 @@ def _rows(found: "CaptureInfo") -> Iterator[list[str]]:
     yield ["duration", "unknown without frame_rate_hz" if found.seconds is None else duration(found.seconds)]
     yield ["flux", f"{found.flux:.3g} photons per pixel per frame"]
     yield ["hot pixels", f"about {percent(found.hot_share)}" if found.hot_share else "none"]
+    yield ["still", found.still_how]
     yield ["speed", found.speed_how if speed is None else f"{speed:.2g} px per frame ({found.speed_how})"]
     yield ["group size", "unknown" if size is None else f"{size}: {found.group_size_reason}"]

@@ -14,12 +14,13 @@ from photonpano.corrections.hot_pixels import HotPixels, hot_in_the_dark
 from photonpano.corrections.masks import ColourFilter, Mask
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import CorrectedSource, corrected_source
+from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
 
 _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
     *(Crop, SwapColumns, MissingRow),
     *TURNS,
-    *(Mask, HotPixels, DarkCounts, ColourFilter),
+    *(Mask, HotPixels, StillPixels, DarkCounts, ColourFilter),
 )
 CORRECTIONS = {correction.name: correction for correction in _ALL}
 """All corrections by their names in specs."""
@@ -31,9 +32,11 @@ __all__ = [
     "DarkCounts",
     "DarkFrames",
     "HotPixels",
+    "StillPixels",
     "corrected_source",
     "hot_in_the_dark",
     "measure_dark",
     "read_dark",
+    "without_still_pixels",
     "write_dark",
 ]

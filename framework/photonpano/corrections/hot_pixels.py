@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -13,6 +13,8 @@ from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from photonpano.corrections.dark import DarkFrames
     from photonpano.corrections.pixels import Decide, Pixels
     from photonpano.protocols import Source
@@ -24,9 +26,12 @@ _SPANS, _SPAN_FRAMES = 16, 256
 """16 spans of 256 frames are summed all over the capture, which blurs the scene."""
 _REACH = 2
 """Neighbourhood radius, px."""
-_ONE_IN = 6
+_LINE_SHARE = 1 / 6
 """A pixel is hot if it is brighter than the top 1/6 of its neighbours by the threshold. A straight edge or a line of the scene
-makes at least 1/6 of them bright, at the border of the frame as well."""
+makes at least 1/6 of them bright, at the border of the frame as well. Where many pixels are hot, it is the share of the
+neighbours that are hot by chance, and two standard deviations of it."""
+_MIN_KNOWN = 6
+"""A pixel with fewer known neighbours than this is not compared."""
 _TO_STD = 1.4826
 """Standard deviation of a normal distribution divided by its median absolute deviation."""
 
@@ -99,20 +104,63 @@ def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[Boo
     image = response.stabilised(response.flux(np.asarray(counts / seen, np.float32), frames), frames)
     usable = pixels.valid & ~pixels.interpolated
     image = np.where(usable, image.ravel()[pixels.index], np.float32(np.nan))
-    outside = np.fmax(image - _ranked(image, _ONE_IN), -image - _ranked(-image, _ONE_IN))
-    differences = np.abs(image - _ranked(image, 2))
-    typical = float(np.median(known)) if (known := differences[np.isfinite(differences)]).size else 0.0
-    std = max(_TO_STD * typical, float(np.max(response.stabilised_std(frames))))
-    return outside > threshold * std, seen
+    return outliers(image, float(np.max(response.stabilised_std(frames))), threshold), seen
 
 
-def _ranked(image: FluxImage, one_in: int) -> FluxImage:
-    """Return, for each pixel, the value that `1 / one_in` of its neighbours reach; NaN where fewer than 6 are known."""
+def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
+    """Return the pixels that are brighter or darker than their neighbours.
+
+    Args:
+        image: (H, W), on the scale on which photon noise is uniform; NaN at pixels that must not be used.
+        noise_std: standard deviation of photon noise.
+        threshold: smallest deviation, in robust standard deviations of the other pixels.
+
+    Returns:
+        (H, W) bool, False at unknown pixels.
+    """
+    around = sorted_neighbours(image)
+    differences = np.abs(image - brightest(around, 0.5))
+    known = differences[np.isfinite(differences)]
+    if not known.size:
+        return np.zeros(image.shape, np.bool_)
+    limit = threshold * max(_TO_STD * float(np.median(known)), noise_std)
+    by_chance = float(np.mean(known > limit))
+    share = max(_LINE_SHARE, by_chance + 2 * np.sqrt(by_chance * (1 - by_chance) / around.shape[-1]))
+    outside = np.fmax(image - brightest(around, share), darkest(around, share) - image)
+    return np.asarray(outside > limit)
+
+
+def sorted_neighbours(image: FluxImage) -> FluxImage:
+    """Return the neighbours of each pixel within 2 px, in ascending order: (H, W, 24); the unknown ones, NaN, come last."""
     side = 2 * _REACH + 1
     padded = np.pad(image, _REACH, constant_values=np.nan)
     windows = sliding_window_view(padded, (side, side)).reshape(*image.shape, side * side)
-    around = np.sort(np.delete(windows, side * side // 2, axis=-1), axis=-1)  # NaN comes last
-    known = np.isfinite(around).sum(axis=-1, keepdims=True)
-    place = np.clip(known - known // one_in, 0, around.shape[-1] - 1)
-    found = np.take_along_axis(around, place, axis=-1)[..., 0]
-    return np.where(known[..., 0] >= _ONE_IN, found, np.float32(np.nan))
+    return np.sort(np.delete(windows, side * side // 2, axis=-1), axis=-1)
+
+
+def brightest(around: FluxImage, share: float) -> FluxImage:
+    """Return, for each pixel, the value that the brightest share of its neighbours reach; NaN where fewer than 6 are known.
+
+    Args:
+        around: (H, W, 24), from `sorted_neighbours`.
+        share: fraction of the neighbours.
+    """
+    known = _n_known(around)
+    return _picked(around, known, known - np.floor(known * share))
+
+
+def darkest(around: FluxImage, share: float) -> FluxImage:
+    """Return, for each pixel, the value that the darkest share of its neighbours do not exceed: see `brightest`."""
+    known = _n_known(around)
+    return _picked(around, known, np.floor(known * share) - 1)
+
+
+def _n_known(around: FluxImage) -> NDArray[np.intp]:
+    return np.asarray(np.isfinite(around).sum(axis=-1, keepdims=True))
+
+
+def _picked(around: FluxImage, known: NDArray[np.intp], place: NDArray[Any]) -> FluxImage:
+    """Return the neighbours at a place of their order: (H, W)."""
+    place = np.clip(place, 0, around.shape[-1] - 1).astype(np.intp)
+    found = np.take_along_axis(around, place, axis=-1)
+    return np.where(known >= _MIN_KNOWN, found, np.float32(np.nan))[..., 0]

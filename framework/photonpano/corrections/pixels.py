@@ -16,7 +16,7 @@ from photonpano.protocols import Source
 from photonpano.values import BoolArray, FluxImage
 
 Index: TypeAlias = NDArray[np.intp]
-Decide: TypeAlias = Callable[[str, int, str], None]
+Decide: TypeAlias = Callable[[str, float, str], None]
 """Records a decision: what was chosen, its value, and the reason."""
 MISSING = -1
 """The index of a pixel that the sensor does not have."""

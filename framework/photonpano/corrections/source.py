@@ -119,7 +119,7 @@ class CorrectedSource(SourceWrapper):
                 self._estimate = _Estimate.of(pixels, self.info.kind == "binary")
             return self._estimate
 
-    def _decide(self, what: str, value: int, reason: str) -> None:
+    def _decide(self, what: str, value: float, reason: str) -> None:
         self.decisions.append(Decision(what, value, reason))
 
 

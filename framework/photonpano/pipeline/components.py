@@ -10,7 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from photonpano.contributions import SourceContext, StageContext, install_command
-from photonpano.corrections import corrected_source
+from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
 from photonpano.motion.attribution import attributed, attributing
 from photonpano.motion.level import Level, NamedLocator
@@ -31,13 +31,14 @@ LARGE_FRAME_PX = 192
 
 @contextmanager
 def open_source(plan: Plan) -> Iterator[Source]:
-    """Open the capture of a plan, and check the stages against it.
+    """Open the capture of a plan, and check the stages against it. With `corrections: auto`, what stands still is masked.
 
     Raises:
         InputError: the capture cannot be used as it is.
         SpecError: a stage does not suit it.
     """
-    with build_source(plan) as source:
+    built = build_source(plan)
+    with without_still_pixels(built) if plan.masks_still_pixels else built as source:
         if problems := check_stream(plan, source.info):
             raise SpecError(problems)
         yield source

@@ -16,19 +16,26 @@ if TYPE_CHECKING:
 
     from photonpano.corrections import Correction
 
+AUTO = "auto"
+"""`corrections: auto` is the default: nothing is rearranged, and the run masks what stands still in the frame."""
 
-def resolved_corrections(data: Any, spec: WrittenSpec) -> tuple[Correction, ...]:
+
+def resolved_corrections(data: Any, spec: WrittenSpec) -> tuple[Correction, ...] | None:
     """Resolve the section `corrections`; corrections with problems are left out.
 
     Args:
-        data: a list; None counts as an empty one.
+        data: a list, `auto`, or None, which is `auto` too.
         spec: problems are added here, each at its place.
+
+    Returns:
+        The corrections of the list; None for `auto`.
     """
-    items = [] if data is None else data
-    if not isinstance(items, list):
-        spec.wrong("corrections", f"expected a list of corrections, got {given(data)}")
+    if data is None or data == AUTO:
+        return None
+    if not isinstance(data, list):
+        spec.wrong("corrections", f"expected a list of corrections, or {AUTO}, got {given(data)}")
         return ()
-    found = (_resolved(item, f"corrections.{index}", spec) for index, item in enumerate(items))
+    found = (_resolved(item, f"corrections.{index}", spec) for index, item in enumerate(data))
     return tuple(correction for correction in found if correction is not None)
 
 

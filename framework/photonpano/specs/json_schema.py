@@ -11,6 +11,7 @@ from photonpano.corrections import CORRECTIONS
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.schema_text import TolerantJsonSchema
 from photonpano.specs.aliases import LocatorAlias
+from photonpano.specs.corrections import AUTO
 from photonpano.specs.resolution import (
     DEFAULT_FALLBACK,
     DEFAULT_REFINER,
@@ -152,7 +153,8 @@ def _corrections(schemas: dict[type[BaseModel], Schema]) -> Schema:
         "properties": {name: schemas[model] for name, model in CORRECTIONS.items()},
     }
     return {
-        "description": "what is done to frames first of all, in this order: names, or mappings of one name to its settings",
-        "type": ["array", "null"],
-        "items": {"anyOf": [{"enum": alone}, one]},
+        "description": "what is done to frames first of all, in this order: names, or mappings of one name to its settings; "
+        "auto masks what stands still in the frame, and an empty list does nothing",
+        "default": AUTO,
+        "anyOf": [{"enum": [AUTO, None]}, {"type": "array", "items": {"anyOf": [{"enum": alone}, one]}}],
     }

@@ -80,7 +80,7 @@ def capture_plan(
     keys: Mapping[str, Any] | None = None,
     *,
     source: str = "auto",
-    corrections: Sequence[Any] = (),
+    corrections: Sequence[Any] | None = None,
     overrides: Sequence[str] = (),
     catalog: Catalog | None = None,
 ) -> Plan:
@@ -90,7 +90,7 @@ def capture_plan(
         path: the file or folder, relative to the current folder.
         keys: keys of its source, such as `{"frame_rate_hz": 96_800}`.
         source: the source that reads it; by default the one that recognises it.
-        corrections: corrections, as in a spec.
+        corrections: a list of corrections, as in a spec; `auto` by default.
         overrides: other values of the spec, such as `run.threads=2`.
         catalog: what can be chosen; by default what the installed plugins offer.
 
@@ -98,7 +98,7 @@ def capture_plan(
         SpecError: no source recognises the capture, or a key or a correction is wrong.
     """
     section = {"use": source, "with": {"path": path, **(keys or {})}}
-    spec = {"version": 1, "source": section, "corrections": list(corrections)}
+    spec = {"version": 1, "source": section, "corrections": None if corrections is None else list(corrections)}
     return parse_spec(spec, overrides=overrides, catalog=catalog)
 
 

@@ -9,7 +9,7 @@ from photonpano.errors import PluginError, SpecError
 from photonpano.registry.kinds import KINDS
 from photonpano.specs.aliases import Alias
 from photonpano.specs.checks import STAGES, complaints
-from photonpano.specs.corrections import resolved_corrections, written_corrections
+from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
 from photonpano.specs.validation import validate
@@ -125,7 +125,7 @@ class _Resolver:
         document = {
             "version": VERSION,
             "source": _component(source),
-            "corrections": written_corrections(corrections),
+            "corrections": AUTO if corrections is None else written_corrections(corrections),
             **chosen,
             "refine": [_component(refiner) for refiner in refine if refiner],
             "levels": UNTIL_CONVERGED if until_converged else [_level(level, chosen) for level in levels if level],
@@ -133,7 +133,7 @@ class _Resolver:
         }
         return Plan(
             source,
-            corrections,
+            corrections or (),
             tuple(filter(None, levels)),
             tuple(filter(None, refine)),
             until_converged,
@@ -143,6 +143,7 @@ class _Resolver:
             file=spec.place("").file,
             observers=self.catalog.observers,
             decisions=tuple(spec.decisions),
+            masks_still_pixels=corrections is None,
         )
 
     def sections_of(self, root: dict[str, Any], refiners: list[Any]) -> dict[str, list[str]]:

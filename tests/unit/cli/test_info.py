@@ -52,6 +52,11 @@ def test_info_group_size_is_that_of_run(cube: Path, invoke: Callable[..., Any]) 
     decisions = json.loads((cube.parent / "runs" / "scan" / "run.json").read_text())["decisions"]
     assert {each["what"]: (each["value"], each["reason"]) for each in decisions} == {
         "source": ("packed-npy", facts["reason"]),
+        "still_pixels": (0, facts["still_how"]),
+        "standing_share": (
+            facts["standing_share"],
+            "share of the frame that stands still, of the parts that show motion or rest",
+        ),
         "group_size": (facts["group_size"], facts["group_size_reason"]),
     }
 
@@ -121,9 +126,12 @@ def test_info_warns_of_hot_and_saturated_pixels(folder: Path, invoke: Callable[.
     facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
     assert facts["hot_share"] == pytest.approx(0.02 * 7 / 8, abs=0.006)
     assert facts["saturated_share"] == pytest.approx(frames.all(axis=0).mean())
-    hot, saturated = invoke("info", "cube.npy").stderr.splitlines()
+    hot, standing, saturated = invoke("info", "cube.npy").stderr.splitlines()
     assert (
         hot == f"warning: about {percent(facts['hot_share'])} of the pixels are hot; mask them with the correction hot-pixels"
+    )
+    assert standing == (
+        "warning: 100% of the frame stands still; if the camera moved, mask what is not the scene with the correction mask"
     )
     assert saturated.startswith("warning: 14 % of the pixels have their highest value in every frame, so that ")
 

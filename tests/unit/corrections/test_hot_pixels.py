@@ -90,3 +90,11 @@ def test_no_frame_is_read_before_valid(corrections: Callable, monkeypatch: pytes
     assert read == []
     assert [source.valid.all() for _ in range(3)] == [True] * 3
     assert read == [FrameSpan(0, 50)]
+
+
+def test_many_hot_pixels_are_found_among_each_other(corrections: Callable) -> None:
+    """Of every pixel's neighbours one in five is hot, too."""
+    hot = hot_ones(0.2)
+    source = corrected_source(MemorySource(exposed(np.where(hot, 0.4, 0.05))), corrections("hot-pixels"))
+    assert (~source.valid[hot]).mean() > 0.95
+    assert source.valid[~hot].mean() > 0.999

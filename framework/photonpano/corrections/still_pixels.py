@@ -1,0 +1,268 @@
+"""Find what stands still in the frame while the rest of it moves: hot and dead pixels, windows, dirt; and mask it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from photonpano.corrections.hot_pixels import brightest, outliers, sorted_neighbours
+from photonpano.corrections.pixels import Correction
+from photonpano.corrections.source import corrected_source
+from photonpano.protocols import LinearlyCorrectedSource
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano.corrections.pixels import Decide, Pixels
+    from photonpano.protocols import Source
+    from photonpano.values import BoolArray, FluxImage
+
+_SPANS, _SPAN_FRAMES = 32, 128
+"""32 spans of at most 128 frames are summed all over the capture."""
+_THRESHOLD = 6.0
+"""Smallest deviation of a hot or dead pixel from its neighbours, in robust standard deviations."""
+_BLUR_PX = 1.0
+"""Standard deviation of the Gaussian blur against photon noise, px."""
+_SIDE_PX = 15
+"""Side of the square over which a pixel's variances are averaged, px."""
+_LEAST_PIXELS = 40
+"""Fewer connected pixels than this do not make a part that stands."""
+_REACH_PX = 24
+"""What stands still is continued over flat parts, which show neither motion nor rest, up to this distance, px."""
+_SURE = 4.0
+"""Standard errors from which a variance is not chance."""
+_MOVED_PX, _STOOD_PX = 0.7, 0.1
+"""A part that moved by less than 0.1 px (root mean square) stands; it must be certain that it moved by less than 0.7 px."""
+_CALM = 0.25
+"""It must also be certain that it varies by less than a quarter of the variance where the frame moves."""
+_STEADY = 0.03
+"""A hot pixel varies by less than this fraction of its squared deviation more than its neighbours."""
+_HALO = 0.2
+"""Least fraction of a point's brightness in the pixels that touch it."""
+_LEAST_MOVING = 0.01
+"""A frame of which less than this share moves stands still."""
+_FAINT = 0.005
+"""Structure is compared if its squared gradient is at least this fraction of the variance where the frame moves. A sensor whose
+pixels differ by a few percent has less before a sky."""
+_HALF = 0.5
+_SHARE_OF = "share of the frame that stands still, of the parts that show motion or rest"
+
+
+class StillPixels(Correction):
+    """Masks what stands still while most of the frame moves: hot and dead pixels, a window, dirt."""
+
+    name: ClassVar[str] = "still-pixels"
+
+    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+        """Mask what stands still; see `Correction`. Frames of grey levels, whose noise is not known well, stay as they are."""
+        n_frames = min(_SPAN_FRAMES, (source.info.n_frames - 1) // _SPANS)
+        if decide is None or source.info.kind != "binary" or n_frames == 0:
+            return pixels
+        spans = source.info.spread(_SPANS, n_frames)
+        sums = np.stack([source.counts(span).ravel()[pixels.index].astype(np.uint8) for span in spans])
+        found = find_still(sums, n_frames, pixels.valid & ~pixels.interpolated)
+        n_masked, n_pixels = int((found.mask & pixels.valid).sum()), int(pixels.valid.sum())
+        decide("still_pixels", n_masked, f"{n_masked / max(n_pixels, 1):.2%} of {n_pixels} pixels {found.why}")
+        decide("standing_share", found.share, _SHARE_OF)
+        return pixels.without(found.mask)
+
+
+def without_still_pixels(source: Source) -> Source:
+    """Return a source in which what stands still is masked; a source that corrects its sums itself stays as it is."""
+    return source if isinstance(source, LinearlyCorrectedSource) else corrected_source(source, [StillPixels()])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Still:
+    """What stands still in the frame.
+
+    Attributes:
+        mask: (H, W) bool, the pixels to mask.
+        share: share of the frame that stands still, of the parts that show motion or rest; 0 if no part does.
+        why: a clause on the masked pixels.
+    """
+
+    mask: BoolArray
+    share: float
+    why: str
+
+
+def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> Still:
+    """Find what stands still while the rest of the frame moves.
+
+    A pixel that sees one thing all the time varies by photon noise only; a pixel that the scene moves past varies by its
+    contrast. To stand still, a part must have structure in all directions, which a motion would have turned into variation: a
+    part that moves by s px (root mean square) over a mean squared gradient g varies by about g s^2. Single pixels stand if they
+    differ from their neighbours all the time.
+
+    Args:
+        sums: (M, H, W) uint8, sums of binary frames at M times of the capture.
+        n_frames: frames of a sum.
+        usable: (H, W) bool, pixels to look at.
+    """
+    single = _single_pixels(sums, n_frames, usable)
+    parts = _Parts.of(sums, n_frames, usable & ~single)
+    standing = _continued(parts.standing, ~parts.moving)
+    share = _share(standing, parts.moving & ~standing)
+    if parts.moving.mean() < _LEAST_MOVING:
+        return Still(np.zeros_like(usable), share, "are masked: nothing in the frame moves")
+    if share > _HALF:
+        why = f"are masked: {share:.0%} of the frame stands still, so that it is open which part is the scene"
+        return Still(np.zeros_like(usable), share, why)
+    mask = (single | _widened(standing)) & usable
+    return Still(
+        mask, share, f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves"
+    )
+
+
+def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> BoolArray:
+    """Return the hot and dead pixels: they differ from their neighbours, and vary hardly more than these."""
+    n_spans, total = len(sums), len(sums) * n_frames
+    counts = sums.sum(axis=0, dtype=np.float32)
+    stabilised = np.arcsin(np.sqrt((counts + 0.375) / np.float32(total + 0.75)))
+    found = outliers(_where(usable, stabilised), 0.5 / np.sqrt(total), _THRESHOLD)
+    mean = counts / np.float32(total)
+    noise = _photon_noise(mean, n_frames, total)
+    variance = sum((each / np.float32(n_frames) - mean) ** 2 for each in sums) / np.float32(n_spans - 1)
+    difference, more = (image - brightest(sorted_neighbours(_where(usable, image)), 0.5) for image in (mean, variance - noise))
+    chance = _SURE * np.sqrt(2 / (n_spans - 1)) * noise
+    return np.asarray(found & (more < chance + _STEADY * difference**2) & ~_has_halo(np.nan_to_num(difference)))
+
+
+def _has_halo(difference: FluxImage) -> BoolArray:
+    """Return where at least three of the four pixels that touch one share its difference: a lens blurs stars, not pixels."""
+    height, width = difference.shape
+    padded = np.pad(difference, 1)
+    touching = [padded[1 + y : 1 + y + height, 1 + x : 1 + x + width] for y, x in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+    third = np.sort(np.stack(touching) * np.sign(difference), axis=0)[1]
+    return np.asarray(third > _HALO * np.abs(difference))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """Where the frame moves, and where it stands: (H, W) bool each; both are False where nothing shows it."""
+
+    moving: BoolArray
+    standing: BoolArray
+
+    @classmethod
+    def of(cls, sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> _Parts:
+        """Compare variation over time with structure, averaged over squares."""
+        kernel = _kernel()
+        independent = _SIDE_PX**2 * _energy(kernel)
+        mean, noise, variance = _variation(sums, n_frames, usable)
+        chance = np.sqrt(2 / (len(sums) - 1) / independent) * _root_mean_square(noise)
+        slope_noise = noise / len(sums) * float(np.sum(np.convolve(kernel, [0.5, 0, -0.5]) ** 2) / np.sum(kernel**2))
+        structure = _weakest_structure(mean, slope_noise)
+
+        moving = (variance > _SURE * chance) & (variance > structure)
+        typical = float(np.median(variance[moving])) if moving.any() else 0.0
+        noticed = _SURE * np.sqrt(2 / independent) * _root_mean_square(slope_noise)
+        stood = (structure > np.maximum(noticed, _FAINT * typical)) & (variance < _STOOD_PX**2 * structure + _SURE * chance)
+        certain = variance + 2 * chance < np.minimum(_MOVED_PX**2 * structure, _CALM * typical)
+        return cls(moving, _large(stood & certain))
+
+
+def _variation(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> tuple[FluxImage, FluxImage, FluxImage]:
+    """Blur the sums against photon noise; return their mean, their noise, and their variance over time without that noise.
+
+    Returns:
+        Mean of the blurred sums per frame, and variance of the photon noise of one of them; variance, averaged over squares.
+    """
+    n_spans, total, known = len(sums), len(sums) * n_frames, usable.astype(np.float32)
+    near = np.maximum(_blurred(known), np.float32(1e-3)) * n_frames
+
+    def smooth(each: NDArray[np.uint8]) -> FluxImage:
+        return np.asarray(_blurred(each * known) / near, np.float32)
+
+    mean = np.asarray(sum(map(smooth, sums)) / n_spans, np.float32)
+    light = [float(smooth(each).mean()) / max(float(mean.mean()), 1e-9) for each in sums]
+    as_seen = sum((smooth(each) - mean) ** 2 for each in sums)
+    relit = sum((smooth(each) - mean * np.float32(now)) ** 2 for each, now in zip(sums, light, strict=True))
+    pixel_noise = _photon_noise(sums.sum(axis=0, dtype=np.float32) / np.float32(total), n_frames, total)
+    noise = np.asarray(_blurred(pixel_noise * known) * (n_frames / near) ** 2 * _energy(_kernel()), np.float32)
+    # Neither a change of light, nor the division by it, must look like motion.
+    variance = np.minimum(*(_averaged(squares / np.float32(n_spans - 1) - noise) for squares in (as_seen, relit)))
+    return mean, noise, variance
+
+
+def _weakest_structure(mean: FluxImage, slope_noise: NDArray[Any]) -> FluxImage:
+    """Return the mean squared gradient along the direction in which it is least, without that of noise: (H, W).
+
+    A horizontal edge stays as it is while the camera pans along it, so the direction with the least structure counts.
+    """
+    down, across = (np.asarray(slopes, np.float32) for slopes in np.gradient(mean))
+    xx, yy = _averaged(across**2 - slope_noise), _averaged(down**2 - slope_noise)
+    return np.asarray((xx + yy) / 2 - np.hypot((xx - yy) / 2, _averaged(across * down)), np.float32)
+
+
+def _photon_noise(mean: FluxImage, n_frames: int, total: int) -> FluxImage:
+    """Return the variance of a sum of frames, divided by their number, from the mean of `total` frames."""
+    return np.asarray(mean * (1 - mean) * np.float32(total / (total - 1) / n_frames), np.float32)
+
+
+def _large(standing: BoolArray) -> BoolArray:
+    """Return the connected parts that are larger than a few pixels, which may stand by chance."""
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(standing.astype(np.uint8))
+    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST_PIXELS
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+def _continued(standing: BoolArray, allowed: BoolArray) -> BoolArray:
+    """Continue what stands over parts that do not move, up to `_REACH_PX`."""
+    import cv2
+
+    grown, square = standing.astype(np.uint8), np.ones((3, 3), np.uint8)
+    for _ in range(_REACH_PX):
+        grown = np.where(allowed, cv2.dilate(grown, square), grown)
+    return grown > 0
+
+
+def _widened(standing: BoolArray) -> BoolArray:
+    """Return the pixels of what stands: a square that reaches over its edge shows motion."""
+    import cv2
+
+    side = 2 * (_SIDE_PX // 2 + 2) + 1
+    return np.asarray(cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def _where(usable: BoolArray, image: FluxImage) -> FluxImage:
+    return np.where(usable, image, np.float32(np.nan))
+
+
+def _share(standing: BoolArray, moving: BoolArray) -> float:
+    n_standing, n_moving = int(standing.sum()), int(moving.sum())
+    return n_standing / max(n_standing + n_moving, 1)
+
+
+def _kernel() -> NDArray[np.float64]:
+    import cv2
+
+    return np.asarray(cv2.getGaussianKernel(2 * round(4 * _BLUR_PX) + 1, _BLUR_PX), np.float64).ravel()
+
+
+def _energy(kernel: NDArray[np.float64]) -> np.float32:
+    """Return the fraction of the variance of white noise that a separable blur leaves."""
+    return np.float32(np.sum(kernel**2) ** 2)
+
+
+def _blurred(image: NDArray[Any]) -> FluxImage:
+    import cv2
+
+    return np.asarray(cv2.sepFilter2D(image.astype(np.float32), -1, _kernel(), _kernel()), np.float32)
+
+
+def _root_mean_square(image: NDArray[Any]) -> FluxImage:
+    """Return the root of the averaged squares: the standard error of an average of unequal variances depends on it."""
+    return np.sqrt(_averaged(image**2))
+
+
+def _averaged(image: NDArray[Any]) -> FluxImage:
+    import cv2
+
+    return np.asarray(cv2.blur(image.astype(np.float32), (_SIDE_PX, _SIDE_PX)), np.float32)
