@@ -209,7 +209,8 @@ def test_failing_source_is_named_in_every_stage(
         return FailsToRead(opened.build(config, context), fails, answer)
 
     fragile = SourceContribution(name="fragile", summary="Fails", config=opened.config, build=build)
-    spec = small_spec | {"source": {"use": "fragile", "with": small_spec["source"]["with"]}, "levels": 1}
+    source = {"use": "fragile", "with": small_spec["source"]["with"]}
+    spec = small_spec | {"source": source, "corrections": [], "levels": 1}
     assert failure(spec, fragile, tmp_path) == f"source 'fragile' of strange-plugin 1.2 {message}"
 
 

@@ -120,7 +120,9 @@ class _Writer:
             if isinstance(value, dict) and value:
                 yield f"{indent}{key}:"
                 yield from self._mapping(value, path, f"{indent}  ")
-            elif isinstance(value, list) and value and re.fullmatch(r"corrections|refine|(levels\.\d+\.)?locate\.fallback", path):
+            elif (
+                isinstance(value, list) and value and re.fullmatch(r"corrections|refine|(levels\.\d+\.)?locate\.fallback", path)
+            ):
                 yield f"{indent}{key}:"
                 for index, item in enumerate(value):
                     yield from self._item(item, f"{path}.{index}", f"{indent}  ")

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.corrections.geometry import Rearrangement
 from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pixels, numbered
 from photonpano.errors import InputError
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source
-from photonpano.source_wrapper import ArrayT, SourceWrapper, with_capabilities
+from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
+from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, with_capabilities
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, FrameSpan, StreamInfo
 
 _TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
@@ -58,7 +59,8 @@ def corrected_source(
 ) -> CorrectedSource:
     """Return a source with corrections.
 
-    It has `packed` if the source has, and `corrected` if a correction changes sums of frames.
+    It has `packed` if the source has, `truth` if the source has and no pixel is moved, and `corrected` if a correction changes
+    sums of frames.
 
     Args:
         source: the capture as it is read; closing the corrected source closes it.
@@ -69,6 +71,8 @@ def corrected_source(
         InputError: see `apply_corrections`. What depends on frames is checked when `valid` is first read.
     """
     capabilities: list[type[SourceWrapper]] = [_PackedFrames] if isinstance(source, PackedSource) else []
+    if isinstance(source, KnowsTruth) and not any(isinstance(correction, Rearrangement) for correction in corrections):
+        capabilities.append(TruthWrapper)
     if any(correction.changes_sums for correction in corrections):
         capabilities.append(_CorrectedSums)
     return with_capabilities(CorrectedSource, capabilities)(source, corrections, blame)

@@ -70,8 +70,13 @@ class StillPixels(Correction):
 
 
 def without_still_pixels(source: Source) -> Source:
-    """Return a source in which what stands still is masked; a source that corrects its sums itself stays as it is."""
-    return source if isinstance(source, LinearlyCorrectedSource) else corrected_source(source, [StillPixels()])
+    """Return a source in which what stands still is masked.
+
+    A source of grey levels stays as it is, and one that corrects its sums itself, which cannot be corrected further.
+    """
+    if source.info.kind != "binary" or isinstance(source, LinearlyCorrectedSource):
+        return source
+    return corrected_source(source, [StillPixels()])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,10 +163,11 @@ class _Parts:
         structure = _weakest_structure(mean, slope_noise)
 
         moving = (variance > _SURE * chance) & (variance > structure)
-        typical = float(np.median(variance[moving])) if moving.any() else 0.0
+        some_move = moving.mean() >= _LEAST_MOVING
+        typical = float(np.median(variance[moving])) if some_move else 0.0
         noticed = _SURE * np.sqrt(2 / independent) * _root_mean_square(slope_noise)
         stood = (structure > np.maximum(noticed, _FAINT * typical)) & (variance < _STOOD_PX**2 * structure + _SURE * chance)
-        certain = variance + 2 * chance < np.minimum(_MOVED_PX**2 * structure, _CALM * typical)
+        certain = variance + 2 * chance < np.minimum(_MOVED_PX**2 * structure, _CALM * typical if some_move else np.inf)
         return cls(moving, _large(stood & certain))
 
 
@@ -259,7 +265,7 @@ def _blurred(image: NDArray[Any]) -> FluxImage:
 
 def _root_mean_square(image: NDArray[Any]) -> FluxImage:
     """Return the root of the averaged squares: the standard error of an average of unequal variances depends on it."""
-    return np.sqrt(_averaged(image**2))
+    return np.sqrt(np.maximum(_averaged(image**2), 0))
 
 
 def _averaged(image: NDArray[Any]) -> FluxImage:

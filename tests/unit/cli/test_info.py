@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -126,14 +127,21 @@ def test_info_warns_of_hot_and_saturated_pixels(folder: Path, invoke: Callable[.
     facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
     assert facts["hot_share"] == pytest.approx(0.02 * 7 / 8, abs=0.006)
     assert facts["saturated_share"] == pytest.approx(frames.all(axis=0).mean())
-    hot, standing, saturated = invoke("info", "cube.npy").stderr.splitlines()
+    hot, *_, saturated = invoke("info", "cube.npy").stderr.splitlines()
     assert (
         hot == f"warning: about {percent(facts['hot_share'])} of the pixels are hot; mask them with the correction hot-pixels"
     )
-    assert standing == (
+    assert saturated.startswith("warning: 14 % of the pixels have their highest value in every frame, so that ")
+
+
+def test_info_warns_of_frame_that_stands_still(folder: Path, invoke: Callable[..., Any]) -> None:
+    rng = np.random.default_rng(0)
+    chances = 0.3 * cv2.GaussianBlur(rng.random((64, 64)), (0, 0), 2) ** 2 / 0.25
+    np.save(folder / "cube.npy", np.packbits(rng.random((600, 64, 64)) < chances, axis=-1))
+    (warning,) = invoke("info", "cube.npy").stderr.splitlines()
+    assert warning == (
         "warning: 100% of the frame stands still; if the camera moved, mask what is not the scene with the correction mask"
     )
-    assert saturated.startswith("warning: 14 % of the pixels have their highest value in every frame, so that ")
 
 
 def test_info_warns_of_capture_too_short_for_groups(folder: Path, invoke: Callable[..., Any]) -> None:
