@@ -181,6 +181,31 @@ ROWS: dict[str, Row] = {
         PAN, repack=lambda packed, width: np.packbits(np.unpackbits(packed, axis=-1, count=width), axis=1)
     ),
 }
+CAUSES: dict[str, tuple[str, ...]] = {
+    "tremor": ("within groups",),
+    "tutorial": ("within groups",),
+    "vibration": ("within groups",),
+    "shake": ("within groups",),
+    "pan of 1.5": ("within groups", "expected error", "contradict"),
+    "hot pixels": ("single pixels", "still"),
+    "dirt": ("the sensor", "still"),
+    "window": ("the sensor", "still", "stand"),
+    "lens k1": ("lens",),
+    "vignette": ("the sensor",),
+    "missing": ("missing",),
+    "jump": ("missing", "jump"),
+    "doubled": ("doubled",),
+    "object": ("move by themselves",),
+    "light": ("light",),
+    "parallax": ("depth",),
+    "repeat": ("repeat",),
+    "checkerboard": ("repeat", "could not be located"),
+    "stripes": ("repeat", "could not be located"),
+    "unpacked": ("unpacked",),
+    "lowest bit": ("bit",),
+    "along the height": ("axis", "height", "packed"),
+}
+"""For words in the names of rows: words of which a right reason of a doubt or a refusal has one."""
 Result: TypeAlias = dict[str, Any]
 """What was measured of one run; see `measured`."""
 
@@ -284,16 +309,40 @@ def is_honest(result: Result) -> bool:
     return bool(result["within_2"] >= WITHIN_2 and result["within_3"] >= WITHIN_3 and narrow)
 
 
+def reasons(result: Result) -> list[str]:
+    """Return why a run is doubtful, or was refused."""
+    found = [str(reason.get("what", reason)) for reason in (result["verdict"] or {}).get("reasons", ())]
+    return [*found, *filter(None, [result["message"]])]
+
+
+def names_its_cause(result: Result) -> bool:
+    """Return whether one of the reasons of a run is the right one: see `CAUSES`."""
+    words = [word for part, of_part in CAUSES.items() if part in result["row"] for word in of_part]
+    return any(word in reason for reason in reasons(result) for word in words)
+
+
 def table(results: Sequence[Result]) -> str:
     """Return one row of Markdown for each kind of capture, over its seeds."""
-    header = "| Capture | Mean (max) | Claimed | Within 2 / 3 std | std / rms | / clean | Below oracle | Says | Honest | Time |"
-    lines = [header, "| --- " * 10 + "|"]
+    header = (
+        "| Capture | Mean (max) | Claimed | Within 2 / 3 std | std / rms | / clean | Below oracle | Says | Right reason "
+        "| Honest | Time |"
+    )
+    lines = [header, "| --- " * 11 + "|"]
     for name in ROWS:
         of_row = [result for result in results if result["row"] == name]
         if of_row:
             lines.append(f"| {name} | {' | '.join(cells(of_row, results))} |")
-    honest = sum(map(is_honest, results))
-    return "\n".join([*lines, "", f"{honest} of {len(results)} runs are honest.", "", *notes(results)])
+    doubts = doubted(results)
+    summary = (
+        f"{sum(map(is_honest, results))} of {len(results)} runs are honest; "
+        f"{sum(map(names_its_cause, doubts))} of {len(doubts)} that are doubtful or refused name the cause."
+    )
+    return "\n".join([*lines, "", summary, "", *notes(results)])
+
+
+def doubted(results: Sequence[Result]) -> list[Result]:
+    """Return the runs that are doubtful or were refused."""
+    return [result for result in results if status(result) in ("doubtful", "refused")]
 
 
 def cells(of_row: Sequence[Result], results: Sequence[Result]) -> Iterator[str]:
@@ -312,6 +361,8 @@ def cells(of_row: Sequence[Result], results: Sequence[Result]) -> Iterator[str]:
         yield from "------"
     says = [status(each) for each in of_row]
     yield ", ".join(word if len(says) == 1 else f"{says.count(word)} {word}" for word in dict.fromkeys(says))
+    doubts = doubted(of_row)
+    yield f"{sum(map(names_its_cause, doubts))} of {len(doubts)}" if doubts else "-"
     yield f"{sum(map(is_honest, of_row))} of {len(of_row)}"
     yield f"{np.mean([each['seconds'] for each in of_row]):.0f} s"
 
@@ -325,10 +376,9 @@ def of_clean(scored: Sequence[Result], results: Sequence[Result]) -> str:
 
 
 def notes(results: Sequence[Result]) -> Iterator[str]:
-    """Yield, for each run, what it said: reasons of the verdict, warnings, and the message of an error."""
+    """Yield, for each run, what it said: reasons of a doubt or a refusal, and warnings."""
     for result in results:
-        reasons = [str(reason.get("what", reason)) for reason in (result["verdict"] or {}).get("reasons", ())]
-        said = [*reasons, *result["warnings"], *filter(None, [result["message"]])]
+        said = [*reasons(result), *result["warnings"]]
         if said:
             yield f"- {result['row']}, seed {result['seed']}: {'; '.join(said)}"
 

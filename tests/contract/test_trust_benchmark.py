@@ -97,7 +97,7 @@ def test_refused_run_is_honest_and_trusted_one_without_score_is_not(trust: Modul
 
 
 def test_table_has_a_row_for_each_kind_of_capture(trust: ModuleType) -> None:
-    doubted = {"status": "doubtful", "reasons": [{"what": "the light at the corners is low"}]}
+    doubted = {"status": "doubtful", "reasons": [{"what": "parts of the sensor are dark"}]}
     lines = trust.table(
         [
             result(),
@@ -105,11 +105,35 @@ def test_table_has_a_row_for_each_kind_of_capture(trust: ModuleType) -> None:
             result(row="vignette 80%", seed=1, within_2=0.5, within_3=0.6, below_oracle_db=0.25),
         ]
     ).splitlines()
-    assert lines[2] == "| clean pan | 0.100 (0.30) | 0.100 | 100% / 100% | 1.00 | - | - | - | 1 of 1 | 5 s |"
+    assert lines[2] == "| clean pan | 0.100 (0.30) | 0.100 | 100% / 100% | 1.00 | - | - | - | - | 1 of 1 | 5 s |"
     assert lines[3] == (
-        "| vignette 80% | 0.250 (0.90) | 0.150 | 50% / 60% | 0.60 | 4.00 | 0.25 dB | 1 doubtful, 1 - | 1 of 2 | 5 s |"
+        "| vignette 80% | 0.250 (0.90) | 0.150 | 50% / 60% | 0.60 | 4.00 | 0.25 dB | 1 doubtful, 1 - | 1 of 1 | 1 of 2 | 5 s |"
     )
-    assert lines[5:] == ["2 of 3 runs are honest.", "", "- vignette 80%, seed 0: the light at the corners is low"]
+    assert lines[5:] == [
+        "2 of 3 runs are honest; 1 of 1 that are doubtful or refused name the cause.",
+        "",
+        "- vignette 80%, seed 0: parts of the sensor are dark",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("row", "reason", "right"),
+    [
+        ("tremor of 1 px", "the image moves within groups", True),
+        ("tremor of 1 px", "the light changes", False),
+        ("lens k1 -1.0%", "frames are deformed as with a lens", True),
+        ("clean pan", "the light changes", False),
+    ],
+)
+def test_right_reason_has_a_word_of_the_cause(trust: ModuleType, row: str, reason: str, right: bool) -> None:
+    doubt = result(row=row, verdict={"status": "doubtful", "reasons": [{"what": "something else"}, {"what": reason}]})
+    assert trust.names_its_cause(doubt) is right
+    assert trust.names_its_cause(result(row=row, exit_code=1, message=reason)) is right
+
+
+def test_rows_that_are_disturbed_have_a_cause(trust: ModuleType) -> None:
+    without = [name for name in trust.ROWS if not any(part in name for part in trust.CAUSES)]
+    assert [name for name in without if not name.startswith("clean")] == []
 
 
 def test_results_are_kept_for_captures_of_one_size(trust: ModuleType, tmp_path: Path) -> None:
