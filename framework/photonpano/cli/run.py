@@ -1,11 +1,15 @@
 """photonpano run."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from photonpano.cli.options import Overrides, SpecPath
+from photonpano.cli.verdict import Strict
+
+if TYPE_CHECKING:
+    from photonpano.record.schema import RefinementRecord
 
 
 def run(
@@ -17,22 +21,35 @@ def run(
         ),
     ] = None,
     overrides: Overrides = None,
+    strict: Strict = False,
 ) -> None:
     """Make a panorama from a spec.
 
     Writes the run folder: panorama.png to look at, panorama.tiff with linear flux, coverage.tiff, trajectory.npz, run.json
-    (settings, versions, results) and report.html.
+    (settings, versions, results) and report.html. The verdict says whether motion and panorama explain the photons.
 
     Example: photonpano run scan.yaml --output runs/first --set render.scale=2
     """
     from photonpano.cli.errors import warn
     from photonpano.cli.progress import progress_for_stderr
+    from photonpano.cli.verdict import print_verdict, require_trust
     from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
 
     result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())
-    for warning in result.record["warnings"]:
+    record, directory = result.record, result.directory.resolve()
+    print_verdict(result.verdict)
+    for warning in record["warnings"]:
         warn(warning)
-    directory = result.directory.resolve()
+    for refinement in record["refinements"]:
+        if refinement["rounds"]:
+            typer.echo(f"refined   {_correction(refinement)}")
     typer.echo(f"panorama  {directory / 'panorama.png'}")
     typer.echo(f"report    {directory / 'report.html'}")
+    if strict:
+        require_trust(result.verdict, "all files of the run folder are written")
+
+
+def _correction(refinement: "RefinementRecord") -> str:
+    """Describe a correction by its first round, which is the largest."""
+    return f"{refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"

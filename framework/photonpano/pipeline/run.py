@@ -23,7 +23,7 @@ from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
 from photonpano.residuals.refinement import refine
-from photonpano.residuals.verdict import judge
+from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
 
@@ -37,10 +37,12 @@ class RunResult:
     Attributes:
         directory: the run folder.
         record: the content of its `run.json`.
+        verdict: whether motion and panorama explain the photons.
     """
 
     directory: Path
     record: RunRecord
+    verdict: Verdict
 
 
 def run(plan: Plan, progress: Progress | None = None) -> RunResult:
@@ -87,7 +89,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         folder.write_results(panorama, motion, record)
         folder.write_report(render_report(record, motion, panorama))
         finished(record)
-    return RunResult(plan.output.directory, record)
+    return RunResult(plan.output.directory, record, verdict)
 
 
 def _require_photons(plan: Plan, source: Source) -> None:

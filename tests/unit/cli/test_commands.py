@@ -14,9 +14,11 @@ from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, hookimpl
 from photonpano.cli.plugins import KindName
+from photonpano.pipeline.run import RunResult
 from photonpano.registry import KINDS, BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.plugins import observation_of
+from photonpano.residuals.verdict import Reason, Verdict
 from photonpano.specs import load_spec, parse_spec
 
 
@@ -59,12 +61,61 @@ def test_simulate_warns_of_masked_pixels(folder: Path, invoke: Callable[..., Any
     )
 
 
-def test_run_prints_only_result_paths_and_warnings_into_pipe(finished: Path) -> None:
+def test_run_prints_only_verdict_paths_and_warnings_into_pipe(finished: Path) -> None:
+    record = json.loads((finished / "run" / "run.json").read_text())
+    refined = [line for line in (finished / "run.out").read_text().splitlines(keepends=True) if line.startswith("refined ")]
+    assert len(refined) == sum(bool(each["rounds"]) for each in record["refinements"])
     assert (finished / "run.out").read_text() == (
+        f"verdict   {record['verdict']['status']}\n{''.join(refined)}"
         f"panorama  {finished}/run/panorama.png\nreport    {finished}/run/report.html\n"
     )
-    warnings = json.loads((finished / "run" / "run.json").read_text())["warnings"]
-    assert (finished / "run.err").read_text() == "".join(f"warning: {warning}\n" for warning in warnings)
+    reasons = [f"doubtful: {Reason(**reason)}\n" for reason in record["verdict"]["reasons"]]
+    warnings = [f"warning: {warning}\n" for warning in record["warnings"]]
+    assert (finished / "run.err").read_text() == "".join([*reasons, *warnings])
+
+
+TREMBLING = Reason("the image moves within groups", 24.1, 2.0, "scatter of the shifts over their noise", "use smaller groups")
+SENTENCE = (
+    "doubtful: the image moves within groups (scatter of the shifts over their noise): 24.1, trusted up to 2; "
+    "use smaller groups\n"
+)
+
+
+@pytest.fixture
+def run_with(folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Invoke `run` with a verdict that is given instead of found."""
+
+    def run_with(verdict: Verdict, *arguments: str) -> Any:
+        refined = {"use": "short-spans", "rounds": ["tremor at 223 Hz", "less"], "change_px": 0.664, "kept_out": None}
+        still = {"use": "other", "rounds": [], "change_px": 0.0, "kept_out": None}
+        record = {"warnings": ["a warning"], "refinements": [refined, still]}
+        result = RunResult(folder / "run", record, verdict)
+        monkeypatch.setattr("photonpano.pipeline.run.run", lambda *_: result)
+        return invoke("run", "capture.yaml", *arguments)
+
+    return run_with
+
+
+def test_run_prints_verdict_reasons_and_corrections(folder: Path, run_with: Callable[..., Any]) -> None:
+    result = run_with(Verdict("doubtful", (TREMBLING,), 24.1))
+    assert result.exit_code == 0
+    assert result.stdout == (
+        "verdict   doubtful\n"
+        "refined   0.66 px on average by short-spans: tremor at 223 Hz\n"
+        f"panorama  {folder}/run/panorama.png\n"
+        f"report    {folder}/run/report.html\n"
+    )
+    assert result.stderr == f"{SENTENCE}warning: a warning\n"
+
+
+def test_strict_run_fails_if_and_only_if_doubtful(run_with: Callable[..., Any]) -> None:
+    result = run_with(Verdict("doubtful", (TREMBLING,), 24.1), "--strict")
+    assert result.exit_code == 1
+    assert result.stderr == (
+        f"{SENTENCE}warning: a warning\n"
+        "error: the verdict is doubtful, and --strict accepts only a trusted one; all files of the run folder are written\n"
+    )
+    assert run_with(Verdict("trusted", (), 1.02), "--strict").exit_code == 0
 
 
 def test_evaluate_table_agrees_with_json(finished: Path, invoke: Callable[..., Any]) -> None:
