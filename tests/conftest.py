@@ -120,6 +120,26 @@ def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFacto
     return run(parse_spec(small_spec, output=tmp_path_factory.mktemp("runs") / "small"))
 
 
+@pytest.fixture(scope="session")
+def clouds() -> Callable[..., np.ndarray]:
+    """Return (n, H, W) binary frames of a cloudy scene, without edges, that moves by 0.2 px a frame along both axes."""
+
+    def clouds(flux: float = 0.3, shape: tuple[int, int] = (64, 96), n_frames: int = 384, seed: int = 0) -> np.ndarray:
+        import cv2
+
+        rng = np.random.default_rng(seed)
+        (height, width), far = shape, n_frames // 5 + 1
+        noise = cv2.GaussianBlur(rng.standard_normal((height + far, width + far)).astype(np.float32), (0, 0), 2.5)
+        scene = flux * np.exp(0.7 * noise / noise.std())
+        frames = np.empty((n_frames, *shape), np.uint8)
+        for index, frame in enumerate(frames):
+            at = index // 5
+            frame[:] = rng.random(shape) < -np.expm1(-scene[at : at + height, at : at + width])
+        return frames
+
+    return clouds
+
+
 @pytest.fixture
 def write_video(tmp_path: Path) -> Callable[..., Path]:
     """Write grey levels unchanged as the luma of a video."""

@@ -174,7 +174,7 @@ class SourceContribution(Contribution):
     Attributes:
         check: finds problems of a config without reading the capture, such as a missing file.
         recognise: returns the keys of a capture if it is one of this source, for specs that leave the choice to `auto`. It
-            reads names, sizes and first bytes, imports nothing heavy, and raises nothing.
+            reads names, sizes and a few megabytes at most, imports nothing heavy, and raises nothing.
         suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
             the message has the problems of the sources with its ending.
     """

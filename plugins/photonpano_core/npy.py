@@ -10,25 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from photonpano import Config, FrameSpan, InputError, SourceContribution, SpecPath, StreamInfo
+from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinarySumResponse
 from photonpano.reading import (
     BinarySource,
     Closing,
+    Content,
     FrameLayout,
     NpyHeader,
     OpenFiles,
+    frames_are_last,
     gzipped_npy_header,
     is_gzip,
     npy_header,
     objections,
     require_frames,
     require_whole,
+    sampled_frames,
     unpacked,
+    unpacked_content,
 )
 
 _READ_BYTES = 4 * 1024**2
 """Bytes of the frames that are read at once."""
+
+
+_NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
 
 
 class NpyConfig(Config):
@@ -41,8 +48,10 @@ class NpyConfig(Config):
     frames_per_sum: int | None = Field(
         None, ge=1, le=65535, description="number of binary frames in each sum; required for sums"
     )
-    frames: Literal["first", "last"] = Field(
-        "first", description="the axis of the frames: first for (frames, height, width), last for (height, width, frames)"
+    frames: Literal["first", "last"] | None = Field(
+        None,
+        description="axis of the frames: first for (frames, height, width), last for (height, width, frames); by default "
+        "first, and arrays that show that it is the last are refused",
     )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames (or sums) a second, in Hz; leave it out if unknown")
 
@@ -107,7 +116,7 @@ class NpyBits(BinarySource):
         for place, values in self._values.blocks(span):
             if values.max() > 1 or values.min() < 0:
                 wrong = (values != 0) & (values != 1) & (values != 255)
-                self._values.require(wrong, values, span.start + place.start, "bits are 0 and 1, or 0 and 255")
+                self._values.require(wrong, values, span.start + place.start, _NO_BIT)
             yield place, np.packbits(values != 0, axis=2)
 
     def close(self) -> None:
@@ -159,6 +168,22 @@ class NpySums(Closing):
         self._values.files.close()
 
 
+def contents_of(path: Path, header: NpyHeader) -> Content | None:
+    """Return what the values of an array are, if they are bool or whole numbers, and not bytes of eight pixels each."""
+    if header.dtype.kind not in "bui" or len(header.shape) != 3 or min(header.shape) < 1 or header.fortran_order:
+        return None
+    samples = sampled_frames(path, header)
+    return unpacked_content(samples) if samples else None
+
+
+def section_for(path: Path, holds: str, highest: int = 1) -> str:
+    """Return the section of a spec that reads such a capture; `highest` is the largest value that was seen in it."""
+    if holds == "bits":
+        return f"source: {{use: npy, with: {{path: {path}, holds: bits}}}}"
+    keys = f"holds: sums, frames_per_sum: {highest}"
+    return f"source: {{use: npy, with: {{path: {path}, {keys}}}}}, with the number of binary frames in a sum if it is larger"
+
+
 def _header(config: NpyConfig) -> NpyHeader:
     """Return the header of the capture.
 
@@ -177,10 +202,20 @@ def _header(config: NpyConfig) -> NpyHeader:
     require_frames(path, header, "height, width, frames" if config.frames == "last" else "frames, height, width")
     if not is_gzip(path):
         require_whole(path, header)
+    if config.frames is None and _frames_are_last(path, header):
+        raise InputError(
+            f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write frames: last, or "
+            "frames: first if it is right"
+        )
     return header
 
 
 _TYPES = {"bits": "bool", "sums": "numpy.uint16"}
+
+
+def _frames_are_last(path: Path, header: NpyHeader) -> bool:
+    samples = sampled_frames(path, header)
+    return bool(samples) and frames_are_last(samples, header.shape)
 
 
 def _open(config: NpyConfig) -> NpyBits | NpySums:
@@ -196,11 +231,30 @@ def _check(config: NpyConfig) -> Sequence[str]:
     return objections(_header, config)
 
 
+def _recognise(path: Path) -> Recognised | None:
+    """Take .npy files of bits. The number of frames in a sum stands in no file."""
+    if not path.is_file() or (path.parent / "transforms.json").exists():
+        return None
+    try:
+        header = gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
+        content = contents_of(path, header)
+    except InputError:
+        return None
+    if content is None or content.holds != "bits":
+        return None
+    keys = {"path": str(path), "holds": "bits"}
+    because = f"{header.dtype} of shape {header.shape} in a .npy file, with the values 0 and {content.highest} only"
+    if not _frames_are_last(path, header):
+        return Recognised(keys, because)
+    return Recognised(keys | {"frames": "last"}, f"{because}, and values are most alike along the last axis")
+
+
 NPY = SourceContribution(
     name="npy",
     summary="Frames in a .npy file, a pixel to a value: zeros and ones, or sums of binary frames",
     config=NpyConfig,
     build=lambda config, _: _open(config),
     check=_check,
+    recognise=_recognise,
     suffixes=(".npy", ".gz"),
 )

@@ -13,10 +13,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.photometry import packed_along_width
-from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, npy_header, objections, read_json, require_whole
+from photonpano.reading import (
+    FrameFile,
+    FrameLayout,
+    PackedFileSource,
+    npy_header,
+    objections,
+    read_json,
+    require_whole,
+    with_channel,
+)
 
 _TRANSFORMS = "transforms.json"
-_GREEN = 1
 
 
 class VisionsimConfig(Config):
@@ -162,21 +170,21 @@ def _recognise(path: Path) -> Recognised | None:
     transforms = (path if path.is_dir() else path.parent) / _TRANSFORMS
     if not transforms.is_file():
         return None
-    for channel in (None, _GREEN):
+
+    def read(channel: int | None) -> list[FrameFile]:
         config = VisionsimConfig(path=transforms, channel=channel)
-        try:
-            files, _, _ = _read(config)
-            with _open(config) as source:
-                source.frames(FrameSpan(0, 1))  # which fails if they are not binary
-        except InputError:
-            continue
-        if path not in (transforms, transforms.parent, *(file.path for file in files)):
-            return None
-        because = f"a {_TRANSFORMS} and the .npy file of binary frames that it names"
-        if channel is None:
-            return Recognised({"path": str(transforms)}, because)
-        return Recognised({"path": str(transforms), "channel": channel}, f"{because}, of whose channels the middle one is used")
-    return None
+        files, _, _ = _read(config)
+        with _open(config) as source:
+            source.frames(FrameSpan(0, 1))  # which fails if they are not binary
+        return files
+
+    if (found := with_channel(read)) is None:
+        return None
+    files, channel = found
+    if path not in (transforms, transforms.parent, *(file.path for file in files)):
+        return None
+    because = f"a {_TRANSFORMS} and the .npy file of binary frames that it names{channel.clause}"
+    return Recognised({"path": str(transforms)} | channel.keys, because)
 
 
 VISIONSIM = SourceContribution(

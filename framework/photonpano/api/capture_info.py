@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons, saturated_share, summarise
 from photonpano.corrections import CorrectedSource, HotPixels, without_still_pixels
 from photonpano.errors import InputError
@@ -153,6 +154,8 @@ def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[s
     except InputError as error:
         yield str(error)
         return
+    if warning := order_warning(source):
+        yield warning
     if hot_left > HOT_SHARE:
         yield f"about {percent(hot_left)} of the pixels are hot; mask them with the correction hot-pixels"
     if found.standing_share > STANDING_SHARE:

@@ -9,7 +9,7 @@ def check(spec: SpecPath, overrides: Overrides = None) -> None:
     """Check a spec without running it.
 
     Prints every problem with its file, line and column, and exits with 2 if there is one. Opens the capture to check the
-    stages against its size, but reads no frames: what depends on the frames stays open.
+    stages against its size, and samples the frames of packed .npy files: what depends on all frames stays open.
 
     Example: photonpano check scan.yaml
     """

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
@@ -26,6 +28,8 @@ from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
+
+logger = logging.getLogger(__name__)
 
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
@@ -72,6 +76,8 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
     ):
         start, memory = time.perf_counter(), int(plan.run.memory)
         _require_photons(plan, source)
+        if warning := order_warning(source):
+            logger.warning(warning)
         decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)

@@ -1,7 +1,9 @@
 """What sources share that read captures from files: packed frames, .npy headers, arrays, files in order."""
 
+from photonpano.reading.array_content import Content, frames_are_last, packed_frames_are_last, unpacked_content
 from photonpano.reading.arrays import read_array, read_arrays, read_picture
 from photonpano.reading.binary_source import BinarySource
+from photonpano.reading.channels import Channel, with_channel
 from photonpano.reading.files import (
     OpenFiles,
     files_in,
@@ -16,23 +18,32 @@ from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, un
 from photonpano.reading.npy import NpyHeader, npy_header, require_frames, require_whole
 from photonpano.reading.packed_files import FrameFile, PackedFileSource
 from photonpano.reading.packed_layout import FrameLayout
+from photonpano.reading.pixel_order import OtherOrder, PixelOrder, other_order
+from photonpano.reading.sampling import sampled_frames, sampled_spans
 from photonpano.source_wrapper import Closing
 
 __all__ = [
     "BinarySource",
+    "Channel",
     "Closing",
+    "Content",
     "FrameFile",
     "FrameLayout",
     "NpyHeader",
     "OpenFiles",
+    "OtherOrder",
     "PackedFileSource",
+    "PixelOrder",
     "files_in",
+    "frames_are_last",
     "gzipped_npy_header",
     "is_gzip",
     "missing_file",
     "natural_order",
     "npy_header",
     "objections",
+    "other_order",
+    "packed_frames_are_last",
     "read_array",
     "read_arrays",
     "read_json",
@@ -41,6 +52,10 @@ __all__ = [
     "reading",
     "require_frames",
     "require_whole",
+    "sampled_frames",
+    "sampled_spans",
     "unpacked",
+    "unpacked_content",
     "unpacked_start",
+    "with_channel",
 ]

@@ -95,8 +95,8 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
         if several:
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
-            # The path is named once; each line has its last part.
-            near = [line.replace(str(path), path.name) for line in _near_misses(spec, written, path)]
+            # The path is named once; each line begins with its last part.
+            near = [line.replace(str(path), path.name, 1) for line in _near_misses(spec, written, path)]
             lines = [*(near or _known_endings(spec.catalog)), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
         spec.wrong(f"{keys}.path", message)

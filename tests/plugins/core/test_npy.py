@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gzip
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from photonpano_core.npy import NPY, NpyConfig
 
 BITS = np.random.default_rng(0).integers(0, 2, (40, 6, 19), dtype=np.uint8)
 SUMS = np.random.default_rng(1).integers(0, 301, (40, 6, 19), dtype=np.uint16)
+
+
+NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
 
 
 def saved(path: Path, array: np.ndarray, **options: Any) -> Path:
@@ -138,8 +142,8 @@ def test_truncated_file_is_refused_with_both_sizes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("value", "dtype", "keys", "remedy"),
     [
-        (2, np.uint8, {"holds": "bits"}, "bits are 0 and 1, or 0 and 255"),
-        (-1, np.int8, {"holds": "bits"}, "bits are 0 and 1, or 0 and 255"),
+        (2, np.uint8, {"holds": "bits"}, NO_BIT),
+        (-1, np.int8, {"holds": "bits"}, NO_BIT),
         (
             301,
             np.uint16,
@@ -185,3 +189,15 @@ def test_value_out_of_range_is_named_with_its_place(
 def test_frames_per_sum_belongs_to_sums(keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         NpyConfig(path=Path("cube.npy"), **keys)
+
+
+def test_frames_that_seem_to_be_last_are_refused_unless_the_spec_states_their_axis(tmp_path: Path, clouds: Callable) -> None:
+    path = saved(tmp_path / "cube.npy", frames_last(clouds()))
+    assert_refused(
+        f"{path} has its frames along the last axis of (64, 96, 384), where values are most alike; write frames: last, or "
+        "frames: first if it is right",
+        path,
+        holds="bits",
+    )
+    for frames in ("first", "last"):
+        assert list(NPY.check(NpyConfig(path=path, holds="bits", frames=frames))) == []

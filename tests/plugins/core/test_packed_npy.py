@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -82,6 +83,128 @@ def test_channel_of_a_colour_capture_is_read(tmp_path: Path, width: int) -> None
             np.testing.assert_array_equal(source.frames(source.info.span), frames)
             np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), frames[3:30].sum(axis=0))
             np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
+
+
+@pytest.mark.parametrize("bit_order", ["big", "little"])
+@pytest.mark.parametrize("height", [16, 13])
+def test_frames_packed_along_the_height_are_read(tmp_path: Path, bit_order: Any, height: int) -> None:
+    frames = cube(height=height, width=21)
+    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=1, bitorder=bit_order))
+    with opened(path, packed_along="height", bit_order=bit_order, height=height) as source:
+        assert source.info.frame_shape == (height, 21)
+        np.testing.assert_array_equal(source.frames(FrameSpan(3, 30)), frames[3:30])
+        np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), frames[3:30].sum(axis=0))
+        np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
+
+
+def test_colour_packed_along_the_height_is_read(tmp_path: Path) -> None:
+    frames = np.stack([cube(height=16, seed=seed) for seed in range(3)], axis=-1)
+    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=1, bitorder="little"))
+    with opened(path, packed_along="height", bit_order="little", channel=2) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), frames[..., 2])
+
+
+def test_frames_with_the_first_pixel_in_the_lowest_bit_are_read(tmp_path: Path) -> None:
+    frames = cube(width=19)
+    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=2, bitorder="little"))
+    with opened(path, bit_order="little", width=19) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), frames)
+        np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        (
+            {"packed_along": "height", "height": 40},
+            "has columns of 6 bytes, which hold a height of 41 to 48, not 40; correct the height",
+        ),
+        ({"packed_along": "height", "width": 24}, "has 3 columns, not 24; correct the width, or leave it out"),
+        ({"height": 48}, "has 6 rows, not 48; correct the height, or leave it out"),
+    ],
+)
+def test_size_that_does_not_fit_the_array_is_refused(tmp_path: Path, keys: dict[str, Any], words: str) -> None:
+    path = saved(tmp_path / "cube.npy", PACKED)
+    assert_refused(f"{path} {words}", path, **keys)
+
+
+def problem_of(path: Path, array: np.ndarray, **config: Any) -> str | None:
+    """Return what the check says of an array, without the path, and without figures."""
+    problems = PACKED_NPY.check(PackedNpyConfig(path=saved(path, array), **config))
+    assert len(problems) <= 1
+    return re.sub(r"\b0\.\d\d\b", "R", problems[0]).replace(str(path), "PATH") if problems else None
+
+
+ACROSS = "pixels correlate by R within bytes, by R across their borders, and by R across their borders if"
+MISTAKES = {
+    "zeros and ones": (
+        lambda frames: frames,
+        "PATH is not packed: all of 2,359,296 bytes sampled are 0 or 1; write source: {use: npy, with: {path: PATH, "
+        "holds: bits}}",
+    ),
+    "zeros and 255": (
+        lambda frames: frames * np.uint8(255),
+        "PATH is not packed: all of 2,359,296 bytes sampled are 0 or 255; write source: {use: npy, with: {path: PATH, "
+        "holds: bits}}",
+    ),
+    "sums of four": (
+        lambda frames: frames.reshape(96, 4, *frames.shape[1:]).sum(axis=1, dtype=np.uint8),
+        "PATH is not packed: neighbouring bytes are alike as numbers, up to 4 in 589,824 sampled; write source: {use: npy, "
+        "with: {path: PATH, holds: sums, frames_per_sum: 4}}, with the number of binary frames in a sum if it is larger",
+    ),
+    "lowest bit first": (
+        lambda frames: np.packbits(frames, axis=2, bitorder="little"),
+        f"PATH is packed in another order: {ACROSS} the first pixel is the lowest bit; write bit_order: little, or "
+        "bit_order: big if it is right",
+    ),
+    "packed along the height": (
+        lambda frames: np.packbits(frames, axis=1),
+        f"PATH is packed in another order: {ACROSS} bytes are packed along the height; write packed_along: height, or "
+        "bit_order: big if it is right",
+    ),
+    "packed along the height, lowest bit first": (
+        lambda frames: np.packbits(frames, axis=1, bitorder="little"),
+        f"PATH is packed in another order: {ACROSS} bytes are packed along the height, with the first pixel in the lowest "
+        "bit; write packed_along: height and bit_order: little, or bit_order: big if it is right",
+    ),
+    "frames last": (
+        lambda frames: np.ascontiguousarray(np.moveaxis(np.packbits(frames[:, :32, :48], axis=2), 0, -1)),
+        "PATH has its frames along the last axis of (32, 6, 384), where values are most alike, and a byte holds eight pixels; "
+        "save numpy.moveaxis(numpy.load(path), -1, 0) to another file, or write bit_order: big if it is right",
+    ),
+    "frames last and packed": (
+        lambda frames: np.packbits(np.moveaxis(frames, 0, -1), axis=-1),
+        "PATH has its frames along the last axis of (64, 96, 48), where values are most alike, and a byte holds eight frames; "
+        "save numpy.packbits(numpy.moveaxis(numpy.unpackbits(numpy.load(path), axis=-1), -1, 0), axis=-1) to another file, "
+        "or write bit_order: big if it is right",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_check_says_what_to_write_for_another_layout(tmp_path: Path, clouds: Callable, mistake: str) -> None:
+    store, message = MISTAKES[mistake]
+    frames = clouds()
+    assert problem_of(tmp_path / "cube.npy", np.packbits(frames, axis=2)) is None
+    assert problem_of(tmp_path / "cube.npy", store(frames)) == message
+
+
+@pytest.mark.parametrize("keys", [{"bit_order": "big"}, {"bit_order": "little"}, {"packed_along": "width"}])
+def test_layout_that_the_spec_states_is_believed(tmp_path: Path, clouds: Callable, keys: dict[str, Any]) -> None:
+    for packed in (np.packbits(clouds(), axis=2, bitorder="little"), clouds()):
+        assert problem_of(tmp_path / "cube.npy", packed, **keys) is None
+
+
+def test_layout_of_each_channel_is_checked(tmp_path: Path, clouds: Callable) -> None:
+    stored = np.packbits(np.repeat(clouds(n_frames=128)[..., None], 3, axis=-1), axis=2, bitorder="little")
+    assert "write bit_order: little" in str(problem_of(tmp_path / "cube.npy", stored, channel=2))
+
+
+def test_layout_of_a_compressed_capture_is_checked(gzipped: Path, clouds: Callable) -> None:
+    packed = np.packbits(clouds(), axis=2, bitorder="little")
+    gzipped.write_bytes(gzip.compress(saved(gzipped.with_name("little.npy"), packed).read_bytes()))
+    (problem,) = PACKED_NPY.check(PackedNpyConfig(path=gzipped))
+    assert problem.endswith("write bit_order: little, or bit_order: big if it is right")
 
 
 def test_channel_without_colour_is_refused(tmp_path: Path) -> None:
@@ -166,12 +289,23 @@ PACKED = np.packbits(cube(), axis=-1)
 
 WRONG_ARRAYS = {
     "dtype": (
+        cube().astype(np.float32),
+        "{path} holds float32 values, not bytes of eight pixels; pack frames of zeros and ones with "
+        "numpy.packbits(cube, axis=-1)",
+    ),
+    "bool": (
         cube().astype(bool),
-        "{path} holds bool values, not packed uint8; pack frames of zeros and ones with numpy.packbits(cube, axis=-1)",
+        "{path} holds bool values, not bytes of eight pixels; write source: {{use: npy, with: {{path: {path}, holds: bits}}}}",
+    ),
+    "sums": (
+        3 * cube().astype(np.int64),
+        "{path} holds int64 values, not bytes of eight pixels; write source: {{use: npy, with: {{path: {path}, holds: sums, "
+        "frames_per_sum: 3}}}}, with the number of binary frames in a sum if it is larger",
     ),
     "objects": (
         np.array([{}], dtype=object),
-        "{path} holds object values, not packed uint8; pack frames of zeros and ones with numpy.packbits(cube, axis=-1)",
+        "{path} holds object values, not bytes of eight pixels; pack frames of zeros and ones with "
+        "numpy.packbits(cube, axis=-1)",
     ),
     "colour": (
         np.zeros((4, 6, 3, 3), np.uint8),
@@ -252,7 +386,7 @@ def test_unpacked_frames_are_refused_by_their_width(tmp_path: Path) -> None:
     path = saved(tmp_path / "cube.npy", cube())
     assert_refused(
         f"{path} has rows of 24 bytes, which hold a width of 185 to 192, not 24; "
-        "it seems not to be packed: use numpy.packbits(cube, axis=-1)",
+        f"it seems not to be packed: write source: {{use: npy, with: {{path: {path}, holds: bits}}}}",
         path,
         width=24,
     )

@@ -14,7 +14,7 @@ import pytest
 from photonpano import FrameSpan, Recognised, Source, SourceContext, discover
 from photonpano.photometry import BinaryResponse
 
-NAMES = "packed-npy swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5"
+NAMES = "packed-npy npy swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5"
 SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}
 
 
@@ -97,11 +97,62 @@ def test_packed_npy_is_recognised_by_header(tmp_path: Path) -> None:
     )
 
 
-def test_unpacked_frames_are_not_recognised(tmp_path: Path) -> None:
-    np.save(tmp_path / "cube.npy", FRAMES)
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32])
+def test_unpacked_bits_are_recognised_by_their_values(tmp_path: Path, dtype: Any) -> None:
+    path = tmp_path / "cube.npy"
+    np.save(path, FRAMES.astype(dtype))
+    found = recognised(path)
+    assert set(found) == {"npy"}
+    assert found["npy"].keys == {"path": str(path), "holds": "bits"}
+    name = np.dtype(dtype).name
+    assert found["npy"].because == f"{name} of shape (6, 10, 16) in a .npy file, with the values 0 and 1 only"
+    with opened("npy", found["npy"].keys) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), FRAMES)
+    (tmp_path / "cube.npy.gz").write_bytes(gzip.compress(path.read_bytes()))
+    assert set(recognised(tmp_path / "cube.npy.gz")) == {"npy"}
+
+
+def test_unpacked_bits_with_frames_last_are_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray]) -> None:
+    np.save(tmp_path / "cube.npy", np.ascontiguousarray(np.moveaxis(clouds() * np.uint8(255), 0, -1)))
+    found = recognised(tmp_path / "cube.npy")
+    assert set(found) == {"npy"}
+    assert found["npy"].keys == {"path": str(tmp_path / "cube.npy"), "holds": "bits", "frames": "last"}
+    assert found["npy"].because == (
+        "uint8 of shape (64, 96, 384) in a .npy file, with the values 0 and 255 only, and values are most alike along the last "
+        "axis"
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_sums_and_floats_are_not_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray], dtype: Any) -> None:
+    np.save(tmp_path / "cube.npy", clouds().reshape(12, 32, 64, 96).sum(axis=1).astype(dtype))
     assert recognised(tmp_path / "cube.npy") == {}
-    (tmp_path / "cube.npy.gz").write_bytes(gzip.compress((tmp_path / "cube.npy").read_bytes()))
-    assert recognised(tmp_path / "cube.npy.gz") == {}
+
+
+@pytest.mark.parametrize(
+    ("axis", "bit_order", "keys"),
+    [
+        (2, "little", {"bit_order": "little"}),
+        (1, "big", {"packed_along": "height"}),
+        (1, "little", {"packed_along": "height", "bit_order": "little"}),
+    ],
+)
+def test_order_of_packed_pixels_is_recognised(
+    tmp_path: Path, clouds: Callable[..., np.ndarray], axis: int, bit_order: Any, keys: dict[str, str]
+) -> None:
+    frames = clouds()
+    np.save(tmp_path / "cube.npy", np.packbits(frames, axis=axis, bitorder=bit_order))
+    found = recognised(tmp_path / "cube.npy")
+    assert set(found) == {"packed-npy"}
+    assert found["packed-npy"].keys == {"path": str(tmp_path / "cube.npy")} | keys
+    assert ", where pixels correlate by " in found["packed-npy"].because
+    with opened("packed-npy", found["packed-npy"].keys) as source:
+        np.testing.assert_array_equal(source.frames(FrameSpan(0, 5)), frames[:5])
+
+
+def test_packed_frames_along_the_last_axis_are_not_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray]) -> None:
+    np.save(tmp_path / "cube.npy", np.ascontiguousarray(np.moveaxis(np.packbits(clouds()[:, :32, :48], axis=2), 0, -1)))
+    assert recognised(tmp_path / "cube.npy") == {}
 
 
 def test_visionsim_is_recognised_by_transforms_json(tmp_path: Path) -> None:

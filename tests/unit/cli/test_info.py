@@ -151,3 +151,46 @@ def test_info_warns_of_capture_too_short_for_groups(folder: Path, invoke: Callab
     rows = rows_of(result.stdout)
     assert (rows["speed"], rows["group size"]) == ("5 frames are too few to estimate a motion", "unknown")
     assert "warning: the capture has 5 frames, " in result.stderr
+
+
+def test_info_finds_order_of_pixels_and_prints_it_in_spec(folder: Path, invoke: Callable[..., Any], clouds: Callable) -> None:
+    np.save(folder / "cube.npy", np.packbits(clouds(), axis=1, bitorder="little"))
+    result = invoke("info", "cube.npy")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert rows_of(result.stdout)["capture"] == "384 binary frames of 64x96"
+    assert result.stdout.endswith(
+        "source: {use: packed-npy, with: {path: cube.npy, bit_order: little, packed_along: height}}\n"
+    )
+
+
+def test_info_reads_unpacked_frames(folder: Path, invoke: Callable[..., Any], clouds: Callable) -> None:
+    np.save(folder / "cube.npy", clouds())
+    result = invoke("info", "cube.npy")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout.endswith("source: {use: npy, with: {path: cube.npy, holds: bits}}\n")
+
+
+def test_info_of_sums_shows_the_line_to_write(folder: Path, invoke: Callable[..., Any], clouds: Callable) -> None:
+    path = folder / "cube.npy"
+    np.save(path, clouds().reshape(96, 4, 64, 96).sum(axis=1))
+    result = invoke("info", "cube.npy")
+    assert result.exit_code == 2
+    assert result.stderr == (
+        f"error: no source recognises {path}, a file of 4,718,720 bytes; name the one that reads it\n"
+        f"  packed-npy: cube.npy holds uint64 values, not bytes of eight pixels; write source: {{use: npy, with: {{path: "
+        f"{path}, holds: sums, frames_per_sum: 4}}}}, with the number of binary frames in a sum if it is larger\n"
+    )
+    result = invoke("info", "cube.npy", "--source", "npy", "--with", "holds=sums", "--with", "frames_per_sum=4")
+    assert result.exit_code == 0
+    assert result.stdout.endswith("source: {use: npy, with: {path: cube.npy, holds: sums, frames_per_sum: 4}}\n")
+
+
+def test_info_warns_of_stated_order_that_the_frames_contradict(
+    folder: Path, invoke: Callable[..., Any], clouds: Callable
+) -> None:
+    np.save(folder / "cube.npy", np.packbits(clouds(), axis=2, bitorder="little"))
+    result = invoke("info", "cube.npy", "--source", "packed-npy", "--with", "bit_order=big")
+    assert result.exit_code == 0
+    assert result.stderr.startswith(
+        "warning: the pixels of the frames seem to be in another order than they are read in: pixels correlate by "
+    )

@@ -1,0 +1,54 @@
+"""Read some frames from all over a .npy file, to judge what it holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.reading.gzipped import is_gzip, unpacked_start
+from photonpano.reading.npy import NpyHeader
+from photonpano.values import FrameSpan
+
+_VALUES = 3 * 1024**2
+"""Values that are read, about."""
+_RUN = 128
+"""Frames of a run of consecutive frames, at most."""
+_SHORTEST_RUN = 16
+"""Frames of a run, even if only some columns of them can be read."""
+
+
+def sampled_frames(path: Path, header: NpyHeader) -> list[NDArray[Any]]:
+    """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
+
+    Args:
+        path: the file.
+        header: its header; the array has three dimensions or more, in C order.
+
+    Returns:
+        Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
+        list where the file is cut short, or the beginning of a .npy.gz file holds no whole frame.
+    """
+    n_frames, n_rows, n_columns, *_ = header.shape
+    values_of_frame = int(np.prod(header.shape[1:]))
+    if is_gzip(path):
+        start = unpacked_start(path, header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
+        whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
+        frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
+        return [frames.reshape(whole, *header.shape[1:])] if whole else []
+    if path.stat().st_size < header.file_bytes:
+        return []
+    columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))
+    stored = np.memmap(path, header.dtype, "r", header.offset, header.shape)
+    return [np.array(stored[each.start : each.stop, :, :columns]) for each in sampled_spans(n_frames, n_rows * columns)]
+
+
+def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:
+    """Return spans of up to 128 frames, evenly spaced over a capture, that hold about 3 million values together."""
+    most = max(1, _VALUES // frame_values)
+    length = min(_RUN, n_frames, most)
+    n_spans = max(1, min(most // length, n_frames // length))
+    starts = np.linspace(0, n_frames - length, n_spans).astype(int).tolist()
+    return [FrameSpan(start, start + length) for start in starts]
