@@ -18,6 +18,8 @@ Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
 LONGEST_RUN = 512
 """Largest size of a run, so that float32 is exact enough."""
+_ROUNDING = 1e-6
+"""Fractions of a pixel that are outside of 0 to 1 by less than this are inside: a still image lies on whole pixels."""
 _STEPS = np.arange(LONGEST_RUN, dtype=np.float32)
 """Precomputed float32 indices: an int-to-float conversion in the loop would dominate it."""
 
@@ -144,10 +146,10 @@ def sample_run(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
 
 @compiled
 def _positive_until(constant: float, linear: float, square: float, most: float) -> float:
-    """Return the first root of a polynomial that is positive at 0, at most `most`."""
+    """Return the first root of a polynomial that is positive at 0, at most `most`; below 0 by rounding errors is positive."""
     at_end = constant + most * (linear + most * square)
     # A concave polynomial has its minimum at an end, a convex one perhaps between.
-    if at_end >= 0 and (square <= 0 or linear >= 0 or linear + 2 * square * most <= 0):
+    if at_end >= -_ROUNDING and (square <= 0 or linear >= 0 or linear + 2 * square * most <= 0):
         return most
     discriminant = linear * linear - 4 * square * constant
     if discriminant < 0:

@@ -27,7 +27,10 @@ def n_blocks(shape: tuple[int, ...]) -> tuple[int, int]:
 def sample_view(
     mean: NDArray[np.float32], precision: NDArray[np.float32], to_canvas: NDArray[np.float64], into: NDArray[np.float32]
 ) -> None:
-    """Interpolate two images of a canvas at the pixels of a frame: (2, h, w); NaN where the canvas ends."""
+    """Sample two images of a canvas at the pixels of a frame: (2, h, w); NaN where the canvas ends.
+
+    The mean is interpolated linearly. The precision, which only weights, is that of the nearest pixel.
+    """
     height, width = into.shape[1:]
     for y in range(height):
         first, last = visible_columns(to_canvas, y, 0.0, mean.shape[1] - 1.0, 0.0, mean.shape[0] - 1.0, width)
@@ -37,7 +40,9 @@ def sample_view(
         while x < last:
             run = run_from(to_canvas, x, y, last - x, mean.shape[0], mean.shape[1])
             sample_run(mean, run, into[0, y, x : x + run.size])
-            sample_run(precision, run, into[1, y, x : x + run.size])
+            row = precision[run.top + int(run.b0 > 0.5)]
+            left = run.left + int(run.a0 > 0.5)
+            into[1, y, x : x + run.size] = row[left : left + run.size]
             x += run.size
 
 
@@ -49,8 +54,6 @@ def add_block_sums(
     mean: NDArray[np.float32],
     precision: NDArray[np.float32],
     sums: NDArray[np.float32],
-    pixel_residual: NDArray[np.float32],
-    pixel_mean: NDArray[np.float32],
 ) -> None:
     """Add the sums of a span to blocks. The border pixels of a frame are left out, for they have no gradient.
 
@@ -61,8 +64,6 @@ def add_block_sums(
         mean: (H, W) expected count of a frame, NaN where unknown.
         precision: (H, W) 1 / variance of the count of a frame; 0 or NaN where unknown.
         sums: (h, w, 12), see `n_blocks`; added to.
-        pixel_residual: (H, W) sum of residuals; added to.
-        pixel_mean: (H, W) sum of expected counts; added to.
     """
     height, width = mean.shape
     n = np.float32(n_frames)
@@ -71,14 +72,12 @@ def add_block_sums(
     for y in range(1, height - 1):
         row, above, below = mean[y], mean[y - 1], mean[y + 1]
         lit, weights, extra = counts[y], precision[y], dark[y]
-        total_r, total_m = pixel_residual[y], pixel_mean[y]
         for block in range((width + BLOCK_PX - 1) // BLOCK_PX):
             start, stop = max(1, block * BLOCK_PX), min(width - 1, (block + 1) * BLOCK_PX)
             size = stop - start
             here, left, right = row[start:stop], row[start - 1 : stop - 1], row[start + 1 : stop + 1]
             up, down = above[start:stop], below[start:stop]
             k, p, e = lit[start:stop], weights[start:stop], extra[start:stop]
-            tr, tm = total_r[start:stop], total_m[start:stop]
             xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
             for t in range(size):
                 m, gx, gy = here[t] * n, (right[t] - left[t]) * half, (down[t] - up[t]) * half
@@ -105,8 +104,6 @@ def add_block_sums(
                 rr += r
                 vv += v
                 ms += m
-                tr[t] += r
-                tm[t] += m
             cell = sums[y // BLOCK_PX, block]
             cell[0] += xx
             cell[1] += xy
@@ -120,6 +117,34 @@ def add_block_sums(
             cell[9] += rr
             cell[10] += vv
             cell[11] += ms
+
+
+@compiled
+def add_pixel_sums(
+    counts: NDArray[np.float32],
+    n_frames: float,
+    mean: NDArray[np.float32],
+    residual: NDArray[np.float32],
+    total: NDArray[np.float32],
+) -> None:
+    """Add residuals, and expected counts, to the sums of each pixel; unknown pixels are NaN in `counts` or `mean`.
+
+    Args:
+        counts: (H, W) summed counts.
+        n_frames: frames of the span.
+        mean: (H, W) expected count of a frame.
+        residual: (H, W) sum of residuals; added to.
+        total: (H, W) sum of expected counts; added to.
+    """
+    n, zero = np.float32(n_frames), np.float32(0)
+    for y in range(mean.shape[0]):
+        k, m, residuals, totals = counts[y], mean[y], residual[y], total[y]
+        for t in range(len(k)):
+            expected = m[t] * n
+            r = k[t] - expected
+            known = r == r
+            residuals[t] += r if known else zero
+            totals[t] += expected if known else zero
 
 
 @compiled

@@ -12,7 +12,7 @@ import numpy as np
 from photonpano.context import Context
 from photonpano.geometry import apply, corner_displacements, corners, inverse
 from photonpano.protocols import LinearlyCorrectedSource, Source
-from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, fold, n_blocks
+from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
 from photonpano.residuals.prediction import Prediction
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, SpanResiduals
@@ -29,6 +29,8 @@ _FEWEST_SPANS = 64
 """A capture is divided into at least this many spans, if it has the frames."""
 _BATCH = 64
 """Spans that a thread measures at a time."""
+_PIXEL_STRIDE = 4
+"""One span in 4 is added to the sums of single pixels, which no other sum needs."""
 _PROBES = 8
 """Instants at which the noise of a shift is predicted."""
 _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
@@ -50,7 +52,7 @@ class Residuals:
         blocks: (h, w, 12) sums over time, for each block of the sensor: see `block_sums`.
         block_misfit: (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen.
         pixel_gain: (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted.
-        pixel_mean: (H, W) predicted photons of each pixel, all spans together.
+        pixel_mean: (H, W) predicted photons of each pixel, in one of four spans.
         cell_misfit: (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was
             seen.
         cell_count: (H', W') number of blocks that fell on each square.
@@ -161,7 +163,7 @@ def _shift_noise_px(prediction: Prediction, homographies: FloatArray) -> float:
     for homography in homographies:
         prediction.view(homography, images)
         sums = np.zeros((*n_blocks(prediction.frame_shape), N_SUMS), np.float32)
-        add_block_sums(nothing, nothing, 1.0, images[0], images[1], sums, nothing.copy(), nothing.copy())
+        add_block_sums(nothing, nothing, 1.0, images[0], images[1], sums)
         xx, xy, yy = sums[..., :3].sum(axis=(0, 1), dtype=np.float64)
         information = np.array([[xx, xy], [xy, yy]]) + 1e-12 * np.eye(2)
         noises.append(float(np.sqrt(np.trace(np.linalg.inv(information)) / 2)))
@@ -234,7 +236,9 @@ def _measured(
             counts = counts + masked
         prediction.view(homography, images)
         sums[:] = 0
-        add_block_sums(counts, dark, float(len(span)), images[0], images[1], sums, total.pixel_residual, total.pixel_mean)
+        add_block_sums(counts, dark, float(len(span)), images[0], images[1], sums)
+        if index % _PIXEL_STRIDE == 0:
+            add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
         places = np.floor(apply(prediction.canvas @ homography, middle.reshape(-1, 2)) / BLOCK_PX).astype(np.int64)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / max(prediction.frames_seen, 1.0))
