@@ -180,3 +180,16 @@ def test_run_masks_hot_pixels_by_itself(simulated: Callable[..., Path], tmp_path
     assert record["spec"]["corrections"] == "auto"
     masked = next(each for each in record["decisions"] if each["what"] == "still_pixels")
     assert masked["value"] == pytest.approx(0.1 * SHAPE[0] * SHAPE[1], rel=0.15)
+
+
+def test_run_divides_by_vignette(simulated: Callable[..., Path], tmp_path: Path) -> None:
+    """Left in, it doubles the error at least."""
+    errors = {}
+    for name, settings in {"clean": {}, "divided": {"lens": {"vignette": 0.8}}}.items():
+        capture = simulated(n_frames=600, **settings)
+        spec = spec_of(capture) | {"levels": 3, "refine": []}
+        if name == "divided":
+            errors["as read"] = scored(spec, capture, tmp_path / "as-read").trajectory.mean_px
+        errors[name] = scored(spec | {"corrections": "auto"}, capture, tmp_path / name).trajectory.mean_px
+    assert errors["divided"] < 1.5 * errors["clean"] + 0.02
+    assert errors["as read"] > 2 * errors["divided"]

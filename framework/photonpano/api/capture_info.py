@@ -96,7 +96,7 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
     """
     with build_source(plan) as read:
         marked = without_still_pixels(read)
-        source = marked if plan.masks_still_pixels else read
+        source = marked if plan.corrects_itself else read
         with one_thread_inside():
             summary = summarise(source, thread_count(plan.run.threads))
         stream, rate = source.info, source.info.frame_rate_hz
@@ -172,7 +172,7 @@ def _spec(plan: Plan) -> dict[str, Any]:
     """Return the spec of the capture, without defaults."""
     keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
     spec = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
-    return spec | ({} if plan.masks_still_pixels else {"corrections": plan.document["corrections"]})
+    return spec | ({} if plan.corrects_itself else {"corrections": plan.document["corrections"]})
 
 
 def _relative(value: Any) -> Any:

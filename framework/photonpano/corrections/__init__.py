@@ -15,6 +15,7 @@ from photonpano.corrections.masks import ColourFilter, Mask
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import CorrectedSource, corrected_source
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
+from photonpano.corrections.vignette import Vignette, divided_by, estimate_vignette
 
 _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
@@ -33,7 +34,10 @@ __all__ = [
     "DarkFrames",
     "HotPixels",
     "StillPixels",
+    "Vignette",
     "corrected_source",
+    "divided_by",
+    "estimate_vignette",
     "hot_in_the_dark",
     "measure_dark",
     "read_dark",

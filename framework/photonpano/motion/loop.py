@@ -59,6 +59,7 @@ def estimate_motion(
     reference: int,
     context: Context,
     until_converged: bool = False,
+    previous: Trajectory | None = None,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -73,13 +74,13 @@ def estimate_motion(
         reference: the frame whose homography is the identity.
         context: threads, progress, and `on_level`, which is called with each result.
         until_converged: stop as soon as a level changes the motion by no more than its expected error.
+        previous: the motion that is known so far; None at level 1.
 
     Raises:
         LocationError: too few exposures could be located.
         PluginError: a component failed, or broke its contract.
     """
     results: list[LevelResult] = []
-    previous: Trajectory | None = None
     for level in levels:
         clock = Stopwatch(context.threads)
         groups = resample(level, source.info.n_frames, clock)

@@ -38,7 +38,7 @@ def open_source(plan: Plan) -> Iterator[Source]:
         SpecError: a stage does not suit it.
     """
     built = build_source(plan)
-    with without_still_pixels(built) if plan.masks_still_pixels else built as source:
+    with without_still_pixels(built) if plan.corrects_itself else built as source:
         if problems := check_stream(plan, source.info):
             raise SpecError(problems)
         yield source

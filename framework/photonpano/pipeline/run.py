@@ -12,7 +12,7 @@ from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
-from photonpano.corrections import CorrectedSource
+from photonpano.corrections import CorrectedSource, Vignette, divided_by, estimate_vignette
 from photonpano.errors import InputError
 from photonpano.merging.panorama import render_panorama
 from photonpano.motion.frame_motion import motion_of_frames
@@ -20,7 +20,7 @@ from photonpano.motion.loop import estimate_motion
 from photonpano.pipeline.components import build_levels, build_refiners, open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import run_folder
-from photonpano.protocols import Source
+from photonpano.protocols import Source, Trajectory
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
@@ -82,6 +82,10 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)
         results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged)
+        if vignette := _vignette(plan, source, results[-1].trajectory):
+            decisions.append(vignette.decision)
+            source, last, known = divided_by(source, vignette), results[-1].level, results[-1].trajectory
+            results[-1:] = estimate_motion(source, [last], plan.graph, reference, context, previous=known)
         motion = motion_of_frames(results, source.info, reference)
         refiners = build_refiners(plan, source, decisions)
         explained = refine(source, motion, refiners, plan.render.tolerance_px, memory, context)
@@ -96,6 +100,14 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         folder.write_report(render_report(record, motion, panorama))
         finished(record)
     return RunResult(plan.output.directory, record, verdict)
+
+
+def _vignette(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
+    """Measure the vignette of a capture, unless its spec lists corrections, or a merger takes frames that have none."""
+    merged_singly = any(level.merge.contribution.name == "splat" for level in plan.levels)
+    if not plan.corrects_itself or source.info.kind != "binary" or merged_singly:
+        return None
+    return estimate_vignette(source, trajectory)
 
 
 def _require_photons(plan: Plan, source: Source) -> None:

@@ -213,8 +213,10 @@ def _measured(
     lever = middle - corners(shape).mean(axis=0)
     corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
     zeros = np.zeros(shape, np.uint32)
-    # Counts of the dark add their noise, although they are subtracted.
-    dark = np.zeros(shape, np.float32) if corrected is None else np.maximum(-corrected(zeros, 1), 0)
+    # Corrected counts are `slope * counts - n * dark`: counts of the dark, and of pixels that are less sensitive, add noise.
+    dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)
+    slope = corrected(zeros + 1, 1) + dark if corrected is not None and source.info.kind == "binary" else None
+    extra = np.maximum(dark, 0)
     masked = None if source.valid.all() else np.where(source.valid, np.float32(0), np.float32(np.nan))
     total = _Batch(
         np.zeros((len(spans), 5, 5)),
@@ -236,7 +238,10 @@ def _measured(
             counts = counts + masked
         prediction.view(homography, images)
         sums[:] = 0
-        add_block_sums(counts, dark, float(len(span)), images[0], images[1], sums)
+        if slope is not None:
+            lit = np.clip((images[0] + dark) / slope, 0, 1)
+            extra = np.maximum(slope**2 * lit * (1 - lit) - images[0] * (1 - images[0]), 0)
+        add_block_sums(counts, extra, float(len(span)), images[0], images[1], sums)
         if index % _PIXEL_STRIDE == 0:
             add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
         places = np.floor(apply(prediction.canvas @ homography, middle.reshape(-1, 2)) / BLOCK_PX).astype(np.int64)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from photonpano.corrections import Correction
 
 AUTO = "auto"
-"""`corrections: auto` is the default: nothing is rearranged, and the run masks what stands still in the frame."""
+"""`corrections: auto` is the default: the run masks what stands still, and divides by a vignette."""
 
 
 def resolved_corrections(data: Any, spec: WrittenSpec) -> tuple[Correction, ...] | None:

@@ -154,7 +154,7 @@ def _corrections(schemas: dict[type[BaseModel], Schema]) -> Schema:
     }
     return {
         "description": "what is done to frames first of all, in this order: names, or mappings of one name to its settings; "
-        "auto masks what stands still in the frame, and an empty list does nothing",
+        "auto masks what stands still in the frame and divides by a vignette, and an empty list does nothing",
         "default": AUTO,
         "anyOf": [{"enum": [AUTO, None]}, {"type": "array", "items": {"anyOf": [{"enum": alone}, one]}}],
     }

@@ -73,7 +73,7 @@ class Plan:
         file: the spec file, None for a spec that was built in Python.
         observers: the plugins that watch the run.
         decisions: choices that the spec leaves open and that reading it made: the source that recognises the capture.
-        masks_still_pixels: `corrections` is `auto`: the run masks what stands still in the frame.
+        corrects_itself: `corrections` is `auto`: the run masks what stands still, and divides by a vignette.
     """
 
     source: Choice
@@ -90,7 +90,7 @@ class Plan:
     file: Path | None = None
     observers: tuple[Observer, ...] = ()
     decisions: tuple[Decision, ...] = ()
-    masks_still_pixels: bool = False
+    corrects_itself: bool = False
 
     def place(self, where: str) -> Place:
         """Return where a value was written, by its path in `document`; for a default, where it would stand."""

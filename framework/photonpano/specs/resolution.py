@@ -143,7 +143,7 @@ class _Resolver:
             file=spec.place("").file,
             observers=self.catalog.observers,
             decisions=tuple(spec.decisions),
-            masks_still_pixels=corrections is None,
+            corrects_itself=corrections is None,
         )
 
     def sections_of(self, root: dict[str, Any], refiners: list[Any]) -> dict[str, list[str]]:

@@ -57,6 +57,6 @@ def test_override_changes_correction_settings(catalog: Catalog) -> None:
 @pytest.mark.parametrize(("written", "still"), [({}, True), ({"corrections": "auto"}, True), ({"corrections": []}, False)])
 def test_still_pixels_are_masked_unless_corrections_are_listed(written: dict[str, Any], still: bool, catalog: Catalog) -> None:
     plan = parse_spec({"version": 1, "source": {"use": "simulator"}} | written, catalog=catalog)
-    assert (plan.corrections, plan.masks_still_pixels) == ((), still)
-    assert parse_spec(plan.document, catalog=catalog).masks_still_pixels == still
+    assert (plan.corrections, plan.corrects_itself) == ((), still)
+    assert parse_spec(plan.document, catalog=catalog).corrects_itself == still
     assert list(plan.document)[:3] == ["version", "source", "corrections"]
