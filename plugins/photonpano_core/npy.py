@@ -35,6 +35,8 @@ _READ_BYTES = 4 * 1024**2
 """Bytes of the frames that are read at once."""
 
 
+_CHECKED = 16
+"""Frames whose values are checked before a run."""
 _NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
 
 
@@ -227,8 +229,18 @@ def _open(config: NpyConfig) -> NpyBits | NpySums:
     return NpySums(values, config.frames_per_sum, config.frame_rate_hz)
 
 
+def _read_some(config: NpyConfig) -> None:
+    """Read some frames; raises what opening the capture and reading them raises. A compressed file is not unpacked for that."""
+    _header(config)
+    if is_gzip(config.path):
+        return
+    with _open(config) as source:
+        for span in source.info.spread(_CHECKED, 1):
+            source.frames(span)
+
+
 def _check(config: NpyConfig) -> Sequence[str]:
-    return objections(_header, config)
+    return objections(_read_some, config)
 
 
 def _recognise(path: Path) -> Recognised | None:

@@ -179,6 +179,20 @@ def test_value_out_of_range_is_named_with_its_place(
             assert str(caught.value) == f"{path} holds the value {value} in frame 21, row 4, column 17; {remedy}"
 
 
+def test_check_reads_some_frames(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cube.npy", np.minimum(SUMS + 2, 299))
+    value = int(min(SUMS[0, 0, 0] + 2, 299))
+    for keys, remedy in (
+        ({"holds": "bits"}, NO_BIT),
+        (
+            {"holds": "sums", "frames_per_sum": 1},
+            "sums of frames_per_sum: 1 go from 0 to 1; correct frames_per_sum",
+        ),
+    ):
+        (problem,) = NPY.check(NpyConfig(path=path, **keys))
+        assert problem == f"{path} holds the value {value} in frame 0, row 0, column 0; {remedy}"
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [

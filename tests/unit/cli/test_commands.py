@@ -365,6 +365,9 @@ def test_plugins_show_prints_keys_and_valid_snippet(finished: Path, invoke: Call
         "frame_rate_hz",
         "width",
         "channel",
+        "bit_order",
+        "packed_along",
+        "height",
     ]
     assert "required" in table
     plan = parse_spec("version: 1\n" + snippet.replace('"<path>"', "cube.npy"), directory=finished)
