@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -37,6 +39,8 @@ _READ_BYTES = 4 * 1024**2
 
 _CHECKED = 16
 """Frames whose values are checked before a run."""
+_PLAIN = re.compile(r"[\w./~+-]+")
+"""Paths that YAML takes without quotes."""
 _NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
 
 
@@ -180,10 +184,11 @@ def contents_of(path: Path, header: NpyHeader) -> Content | None:
 
 def section_for(path: Path, holds: str, highest: int = 1) -> str:
     """Return the section of a spec that reads such a capture; `highest` is the largest value that was seen in it."""
+    written = str(path) if _PLAIN.fullmatch(str(path)) else json.dumps(str(path), ensure_ascii=False)
     if holds == "bits":
-        return f"source: {{use: npy, with: {{path: {path}, holds: bits}}}}"
+        return f"source: {{use: npy, with: {{path: {written}, holds: bits}}}}"
     keys = f"holds: sums, frames_per_sum: {highest}"
-    return f"source: {{use: npy, with: {{path: {path}, {keys}}}}}, with the number of binary frames in a sum if it is larger"
+    return f"source: {{use: npy, with: {{path: {written}, {keys}}}}}, with the number of binary frames in a sum if it is larger"
 
 
 def _header(config: NpyConfig) -> NpyHeader:

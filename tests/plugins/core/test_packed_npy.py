@@ -189,6 +189,11 @@ def test_check_says_what_to_write_for_another_layout(tmp_path: Path, clouds: Cal
     assert problem_of(tmp_path / "cube.npy", store(frames)) == message
 
 
+def test_path_in_the_line_to_write_is_quoted_where_yaml_needs_it(tmp_path: Path, clouds: Callable) -> None:
+    message = problem_of(tmp_path / "scan: 2, {a}.npy", clouds(n_frames=16))
+    assert str(message).endswith('write source: {use: npy, with: {path: "PATH", holds: bits}}')
+
+
 @pytest.mark.parametrize("keys", [{"bit_order": "big"}, {"bit_order": "little"}, {"packed_along": "width"}])
 def test_layout_that_the_spec_states_is_believed(tmp_path: Path, clouds: Callable, keys: dict[str, Any]) -> None:
     for packed in (np.packbits(clouds(), axis=2, bitorder="little"), clouds()):
