@@ -38,6 +38,7 @@ from .pipeline.forecast import Forecast as Forecast
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run
 from .protocols import Interpolator as Interpolator
+from .protocols import KeepsHypotheses as KeepsHypotheses
 from .protocols import KnowsTruth as KnowsTruth
 from .protocols import LinearlyCorrectedSource as LinearlyCorrectedSource
 from .protocols import Locator as Locator

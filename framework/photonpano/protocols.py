@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Protocol, runtime_checkable
 
@@ -181,6 +181,28 @@ class Locator(Protocol):
             moving: what `describe` returned for the moving exposure.
             fixed: what `describe` returned for the fixed exposure.
             initial: (3, 3) map to start from, None while no motion is known.
+        """
+        ...
+
+
+@runtime_checkable
+class KeepsHypotheses(Locator, Protocol):
+    """A locator that lists where an exposure may lie, as where a scene repeats.
+
+    At the first level, the framework decides where each registration of such a locator starts: at the motion that short spans
+    of frames show, or where they show none, at the hypothesis that continues the motion of the exposures before. Other locators
+    get no initial map there.
+    """
+
+    def hypotheses(self, moving: Any, fixed: Any) -> Sequence[Homography]:
+        """Return motions to start from that are nearly as likely as each other, likeliest first; empty without texture.
+
+        Convention:
+            As in `register`: (3, 3) maps, pixels of `moving` to pixels of `fixed`.
+
+        Args:
+            moving: what `describe` returned for the moving exposure.
+            fixed: what `describe` returned for the fixed exposure.
         """
         ...
 

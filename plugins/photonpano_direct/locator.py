@@ -9,7 +9,7 @@ import numpy as np
 
 from photonpano import Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import translation
-from photonpano.locating import ALL_PARAMETERS, NOTHING_SEEN, free_parameters
+from photonpano.locating import ALL_PARAMETERS, NOTHING_SEEN, correlation_peaks, correlation_surface, free_parameters
 from photonpano.photometry import Similarity
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
@@ -22,6 +22,10 @@ _EXACT_PX = 0.1
 """Coarser layers are not considered if the expected error of a corner is below this."""
 _COARSE_TOLERANCE = 12
 """Tolerance of the coarser layers, which only initialise the finest, relative to `converged_px`."""
+_PEAK_PX = 0.5
+"""Standard deviation of the peaks of the phase correlation, px of the coarsest layer."""
+_RIVAL = 0.7
+"""Peaks of at least this share of the highest one are hypotheses, too."""
 _BLUR_DIFFERENCE = 0.1
 """Largest residual that different motion blur explains, as a fraction of the contrast. In much light this is many times the
 photon noise."""
@@ -37,6 +41,13 @@ class DirectLocator:
         """Return the pyramid of the exposure on the scale on which photon noise is uniform."""
         return pyramid_of(exposure, self._config.pyramid_levels, self._config.blur_px)
 
+    def hypotheses(self, moving: Pyramid, fixed: Pyramid) -> Sequence[Homography]:
+        """Return shifts to start from, likeliest first; see `photonpano.KeepsHypotheses`."""
+        coarsest = moving.layers[-1], fixed.layers[-1]
+        if not all(layer.weight.any() for layer in coarsest):
+            return []
+        return _hypotheses(*coarsest, len(moving.layers))
+
     def register(self, moving: Pyramid, fixed: Pyramid, initial: Homography | None) -> Located | NotLocated:
         """Align; see `photonpano.Locator`.
 
@@ -48,7 +59,7 @@ class DirectLocator:
             return NotLocated(NOTHING_SEEN)
         n_layers = len(moving.layers)
         if initial is None:
-            initial = _shift_between(moving.layers[-1], fixed.layers[-1], n_layers)
+            initial = next(iter(self.hypotheses(moving, fixed)), np.eye(3))
         prior_mean = homography = np.array(initial, dtype=np.float64)
         found: list[tuple[float, Aligned]] = []
         for depth in reversed(range(n_layers)):
@@ -127,10 +138,14 @@ def _best(found: Sequence[tuple[float, Aligned]]) -> tuple[float, Homography, Qu
     return best
 
 
-def _shift_between(moving: Layer, fixed: Layer, n_layers: int) -> Homography:
-    """Return the shift between the coarsest layers by OpenCV's phase correlation, in pixels of the finest layer."""
+def _hypotheses(moving: Layer, fixed: Layer, n_layers: int) -> list[Homography]:
+    """Return the shifts at which the phase correlation of the coarsest layers peaks, in pixels of the finest layer."""
     height, width = moving.image.shape
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
     flat = [np.where(layer.weight > 0, layer.image - layer.image[layer.weight > 0].mean(), 0) for layer in (moving, fixed)]
-    (x, y), _ = cv2.phaseCorrelate(flat[0].astype(np.float32), flat[1].astype(np.float32), window)
-    return rescaled(translation(x, y), 2.0 ** (n_layers - 1))
+    spectra = [np.fft.rfft2(window * image) for image in flat]
+    surface = correlation_surface(spectra[1] * spectra[0].conj(), (height, width), _PEAK_PX)
+    if surface is None:
+        return []
+    shifts, _ = correlation_peaks(surface, _RIVAL)
+    return [rescaled(translation(x, y), 2.0 ** (n_layers - 1)) for x, y in shifts]

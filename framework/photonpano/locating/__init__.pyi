@@ -19,6 +19,8 @@ from .fitting import MIN_NOISE_PX as MIN_NOISE_PX
 from .fitting import Fit as Fit
 from .fitting import fit_homography as fit_homography
 from .images import motion_from_images as motion_from_images
+from .phase import correlation_peaks as correlation_peaks
+from .phase import correlation_surface as correlation_surface
 from .phase import shift_between as shift_between
 from .phase import shift_by_phase as shift_by_phase
 from .points import Matches as Matches

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -46,19 +48,59 @@ def shift_by_phase(
         gaussian_peak: whether the peak is located by a Gaussian through three values, and not by a parabola.
     """
     spectra = [fft.rfft2(image) for image in (moving, fixed)]
-    cross = spectra[1] * spectra[0].conj()
+    surface = correlation_surface(spectra[1] * spectra[0].conj(), moving.shape, peak_px)
+    if surface is None:
+        return None
+    row, column = np.unravel_index(int(surface.argmax()), surface.shape)
+    return _refined(surface, int(row), int(column), gaussian_peak)
+
+
+def correlation_surface(cross: NDArray[np.complexfloating], shape: tuple[int, ...], peak_px: float) -> FloatArray | None:
+    """Return the phase correlation of two images at each cyclic shift, (H, W), row by row from 0; None without texture.
+
+    Args:
+        cross: (H, W // 2 + 1) spectrum of the fixed image times the conjugate spectrum of the moving one. Spectra of several
+            pairs with one shift may be summed.
+        shape: (height, width) of the images.
+        peak_px: standard deviation of the peak, in px.
+    """
     amplitude = np.abs(cross)
     if not amplitude.max() > 0:
         return None
-    height, width = moving.shape
-    down, across = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
-    blur = np.exp(-2 * (np.pi * peak_px) ** 2 * (down**2 + across**2))
-    surface = fft.irfft2(blur * cross / np.maximum(amplitude, 1e-12 * amplitude.max()), s=moving.shape)
-    row, column = np.unravel_index(int(surface.argmax()), surface.shape)
-    y = row + _vertex(surface[[row - 1, row, (row + 1) % height], column], gaussian_peak)
-    x = column + _vertex(surface[row, [column - 1, column, (column + 1) % width]], gaussian_peak)
+    return np.asarray(fft.irfft2(_blur(shape, peak_px) * cross / np.maximum(amplitude, 1e-12 * amplitude.max()), s=shape))
+
+
+def correlation_peaks(surface: FloatArray, least: float, most: int = 8) -> tuple[FloatArray, FloatArray]:
+    """Return the shifts (x, y) of the highest local maxima of a phase correlation, (P, 2) in px, and their heights, (P,).
+
+    Args:
+        surface: (H, W), from `correlation_surface`.
+        least: height of the lowest peak, as a share of the highest.
+        most: largest number of peaks, the highest first.
+    """
+    padded = np.pad(surface.astype(np.float32), 1, mode="wrap")
+    highest_near = cv2.dilate(padded, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    rows, columns = np.nonzero((padded[1:-1, 1:-1] >= highest_near) & (surface >= least * surface.max()))
+    order = np.argsort(-surface[rows, columns], kind="stable")[:most]
+    shifts = [_refined(surface, int(rows[index]), int(columns[index]), gaussian=True) for index in order]
+    return np.array(shifts).reshape(-1, 2), np.asarray(surface[rows[order], columns[order]])
+
+
+def _refined(surface: FloatArray, row: int, column: int, gaussian: bool) -> FloatArray:
+    """Return the shift (x, y) of a local maximum, to a fraction of a pixel."""
+    height, width = surface.shape
+    y = row + _vertex(surface[[row - 1, row, (row + 1) % height], column], gaussian)
+    x = column + _vertex(surface[row, [column - 1, column, (column + 1) % width]], gaussian)
     # Shifts beyond half of the image come out as negative ones.
     return np.array([(x + width / 2) % width - width / 2, (y + height / 2) % height - height / 2])
+
+
+@cache
+def _blur(shape: tuple[int, ...], peak_px: float) -> FloatArray:
+    """Return the spectrum of a Gaussian: (H, W // 2 + 1)."""
+    height, width = shape
+    down, across = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
+    return np.asarray(np.exp(-2 * (np.pi * peak_px) ** 2 * (down**2 + across**2)))
 
 
 def _window(seen: BoolArray) -> NDArray[np.float32]:

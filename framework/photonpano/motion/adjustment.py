@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,10 @@ from photonpano.values import BoolArray, FloatArray, Located
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3
 """A step that moves no corner by more than about this has converged."""
+MAX_HALVINGS = 8
+"""A step that raises the cost is halved up to this many times."""
+NO_WORSE = 1e-6
+"""Rounding errors may raise the cost by this share."""
 CAUCHY = 2.385
 """Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise)."""
 OUTLIER = 8.0
@@ -84,9 +89,11 @@ class Adjustment:
             free = self._free
             step = np.zeros(8 * self._n_nodes)
             step[free] = -_solved((jacobians.T @ jacobians)[free][:, free], (jacobians.T @ residuals)[free])
-            change = np.linalg.inv(self._unit) @ from_parameters(step.reshape(-1, 8)) @ self._unit
-            homographies = normalised(homographies @ change)
-            weights = self._robust_weights(self._norms(homographies), kept)
+            stepped = self._stepped(homographies, step, weights, float(residuals @ residuals))
+            if stepped is None:
+                break
+            homographies, norms = stepped
+            weights = self._robust_weights(norms, kept)
             if np.abs(step).max() * self._half < CONVERGED_PX:
                 break
         # The anchor is fixed; this removes rounding errors.
@@ -119,6 +126,24 @@ class Adjustment:
         changes = np.zeros((8 * self._n_nodes, SAMPLES))
         changes[free] = _solved(normal[free][:, free], (jacobians.T @ draws)[free])
         return self._in_parameters(homographies, blocks), self._corner_std_px(homographies, changes)
+
+    def _stepped(
+        self, homographies: FloatArray, step: FloatArray, weights: FloatArray, cost: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return the homographies after a step, halved until the cost falls, and the norms there; None if it never does.
+
+        A chain of many frames is far from linear: the perspective of the first bends the path of all others.
+        """
+        for _ in range(MAX_HALVINGS):
+            # Too large a step may leave homographies that cannot be inverted.
+            with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
+                change = np.linalg.inv(self._unit) @ from_parameters(step.reshape(-1, 8)) @ self._unit
+                changed = normalised(homographies @ change)
+                norms = self._norms(changed)
+                if 8 * weights @ norms**2 <= cost * (1 + NO_WORSE):
+                    return changed, norms
+            step = step / 2
+        return None
 
     @property
     def _free(self) -> BoolArray:

@@ -67,18 +67,21 @@ def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
     return np.asarray(np.argsort(by_size)[labels])
 
 
-def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> GraphSolution:
+def solve(
+    n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int], start: FloatArray | None = None
+) -> GraphSolution:
     """Solve the graph: find the homographies with the least residuals of all located edges.
 
     Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
-    with Cauchy weights, from a spanning tree of edges to the nearest exposures. Outliers are dropped, unless the graph would
-    fall apart, and it is solved again.
+    with Cauchy weights, from a spanning tree of edges to the nearest exposures unless a start is given. Outliers are dropped,
+    unless the graph would fall apart, and it is solved again.
 
     Args:
         n_nodes: number of exposures.
         edges: pairs of exposures; those that are not located are skipped.
         anchor: the node whose homography is the identity.
         frame_shape: (height, width) of a frame.
+        start: (N, 3, 3) homographies to any plane, such as those of a solution without some of the edges.
     """
     located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
     pairs = _pairs(edges)
@@ -94,7 +97,10 @@ def solve(n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[i
         return GraphSolution(homographies, located, (), 0.0, lambda: (np.full((1, 8, 8), np.nan), np.full(1, np.nan)))
     pairs = pairs[tied]
     observed = np.array([motion.homography for motion in motions])
-    _compose_tree(homographies, order[1:], parents, pairs, observed)
+    if start is None:
+        _compose_tree(homographies, order[1:], parents, pairs, observed)
+    else:
+        homographies[located] = normalised(inverse(start[anchor]) @ start[located])
 
     compact = np.cumsum(located) - 1
     adjustment = Adjustment(compact[pairs], int(compact[anchor]), observed, motions, frame_shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.threads import thread_pool
-from photonpano.values import Edge, FloatArray, FrameSpan, Group, NotLocated
+from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +32,7 @@ class LocatedLevel:
             single exposure.
         std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
         frame_shape: (height, width) of a frame.
+        ambiguity: pairs that fit the scene at more than one place; None where there are none.
     """
 
     groups: Sequence[Group]
@@ -41,6 +42,7 @@ class LocatedLevel:
     information: FloatArray | None
     std_px: FloatArray
     frame_shape: tuple[int, int]
+    ambiguity: Ambiguity | None = None
 
     @property
     def instants(self) -> FloatArray:
@@ -82,9 +84,9 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
         PluginError: a locator failed, or broke its contract.
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
-    registrar = Registrar(exposures)
     pairs = pairs_of(groups, graph.skips)
     with thread_pool(context.threads) as pool:
+        registrar = Registrar(exposures, pool)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
@@ -94,11 +96,29 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
-            solution = solve(len(groups), edges, anchor, shape)
+            solution = solve(len(groups), edges, anchor, shape, registrar.to_plane)
             candidates = closure_candidates(groups, solution, shape, graph)
         closures = tuple(registrar.closures(candidates, solution.homographies, pool))
     with exposures.clock("locate"):
         if closures:
-            solution = solve(len(groups), edges + closures, anchor, shape)
+            solution = solve(len(groups), edges + closures, anchor, shape, registrar.to_plane)
         information, std_px = solution.assess()
-    return LocatedLevel(groups, edges + closures, closures, solution, information if len(std_px) > 1 else None, std_px, shape)
+    return LocatedLevel(
+        groups,
+        edges + closures,
+        closures,
+        solution,
+        information if len(std_px) > 1 else None,
+        std_px,
+        shape,
+        _ambiguity(level.number, registrar.alternatives_px, edges),
+    )
+
+
+def _ambiguity(level: int, alternatives_px: Mapping[tuple[int, int], float], edges: Sequence[Edge]) -> Ambiguity | None:
+    """Return which located pairs may as well have another motion, and how far that is away."""
+    located = {(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)}
+    pairs = tuple(sorted(located & alternatives_px.keys()))
+    if not pairs:
+        return None
+    return Ambiguity(level, pairs, float(np.median([alternatives_px[pair] for pair in pairs])))

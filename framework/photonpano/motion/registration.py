@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -15,8 +16,11 @@ from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import FrameHomography, NamedLocator
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of, shared_share
+from photonpano.motion.start import starting_motion
+from photonpano.motion.tracking import Place, Track
+from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import in_order, lagging
-from photonpano.values import Edge, FloatArray, Located, NotLocated, VirtualExposure
+from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated, VirtualExposure
 
 BRIDGE = 3
 """If no pair of an exposure with earlier ones is located, pairs with this many predecessors are tried."""
@@ -49,16 +53,23 @@ class Registrar:
 
     Attributes:
         contrasts: how much there is to see in each exposure described so far, by its number.
+        to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
-    def __init__(self, exposures: VirtualExposures) -> None:
+    def __init__(self, exposures: VirtualExposures, pool: ThreadPoolExecutor) -> None:
         self._exposures, self._level, self._clock = exposures, exposures.level, exposures.clock
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
-        self._to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))
-        self._from_plane = None if self._to_plane is None else inverse(self._to_plane)
+        self.to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))
+        self._from_plane = None if self.to_plane is None else inverse(self.to_plane)
+        self._track = self._started(pool) if exposures.previous is None else None
         self._independent = independent_share(exposures.groups)
         self._described: dict[int, _Described] = {}
         self.contrasts: dict[int, Contrast] = {}
+
+    @property
+    def alternatives_px(self) -> Mapping[tuple[int, int], float]:
+        """Of the pairs that may as well have another motion: how far that is from where their registration started."""
+        return {} if self._track is None else self._track.alternatives_px
 
     def edges(
         self, pairs: Sequence[tuple[int, int]], pool: ThreadPoolExecutor, threads: int, advance: Callable[[int], None]
@@ -78,7 +89,7 @@ class Registrar:
             needed_until[fixed] = max(needed_until[fixed], moving)
         # Pairs of several exposures are under way at once, so that no thread waits for the last pair of one.
         for moving, jobs in lagging(self._submitted(partners, pool, threads), threads):
-            found = [job.result() for job in jobs]
+            found = [edge for job in jobs for edge in job.result()]
             if found and not any(isinstance(edge.motion, Located) for edge in found):
                 found += self._bridge(moving, partners[moving])
             yield from found
@@ -109,20 +120,40 @@ class Registrar:
 
     def _submitted(
         self, partners: Mapping[int, Sequence[int]], pool: ThreadPoolExecutor, threads: int
-    ) -> Iterator[tuple[int, list[Future[Edge]]]]:
+    ) -> Iterator[tuple[int, list[Future[list[Edge]]]]]:
         """Describe one exposure after the other; yield each with its pairs, which are being registered."""
         for moving, described in enumerate(in_order(self._describe, partners, threads, pool)):
             self._described[moving], self.contrasts[moving] = described, described.contrast
-            yield (
-                moving,
-                [pool.submit(self._register, moving, fixed, self._expected(moving, fixed)) for fixed in partners[moving]],
-            )
+            if self._track is not None:
+                yield moving, [pool.submit(self._register_along, self._track, moving, partners[moving])]
+            else:
+                yield moving, [pool.submit(self._register_each, moving, [fixed]) for fixed in partners[moving]]
+
+    def _register_each(self, moving: int, partners: Sequence[int]) -> list[Edge]:
+        return [self._register(moving, fixed, self._expected(moving, fixed)) for fixed in partners]
+
+    def _register_along(self, track: Track, moving: int, partners: Sequence[int]) -> list[Edge]:
+        """Register an exposure of the first level with others; the nearest one tells where it lies in those further away."""
+        place: Place | None = None
+        foreseen: Place | None = None
+        found: list[Edge] = []
+        try:
+            for fixed in sorted(partners, reverse=True):
+                expected = track.expected(place, moving, fixed, partial(self._hypotheses, moving, fixed))
+                found.append(self._register(moving, fixed, expected, guessed=True))
+                if place is None and isinstance(motion := found[-1].motion, Located):
+                    place = track.placed(moving, fixed, motion.homography)
+                elif foreseen is None and expected is not None:
+                    foreseen = track.placed(moving, fixed, expected)
+        finally:
+            track.settle(moving, place or foreseen)
+        return found[::-1]
 
     def _bridge(self, moving: int, tried: Sequence[int]) -> Iterator[Edge]:
         """Register an exposure with its predecessors, until one is located."""
         for fixed in range(moving - 1, max(moving - BRIDGE, 0) - 1, -1):
             if fixed not in tried:
-                edge = self._register(moving, fixed, self._expected(moving, fixed))
+                edge = self._register(moving, fixed, self._expected(moving, fixed), guessed=self._track is not None)
                 yield edge
                 if isinstance(edge.motion, Located):
                     return
@@ -163,19 +194,52 @@ class Registrar:
             return described.features[locator.name]
 
     def _expected(self, moving: int, fixed: int) -> FrameHomography | None:
-        """Return the motion of a pair that is known so far; None at the first level."""
-        if self._to_plane is None or self._from_plane is None:
+        """Return the motion of a pair that is known so far; None at the first level, unless both exposures are tracked."""
+        if self._track is not None:
+            return self._track.expected(self._track.place(moving), moving, fixed, partial(self._hypotheses, moving, fixed))
+        if self.to_plane is None or self._from_plane is None:
             return None
-        return FrameHomography(self._from_plane[fixed] @ self._to_plane[moving])
+        return FrameHomography(self._from_plane[fixed] @ self.to_plane[moving])
 
-    def _register(self, moving: int, fixed: int, expected: FrameHomography | None) -> Edge:
-        """Pass a pair to one locator after the other, until one locates it."""
+    def _started(self, pool: ThreadPoolExecutor) -> Track | None:
+        """Measure how the image moves, for a first level whose locators make use of it."""
+        level, groups = self._level, self._exposures.groups
+        if not any(isinstance(locator.component, KeepsHypotheses) for locator in level.locators):
+            return None
+        with self._clock("locate"):
+            start = starting_motion(self._exposures.source, groups, pool)
+        return Track(start, instants_of(groups), self._exposures.frame_shape)
+
+    def _hypotheses(self, moving: int, fixed: int) -> list[Homography]:
+        """Return what the first locator that keeps hypotheses makes of a pair, in pixels of frames; none of blank exposures."""
+        for locator in self._level.locators:
+            component = locator.component
+            if not isinstance(component, KeepsHypotheses) or self.contrasts[moving].blank or self.contrasts[fixed].blank:
+                continue
+            features = self._features(locator, moving), self._features(locator, fixed)
+            with self._clock("locate"), self._level.attributing(locator):
+                found = [require_valid(Located(each)) for each in component.hypotheses(*features)]
+            return [self._level.in_frame_px(each).homography for each in found if isinstance(each, Located)]
+        return []
+
+    def _register(self, moving: int, fixed: int, expected: FrameHomography | None, guessed: bool = False) -> Edge:
+        """Pass a pair to one locator after the other, until one locates it.
+
+        Args:
+            moving: number of the later exposure.
+            fixed: number of the earlier one.
+            expected: the motion known so far.
+            guessed: whether that is a guess of the first level, which only locators that keep hypotheses start from.
+        """
         for index in (moving, fixed):
             if blank := self.contrasts[index].blank:
                 return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
+        if expected is not None and (reason := why_implausible(expected, self._exposures.frame_shape)):
+            return Edge(moving, fixed, NotLocated(f"by the motion known so far, {reason}"))
         failures: dict[str, NotLocated] = {}
         for locator in self._level.locators:
-            motion = self._located_by(locator, moving, fixed, expected)
+            starts = not guessed or isinstance(locator.component, KeepsHypotheses)
+            motion = self._located_by(locator, moving, fixed, expected if starts else None)
             if isinstance(motion, Located):
                 return Edge(moving, fixed, motion, locator.name)
             failures[locator.name] = motion

@@ -268,6 +268,13 @@ def level_warnings(results: Sequence[LevelResult]) -> list[str]:
                 f"level {result.level.number}: {len(lost)} of {len(groups)} exposures are not located "
                 f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
             )
+        if ambiguity := located.ambiguity:
+            moving, fixed = ambiguity.pairs[0]
+            warnings.append(
+                f"level {result.level.number}: {len(ambiguity.pairs)} of {len(located.edges)} pairs fit the scene as well "
+                f"{ambiguity.alternative_px:.0f} px away, since it repeats ({groups[moving]} onto {groups[fixed]}"
+                f"{' and others' if len(ambiguity.pairs) > 1 else ''}); the slower motion was taken"
+            )
         if located.solution.outliers:
             dropped = [located.edges[index] for index in located.solution.outliers]
             first = f"{groups[dropped[0].moving]} onto {groups[dropped[0].fixed]}"

@@ -4,10 +4,11 @@ from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, F
 from photonpano.values.capture import CaptureSummary, Decision, DecisionValue, StreamInfo
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
-from photonpano.values.motion import Edge, Located, NotLocated
+from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated
 from photonpano.values.refinement import Refined, SpanResiduals
 
 __all__ = [
+    "Ambiguity",
     "BoolArray",
     "CaptureSummary",
     "Counts",

@@ -57,3 +57,18 @@ class Edge:
     fixed: int
     motion: Located | NotLocated
     locator: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ambiguity:
+    """Pairs of a level that fit a scene that repeats at more than one place, and that nothing decided between.
+
+    Attributes:
+        level: its number, from 1.
+        pairs: (moving, fixed) numbers of the exposures of each pair, in order.
+        alternative_px: how far from the motion taken the other one is, in px of a frame: the median of the pairs.
+    """
+
+    level: int
+    pairs: tuple[tuple[int, int], ...]
+    alternative_px: float

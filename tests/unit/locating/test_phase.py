@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano.locating import View, shift_between, shift_by_phase
+from photonpano.locating import View, correlation_peaks, correlation_surface, shift_between, shift_by_phase
 
 SHAPE = (80, 120)
 
@@ -24,3 +24,19 @@ def test_shift_between_returns_none_without_contrast_or_overlap() -> None:
     ones, left = np.ones(SHAPE, np.float32), np.broadcast_to(np.arange(SHAPE[1]) < 60, SHAPE).astype(np.float32)
     assert shift_between(View(ones, ones, 1.0), View(ones, ones, 1.0)) is None
     assert shift_between(View(noise(), left, 1.0), View(noise(), 1 - left, 1.0)) is None
+
+
+def test_correlation_peaks_are_in_order_of_height_and_to_a_fraction_of_a_pixel() -> None:
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    peaks = [(0.7, -20.3, 0.0), (1.0, 10.2, 5.4), (0.2, 0.0, 30.0)]
+    gaussians = [
+        height * np.exp(-((((x - right + 60) % 120) - 60) ** 2 + (((y - down + 40) % 80) - 40) ** 2) / 2)
+        for height, right, down in peaks
+    ]
+    shifts, heights = correlation_peaks(sum(gaussians), 0.3)
+    np.testing.assert_allclose(shifts, [[10.2, 5.4], [-20.3, 0]], atol=0.02)
+    np.testing.assert_allclose(heights, [1, 0.7], rtol=0.15)
+
+
+def test_correlation_surface_is_none_without_texture() -> None:
+    assert correlation_surface(np.zeros((80, 61), complex), SHAPE, 1.0) is None

@@ -1,0 +1,237 @@
+"""The speed of the image before the first level, from sums of a few frames, whose shifts are too small to be mistaken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from photonpano.geometry import translation
+from photonpano.locating import correlation_peaks, correlation_surface
+from photonpano.motion.pairs import lengths_of
+from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.values import FloatArray, FrameSpan, Group
+
+_SPANS = 16
+"""A window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur."""
+_SHORTEST = {"binary": 4, "intensity": 1}
+"""Frames of the shortest span: sums of fewer binary frames are mostly noise."""
+_SIDE_PX = 64
+"""Pixels are binned until the shorter side has about 64 of them."""
+_PEAK_PX = 1.0
+"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_SIGNIFICANT = 7.0
+"""Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5."""
+_STD_PER_MEDIAN = 1.4826
+"""Standard deviation of Gaussian numbers over the median of their magnitudes."""
+_RIVAL = 0.6
+"""Peaks of at least this share of the highest one are kept as hypotheses."""
+_EXACT_PX = 4.0
+"""Spans are doubled until the image moves by this many binned pixels from one to the next, which determines the speed."""
+_TRACKED_PX = 2.0
+"""A peak of doubled spans lies within this many binned pixels of twice the shift of single ones."""
+_CONTINUITY_PX = 1.0
+"""Standard deviation of the change of a shift, in binned pixels, from one window to the next."""
+_SLOWER = 3.0
+"""A motion is taken for granted, and one that is this many times as fast is not considered."""
+_TIE = 4.0
+"""Hypotheses whose log likelihoods differ by less than this cannot be told apart."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """What the image may do within one window.
+
+    Attributes:
+        velocities: (P, 2) in px of a frame per frame period, likeliest first.
+        heights: (P,) of the peaks, as shares of the highest.
+        px_per_frame: velocity that moves the image by one binned pixel between spans.
+    """
+
+    velocities: FloatArray
+    heights: FloatArray
+    px_per_frame: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartingMotion:
+    """A motion without rotation, from the velocity of the image in windows of the length of a group.
+
+    Attributes:
+        instants: (N,) centres of the windows in which the velocity was found.
+        velocities: (N, 2) of the image there, in px of a frame per frame period.
+        alternatives: (N, 2) velocities that are as likely; NaN where there is none.
+        reach: frames from the nearest of these instants within which the motion is known.
+    """
+
+    instants: FloatArray
+    velocities: FloatArray
+    alternatives: FloatArray
+    reach: float
+
+    def between(self, moving: float, fixed: float) -> FloatArray | None:
+        """Return the homography from the frame at one instant to that at another: (3, 3); None where it is not known."""
+        points = self._points(moving, fixed)
+        if np.abs(points[:, None] - self.instants).min(axis=1).max() > self.reach:
+            return None
+        return translation(*-self._integral(self.velocities, points))
+
+    def alternative_px(self, moving: float, fixed: float) -> float:
+        """Return how far from that motion an equally likely one is, in px; 0 if there is none."""
+        points = self._points(moving, fixed)
+        differences = np.nan_to_num(self.alternatives - self.velocities)
+        return float(np.linalg.norm(self._integral(differences, points)))
+
+    def _points(self, moving: float, fixed: float) -> FloatArray:
+        return np.linspace(fixed, moving, 9)
+
+    def _integral(self, velocities: FloatArray, points: FloatArray) -> FloatArray:
+        at = np.stack([np.interp(points, self.instants, each) for each in velocities.T], axis=1)
+        return np.asarray(np.trapezoid(at, points, axis=0))
+
+
+def starting_motion(source: Source, groups: Sequence[Group], pool: ThreadPoolExecutor) -> StartingMotion | None:
+    """Measure the velocity of the image all over a capture, before any motion is known.
+
+    The capture is divided into windows of the length of a group, and each of them into short spans of frames. The phase
+    correlations of successive spans are averaged over the window; their peaks are the hypotheses. Of several, continuity from
+    window to window decides.
+
+    Returns:
+        None if no window has a significant peak.
+    """
+    n_frames = source.info.n_frames
+    length = min(n_frames, max(2 * _SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
+    starts = np.rint(np.linspace(0, n_frames - length, max(1, n_frames // length))).astype(int).tolist()
+    found = list(pool.map(partial(_hypotheses, source, length), starts))
+    known = [(start + (length - 1) / 2, each) for start, each in zip(starts, found, strict=True) if each is not None]
+    if not known:
+        return None
+    velocities, alternatives = _continuous([each for _, each in known])
+    return StartingMotion(np.array([instant for instant, _ in known]), velocities, alternatives, 1.5 * length)
+
+
+def _hypotheses(source: Source, length: int, start: int) -> Hypotheses | None:
+    """Return the velocities that a window may have; None if no peak is significant."""
+    short = max(_SHORTEST[source.info.kind], length // _SPANS)
+    spans = [FrameSpan(first, first + short) for first in range(start, start + length - short + 1, short)]
+    binned = [_binned(source, span) for span in spans]
+    window = _window(binned[0].shape)
+    spectra = np.array([fft.rfft2(window * (image - image.mean())) for image in binned])
+    found = _velocities(spectra, binned[0].shape)
+    if found is None:
+        return None
+    shifts, heights, doubled = found
+    px_per_frame = _binning(source) / (short * doubled)
+    sizes = np.linalg.norm(shifts, axis=1)
+    slow = sizes <= _SLOWER * max(1.0, sizes.min())
+    return Hypotheses(shifts[slow] * px_per_frame, heights[slow] / heights[0], px_per_frame)
+
+
+def _velocities(spectra: NDArray[np.complexfloating], shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray, int] | None:
+    """Return the (P, 2) shifts between successive images, in their pixels, the heights of the peaks, and the spans of an image.
+
+    Images are summed in twos until a peak is significant; then on, to make the shift exact, as long as the peak is found again.
+    """
+    doubled = 1
+    while len(spectra) >= 2:
+        surface = _surface(spectra, shape)
+        if surface is not None and surface.max() >= _SIGNIFICANT:
+            shifts, heights = correlation_peaks(surface, _RIVAL)
+            return _refined(spectra, shape, shifts), heights, doubled
+        spectra, doubled = _summed_in_twos(spectra), 2 * doubled
+    return None
+
+
+def _refined(spectra: NDArray[np.complexfloating], shape: tuple[int, ...], shifts: FloatArray) -> FloatArray:
+    """Return (P, 2) shifts more exactly, from sums of more spans, whose shifts are larger."""
+    refined, doubled, moving = shifts.copy(), 1, np.ones(len(shifts), dtype=bool)
+    while len(spectra) >= 4 and moving.any():
+        spectra, doubled = _summed_in_twos(spectra), 2 * doubled
+        moving &= np.linalg.norm(refined, axis=1) * doubled < 2 * _EXACT_PX
+        surface = _surface(spectra, shape)
+        if surface is None:
+            break
+        peaks, heights = correlation_peaks(surface, 0.0, most=32)
+        peaks = peaks[heights >= _SIGNIFICANT]
+        for index in np.flatnonzero(moving):
+            distances = np.linalg.norm(peaks - doubled * refined[index], axis=1)
+            moving[index] = bool(len(peaks)) and distances.min() <= _TRACKED_PX
+            if moving[index]:
+                refined[index] = peaks[distances.argmin()] / doubled
+    return refined
+
+
+def _surface(spectra: NDArray[np.complexfloating], shape: tuple[int, ...]) -> FloatArray | None:
+    """Return the phase correlation of successive images, in standard deviations of its noise."""
+    surface = correlation_surface((spectra[1:] * spectra[:-1].conj()).sum(axis=0), shape, _PEAK_PX)
+    # The median, since a scene that repeats has many peaks.
+    return None if surface is None else surface / (_STD_PER_MEDIAN * max(float(np.median(np.abs(surface))), 1e-12))
+
+
+def _summed_in_twos(spectra: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+    even = len(spectra) // 2 * 2
+    return np.asarray(spectra[:even:2] + spectra[1:even:2])
+
+
+def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
+    """Choose one hypothesis of each window, so that together they are the likeliest (Viterbi 1967).
+
+    A hypothesis is the likelier the higher its peak, and the nearer it is to that of the next window. Of the first
+    window, slow ones are likelier, by the square of the speed: before it is known, its order of magnitude may be any.
+
+    Returns:
+        (N, 2) velocities, and the (N, 2) velocities that are as likely; NaN where there is none.
+    """
+    scores = [np.log(each.heights) for each in windows]
+    scores[0] = scores[0] - 2 * np.log(np.maximum(np.linalg.norm(windows[0].velocities, axis=1), windows[0].px_per_frame))
+    links = [_link(before, after) for before, after in pairwise(windows)]
+    forward, backward = [scores[0]], [np.zeros(len(scores[-1]))]
+    for link, score in zip(links, scores[1:], strict=True):
+        forward.append(score + (forward[-1][:, None] + link).max(axis=0))
+    for link, score in zip(reversed(links), reversed(scores[1:]), strict=True):
+        backward.append((link + score + backward[-1]).max(axis=1))
+    velocities, alternatives = np.empty((len(windows), 2)), np.full((len(windows), 2), np.nan)
+    for index, (each, total) in enumerate(zip(windows, map(np.add, forward, reversed(backward)), strict=True)):
+        best, *others = np.argsort(-total, kind="stable")
+        velocities[index] = each.velocities[best]
+        if others and total[best] - total[others[0]] < _TIE:
+            alternatives[index] = each.velocities[others[0]]
+    return velocities, alternatives
+
+
+def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:
+    """Return the log likelihood of each change of velocity from one window to the next: (P, Q)."""
+    change = before.velocities[:, None] - after.velocities
+    std = _CONTINUITY_PX * max(before.px_per_frame, after.px_per_frame)
+    return np.asarray(-np.sum((change / std) ** 2, axis=-1) / 2)
+
+
+def _binning(source: Source) -> int:
+    """Return the side of a binned pixel, in px."""
+    return max(1, min(source.info.frame_shape) // _SIDE_PX)
+
+
+def _binned(source: Source, span: FrameSpan) -> NDArray[np.float32]:
+    """Return the sum of a span in binned pixels; 0 where no pixel is valid, and elsewhere per valid pixel."""
+    binning = _binning(source)
+    height, width = (side // binning * binning for side in source.info.frame_shape)
+    size = (width // binning, height // binning)
+    counts = source.counts(span)
+    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
+    valid = source.valid[:height, :width].astype(np.float32)
+    images = valid * lit[:height, :width].astype(np.float32), valid
+    summed, share = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images)
+    return np.divide(summed, share, out=np.full_like(summed, summed.mean()), where=share > 0)
+
+
+@cache
+def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    return np.asarray(cv2.createHanningWindow((shape[1], shape[0]), cv2.CV_32F))

@@ -1,0 +1,98 @@
+"""Where the registrations of the first level start: at the motion of short spans, then at that of the nearest exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonpano.geometry import apply, corners, inverse, normalised
+from photonpano.motion.level import FrameHomography
+from photonpano.motion.start import StartingMotion
+from photonpano.values import FloatArray, Homography
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where an exposure lies.
+
+    Attributes:
+        segment: number of the first exposure of those that are tied to this one.
+        homography: (3, 3), pixels of its frame to those of that exposure's frame.
+        velocity: (2,) shift of the middle of the image per frame period, px, along the last pair that was located; None where
+            none was.
+    """
+
+    segment: int
+    homography: Homography
+    velocity: FloatArray | None
+
+
+class Track:
+    """The exposures of the first level, each tied to the nearest earlier one. May be used from several threads.
+
+    An exposure is placed by the thread that registers it; others wait for that. Exposures must be begun in order.
+
+    Attributes:
+        alternatives_px: of the pairs that may just as well have another motion, how far that is from the one they start at.
+    """
+
+    def __init__(self, start: StartingMotion | None, instants: FloatArray, frame_shape: tuple[int, int]) -> None:
+        self._start, self._instants = start, instants
+        self._middle = corners(frame_shape).mean(axis=0)
+        self._places: list[Future[Place]] = [Future() for _ in instants]
+        self.alternatives_px: dict[tuple[int, int], float] = {}
+
+    def expected(
+        self, place: Place | None, moving: int, fixed: int, hypotheses: Callable[[], Sequence[Homography]]
+    ) -> FrameHomography | None:
+        """Return where the registration of a pair starts: (3, 3); None if nothing is known.
+
+        Args:
+            place: where `moving` lies, if one of its pairs was located before.
+            moving: number of the later exposure.
+            fixed: number of the earlier one.
+            hypotheses: returns the motions that the two images themselves suggest, likeliest first.
+        """
+        there = self._places[fixed].result()
+        if place is not None and place.segment == there.segment:
+            return FrameHomography(normalised(inverse(there.homography) @ place.homography))
+        instants = self._instants[moving], self._instants[fixed]
+        if self._start is not None and (motion := self._start.between(*instants)) is not None:
+            if alternative_px := self._start.alternative_px(*instants):
+                self.alternatives_px[moving, fixed] = alternative_px
+            return FrameHomography(motion)
+        return self._steadiest(hypotheses(), there.velocity, moving, fixed)
+
+    def placed(self, moving: int, fixed: int, motion: Homography) -> Place:
+        """Return where an exposure lies by its motion to an earlier one."""
+        there = self._places[fixed].result()
+        velocity = self._shift(motion) / (self._instants[moving] - self._instants[fixed])
+        return Place(there.segment, normalised(there.homography @ motion), velocity)
+
+    def place(self, index: int) -> Place:
+        """Return where an exposure lies, once that is known."""
+        return self._places[index].result()
+
+    def settle(self, moving: int, place: Place | None) -> None:
+        """Let others know where an exposure lies; None for the first of its segment."""
+        self._places[moving].set_result(Place(moving, np.eye(3), None) if place is None else place)
+
+    def _steadiest(
+        self, hypotheses: Sequence[Homography], velocity: FloatArray | None, moving: int, fixed: int
+    ) -> FrameHomography | None:
+        """Return the hypothesis nearest to the motion so far, or the likeliest at the start."""
+        if not len(hypotheses):
+            return None
+        shifts = np.array([self._shift(each) for each in hypotheses])
+        if velocity is None:
+            if len(shifts) > 1:
+                self.alternatives_px[moving, fixed] = float(np.linalg.norm(shifts[1] - shifts[0]))
+            return FrameHomography(hypotheses[0])
+        going_on = velocity * (self._instants[moving] - self._instants[fixed])
+        return FrameHomography(hypotheses[int(np.linalg.norm(shifts - going_on, axis=1).argmin())])
+
+    def _shift(self, motion: Homography) -> FloatArray:
+        return np.asarray(apply(motion, self._middle[None])[0] - self._middle)

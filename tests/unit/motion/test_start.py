@@ -1,0 +1,65 @@
+"""The speed of the image from short spans: small captures of 64x96 px in memory, whose motion is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group
+from photonpano.motion.start import StartingMotion, starting_motion
+
+SHAPE = (64, 96)
+LENGTH = 32
+"""Frames of a group."""
+
+
+def tiled(period: int) -> np.ndarray:
+    """Panels that repeat every `period` px along both sides: (64, 800) of flux."""
+    rng = np.random.default_rng(1)
+    return np.tile(rng.uniform(0.05, 0.6, (period // 4, period // 4)).repeat(4, 0).repeat(4, 1), (4, 60))[:64, :800]
+
+
+@pytest.fixture
+def started(memory_source: type) -> Callable[..., StartingMotion | None]:
+    """Simulate a pan over a scene at a whole number of px per frame, and measure its start."""
+
+    def started(scene: np.ndarray, px_per_frame: int, n_frames: int = 128) -> Any:
+        rng = np.random.default_rng(0)
+        views = [scene[:, px_per_frame * frame :][:, : SHAPE[1]] for frame in range(n_frames)]
+        source = memory_source([rng.random(SHAPE) < -np.expm1(-view) for view in views])
+        spans = [FrameSpan(start, start + LENGTH) for start in range(0, n_frames, LENGTH)]
+        with ThreadPoolExecutor(1) as pool:
+            return starting_motion(source, [Group(span, span.centre) for span in spans], pool)
+
+    return started
+
+
+def test_speed_is_right_where_groups_move_by_more_than_a_panel(started: Callable) -> None:
+    """A group moves by 64 px, so that panels of 40 px fit a shift of -16 px between groups better than the true one."""
+    start = started(tiled(40), 2)
+    shift = start.between(80.0, 48.0)[:2, 2]
+    np.testing.assert_allclose(shift, [64, 0], atol=2)
+    assert start.alternative_px(80.0, 48.0) == 0
+
+
+def test_slower_motion_is_taken_and_the_other_named_where_spans_move_by_half_a_panel(started: Callable) -> None:
+    """Spans of 4 frames move by 8 px, so that panels of 20 px fit a motion back by 12 px as well."""
+    start = started(tiled(20), 2)
+    np.testing.assert_allclose(start.between(80.0, 48.0)[:2, 2], [64, 0], atol=6)
+    assert start.alternative_px(80.0, 48.0) == pytest.approx(32 / 4 * 20, abs=8)
+
+
+def test_motion_is_unknown_beyond_the_windows_with_a_significant_peak(started: Callable) -> None:
+    scene = tiled(40)
+    scene[:, 2 * 96 :] = 0.3
+    start = started(scene, 2, n_frames=256)
+    assert start.between(64.0, 32.0) is not None
+    assert start.between(250.0, 220.0) is None
+
+
+def test_no_motion_is_known_without_texture(started: Callable) -> None:
+    assert started(np.full((64, 800), 0.3), 2) is None
