@@ -44,6 +44,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "colmap": GROUPS,
     "demo": GROUPS,
     "swissspad": GROUPS | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
+    "sums": {"resample.with.group_size": 25},
     "visionsim": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
@@ -85,6 +86,8 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
     for capture in (folder / "capture.npy", demo / "capture.npy"):
         shutil.copy(small_capture, capture)
         shutil.copy(truth_path(small_capture), truth_path(capture))
+    frames = np.unpackbits(np.load(small_capture), axis=-1)
+    np.save(folder / "sums.npy", frames[::2] + frames[1::2])
     visionsim = folder / "visionsim"
     visionsim.mkdir()
     shutil.copy(small_capture, visionsim / "frames.npy")
