@@ -97,7 +97,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         observers.rendered(panorama.canvas, panorama.seconds)
         record = record_of(plan, source.info, decisions, results, explained, verdict, panorama, time.perf_counter() - start)
         folder.write_results(panorama, motion, record)
-        folder.write_report(render_report(record, motion, panorama))
+        folder.write_report(render_report(record, explained, panorama))
         finished(record)
     return RunResult(plan.output.directory, record, verdict)
 

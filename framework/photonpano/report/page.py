@@ -8,13 +8,17 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from photonpano import text
+from photonpano.geometry import inverse
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import RunRecord
-from photonpano.report import figures
+from photonpano.report import figures, residual_figures
+from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.failures import failure_groups
-from photonpano.report.figures import jpeg_uri, shrunk
+from photonpano.residuals.refinement import Explained
 from photonpano.values import true_spans
 
 PICTURE_PIXELS = 1600
@@ -24,12 +28,13 @@ MAX_SPANS = 12
 """Number of spans of frames that are listed."""
 
 
-def render_report(record: RunRecord, motion: FrameMotion | None, panorama: RenderedPanorama | None) -> str:
+def render_report(record: RunRecord, explained: Explained | None, panorama: RenderedPanorama | None) -> str:
     """Return the report of a run as one HTML page that needs no other file, no network and no script.
 
     Args:
         record: the content of `run.json`.
-        motion: the motion of every frame; None for a run that failed, whose page has no figures of it.
+        explained: the motion of every frame, and what the panorama does not explain; None for a run that failed, whose page
+            has no figures of it.
         panorama: the panorama; None for a run that failed.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -52,14 +57,29 @@ def render_report(record: RunRecord, motion: FrameMotion | None, panorama: Rende
         failures=failure_groups(record["levels"]),
         spec_yaml=_yaml(record["spec"]),
         stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
-        **_motion(record, motion, panorama),
+        **({"picture": None} if explained is None or panorama is None else _results(record, explained, panorama)),
     )
     return page
 
 
-def _motion(record: RunRecord, motion: FrameMotion | None, panorama: RenderedPanorama | None) -> dict[str, Any]:
-    if motion is None or panorama is None:
-        return {"picture": None}
+def _results(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:
+    return _motion(record, explained.motion, panorama) | _unexplained(record, explained, panorama)
+
+
+def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:
+    residuals, canvas = explained.residuals, panorama.canvas
+    to_panorama = canvas.transform @ inverse(explained.panorama.canvas)
+    return {
+        "misfit": float(residuals.misfit.mean()),
+        "misfit_over_panorama": residual_figures.misfit_over_panorama(residuals, to_panorama, canvas.shape),
+        "over_sensor": residual_figures.over_sensor(residuals),
+        "shifts_are_drawn": residual_figures.significant_shifts(residuals) is not None,
+        "shifts_over_time": residual_figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
+        "span_frames": int(np.median([len(span) for span in residuals.spans])),
+    }
+
+
+def _motion(record: RunRecord, motion: FrameMotion, panorama: RenderedPanorama) -> dict[str, Any]:
     not_located = true_spans(~motion.located)
     return {
         "picture": jpeg_uri(shrunk(panorama.picture, PICTURE_PIXELS)),

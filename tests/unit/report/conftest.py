@@ -9,6 +9,9 @@ from photonpano import FrameSpan, Panorama
 from photonpano.geometry import canvas_of, normalised, translation
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
+from photonpano.residuals.measure import Residuals
+from photonpano.residuals.refinement import Explained
 from photonpano.testing import KnownMotion
 
 FRAME_SHAPE = (254, 496)
@@ -46,6 +49,35 @@ def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanoram
     preview, weight = np.clip(picture, 0, 255).astype(np.uint8), coverage.astype(np.float32)
     thumbnail = Panorama(weight, weight, canvas.transform)
     return motion, RenderedPanorama(canvas, thumbnail, 1, preview, 1.8342, float((weight > 0).mean()), 4.18)
+
+
+def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: float = 100.0) -> Residuals:
+    """Make the residuals of spans of 16 frames: noise of 0.03 px, and a tremor along x that the motion lacks."""
+    rng = np.random.default_rng(4)
+    spans = tuple(FrameSpan(start, start + 16) for start in range(0, n_frames - 15, 16))
+    instants = np.array([span.centre for span in spans])
+    information = np.diag([1 / 0.03**2] * 2 + [1e6] * 3)
+    steps = rng.normal(0, 1 / np.sqrt(np.diagonal(information)), (len(spans), 5))
+    steps[:, 0] += tremor_px * np.sin(2 * np.pi * instants / period)
+    grid, cells = n_blocks(FRAME_SHAPE), (20, 80)
+    blocks = np.zeros((*grid, N_SUMS))
+    blocks[..., [GXX, GYY]], blocks[..., [V, M]] = 1e6, 1e5
+    blocks[..., R] = rng.normal(0, np.sqrt(1e5), grid)
+    return Residuals(
+        spans=spans,
+        instants=instants,
+        normal=np.repeat(information[None], len(spans), axis=0),
+        gradient=steps @ information,
+        misfit=np.ones(len(spans)),
+        blocks=blocks,
+        block_misfit=rng.normal(1, 0.05, grid),
+        pixel_gain=np.ones(FRAME_SHAPE, np.float32),
+        pixel_mean=np.full(FRAME_SHAPE, 1e4, np.float32),
+        cell_misfit=rng.normal(1, 0.1, cells),
+        cell_count=np.full(cells, 300.0),
+        frames_seen=4000.0,
+        frame_shape=FRAME_SHAPE,
+    )
 
 
 def make_record(n_frames: int, panorama: RenderedPanorama) -> dict[str, Any]:
@@ -122,6 +154,23 @@ def make_record(n_frames: int, panorama: RenderedPanorama) -> dict[str, Any]:
         ],
         "levels": levels,
         "motion": {"std_px": 0.07, "worst_std_px": 0.61, "worst_frame": 9874},
+        "refinements": [
+            {"use": "short-spans", "rounds": ["tremor at 223 Hz", "a little more"], "change_px": 0.664, "kept_out": None},
+            {"use": "other", "rounds": [], "change_px": 0.0, "kept_out": None},
+        ],
+        "verdict": {
+            "status": "doubtful",
+            "reasons": [
+                {
+                    "what": "the light changes over time",
+                    "figure": 0.25,
+                    "threshold": 0.03,
+                    "where": "most at frames 0 to 15",
+                    "what_to_do": "keep the light steady",
+                }
+            ],
+            "residual_ratio": 1.0123,
+        },
         "panorama": {
             "height": height,
             "width": width,
@@ -150,6 +199,22 @@ def motion(results: tuple[FrameMotion, RenderedPanorama]) -> FrameMotion:
 @pytest.fixture(scope="session")
 def panorama(results: tuple[FrameMotion, RenderedPanorama]) -> RenderedPanorama:
     return results[1]
+
+
+@pytest.fixture(scope="session")
+def residuals() -> Residuals:
+    return make_residuals()
+
+
+@pytest.fixture(scope="session")
+def tremor() -> Residuals:
+    """Residuals of a motion that lacks a tremor of 0.3 px with a period of 100 frames."""
+    return make_residuals(tremor_px=0.3)
+
+
+@pytest.fixture(scope="session")
+def explained(motion: FrameMotion, panorama: RenderedPanorama, residuals: Residuals) -> Explained:
+    return Explained(motion, panorama.thumbnail, residuals, 1.0123, ())
 
 
 @pytest.fixture

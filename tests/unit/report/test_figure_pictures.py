@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano.report.figures import jpeg_uri, shrunk
+from photonpano.report.drawing import jpeg_uri, shrunk
 
 
 def decoded(uri: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from photonpano.report import figures, render_report
+from photonpano.report import figures, render_report, residual_figures
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 
@@ -20,6 +20,8 @@ def no_figures(monkeypatch):
     """Leave out the figures, whose drawing takes a second, where a test is about the words."""
     for name in ("path_over_time", "path_on_panorama", "coverage_map", "stage_times"):
         monkeypatch.setattr(figures, name, lambda *_: "")
+    for name in ("misfit_over_panorama", "over_sensor", "shifts_over_time"):
+        monkeypatch.setattr(residual_figures, name, lambda *_: "")
 
 
 def text_of(page: str) -> str:
@@ -42,21 +44,29 @@ def check_self_contained(page: str) -> None:
     assert targets <= set(names)
 
 
-def test_page_is_self_contained_and_deterministic(record, motion, panorama):
-    page = render_report(record, motion, panorama)
-    assert page == render_report(record, motion, panorama)
+def test_page_is_self_contained_and_deterministic(record, explained, panorama):
+    page = render_report(record, explained, panorama)
+    assert page == render_report(record, explained, panorama)
     check_self_contained(page)
     assert "http" not in page
     assert page.count("data:image/jpeg") == 1
-    assert page.count("<svg") == 4
+    assert page.count("<svg") == 7
 
 
-def test_page_shows_facts_warnings_and_failures(record, motion, panorama, no_figures):
-    text = text_of(render_report(record, motion, panorama))
+def test_page_shows_facts_warnings_and_failures(record, explained, panorama, no_figures):
+    text = text_of(render_report(record, explained, panorama))
     height, width = panorama.canvas.shape
     for sentence in (
-        "photonpano 0.1.0 done corridor-pan",
+        "photonpano 0.1.0 done doubtful corridor-pan",
         f"10,000 binary frames of 496 {TIMES} 254 px at 96.8 kHz, 103 ms. 14 March 2026, 15:09 UTC",
+        "Do not rely on this panorama yet: The light changes over time (most at frames 0 to 15) . "
+        "The figure is 0.25; up to 0.03 is trusted. What to do: keep the light steady.",
+        "scatter of short spans 1.01",
+        "Each span of 16 frames is compared",
+        "Over the whole capture it is 1.",
+        "short-spans moved the frames by 0.664 px on average, in 2 rounds: tremor at 223 Hz; a little more.",
+        "other found nothing to correct.",
+        "The shifts of parts of the frame are not larger than their noise.",
         "level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it",
         f"The panorama, {width:,} {TIMES} {height} px at scale 1; 99 % of it was seen; "
         "white is 1.83 photons per pixel per frame.",
@@ -78,18 +88,18 @@ def test_page_shows_facts_warnings_and_failures(record, motion, panorama, no_fig
         assert sentence in text
 
 
-def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, motion, panorama, no_figures):
-    assert "located by" not in text_of(render_report(record, motion, panorama))
+def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, explained, panorama, no_figures):
+    assert "located by" not in text_of(render_report(record, explained, panorama))
     for level, counts in zip(record["levels"], ((39, 0), (67, 1), (150, 6)), strict=True):
         level["located_by"] = dict(zip(("direct", "opencv-sift"), counts, strict=True))
-    text = text_of(render_report(record, motion, panorama))
+    text = text_of(render_report(record, explained, panorama))
     assert "Level 1:" not in text
     assert "Level 2: 67 pairs located by direct , 1 pair located by opencv-sift ." in text
     assert "Level 3: 150 pairs located by direct , 6 pairs located by opencv-sift ." in text
 
 
-def test_level_table_has_one_row_per_level(record, motion, panorama, no_figures):
-    tree = ElementTree.fromstring(render_report(record, motion, panorama))
+def test_level_table_has_one_row_per_level(record, explained, panorama, no_figures):
+    tree = ElementTree.fromstring(render_report(record, explained, panorama))
     [table] = [table for table in tree.iter("table") if table.get("class") == "figures"]
     rows = [["".join(cell.itertext()) for cell in row] for row in table.find("tbody")]
     dash = "\N{EN DASH}"
@@ -100,15 +110,15 @@ def test_level_table_has_one_row_per_level(record, motion, panorama, no_figures)
     ]
 
 
-def test_page_shows_resolved_spec(record, motion, panorama, no_figures):
-    tree = ElementTree.fromstring(render_report(record, motion, panorama))
+def test_page_shows_resolved_spec(record, explained, panorama, no_figures):
+    tree = ElementTree.fromstring(render_report(record, explained, panorama))
     assert YAML(typ="safe").load("".join(tree.find(".//pre").itertext())) == record["spec"]
 
 
 HOSTILE = '</pre></style><script>alert("1")</script><img src="http://example.org/x.png"/>&amp;'
 
 
-def test_page_escapes_all_input(record, motion, panorama, no_figures):
+def test_page_escapes_all_input(record, explained, panorama, no_figures):
     record["spec_file"] = HOSTILE
     record["status"] = HOSTILE
     record["warnings"] = [HOSTILE]
@@ -116,49 +126,59 @@ def test_page_escapes_all_input(record, motion, panorama, no_figures):
     record["levels"][1]["failures"][0]["reason"] = HOSTILE
     record["spec"]["source"]["with"]["path"] = HOSTILE
     record["plugins"][0]["use"] = HOSTILE
+    record["verdict"]["reasons"][0].update(where=HOSTILE, what_to_do=HOSTILE)
+    record["refinements"][0].update(use=HOSTILE, rounds=[HOSTILE])
     record["libraries"][HOSTILE] = HOSTILE
-    page = render_report(record, motion, panorama)
+    page = render_report(record, explained, panorama)
     check_self_contained(page)
     assert "<script>" not in page
-    assert text_of(page).count('<script>alert("1")</script>') == 9
+    assert text_of(page).count('<script>alert("1")</script>') == 13
 
 
-def test_page_without_gaps_says_all_frames_located(record, motion, panorama, no_figures):
-    page = render_report(record, replace(motion, located=np.ones_like(motion.located)), panorama)
+def test_page_of_trusted_run_has_no_doubts(record, explained, panorama, no_figures):
+    record["verdict"] = {"status": "trusted", "reasons": [], "residual_ratio": None}
+    text = text_of(render_report(record, explained, panorama))
+    assert "photonpano 0.1.0 done trusted corridor-pan" in text
+    assert "Do not rely" not in text
+    assert "scatter of short spans" not in text
+
+
+def test_page_without_gaps_says_all_frames_located(record, explained, motion, panorama, no_figures):
+    page = render_report(record, replace(explained, motion=replace(motion, located=np.ones_like(motion.located))), panorama)
     assert "All frames were located." in text_of(page)
     assert "Shaded" not in page
 
 
-def test_page_counts_gaps_beyond_the_first_dozen(record, motion, panorama, no_figures):
+def test_page_counts_gaps_beyond_the_first_dozen(record, explained, motion, panorama, no_figures):
     located = np.arange(len(motion.located)) % 100 > 0
-    text = text_of(render_report(record, replace(motion, located=located), panorama))
+    text = text_of(render_report(record, replace(explained, motion=replace(motion, located=located)), panorama))
     assert "100 frames of 10,000 were not located: 0; 100; 200;" in text
     assert "1,000; 1,100 and 88 further spans" in text
 
 
-def test_page_omits_time_without_frame_rate(record, motion, panorama):
+def test_page_omits_time_without_frame_rate(record, explained, panorama):
     record["source"]["frame_rate_hz"] = None
-    page = render_report(record, motion, panorama)
+    page = render_report(record, explained, panorama)
     check_self_contained(page)
     assert f"10,000 binary frames of 496 {TIMES} 254 px. 14 March" in text_of(page)
     assert "time (" not in page
 
 
-def test_page_has_title_without_spec_file(record, motion, panorama, no_figures):
+def test_page_has_title_without_spec_file(record, explained, panorama, no_figures):
     record["spec_file"] = None
-    text = text_of(render_report(record, motion, panorama))
+    text = text_of(render_report(record, explained, panorama))
     assert "A run without a spec file" in text
     assert "From " not in text
 
 
-def test_page_reduces_large_panorama(record, motion, panorama, no_figures):
+def test_page_reduces_large_panorama(record, explained, panorama, no_figures):
     large = replace(panorama, picture=np.repeat(panorama.picture, 2, axis=1))
-    assert "Reduced for this page; panorama.png has all pixels." in text_of(render_report(record, motion, large))
-    assert "Reduced for this page" not in render_report(record, motion, panorama)
+    assert "Reduced for this page; panorama.png has all pixels." in text_of(render_report(record, explained, large))
+    assert "Reduced for this page" not in render_report(record, explained, panorama)
 
 
 def test_page_of_failed_run_has_no_panorama(record):
-    record.update(status="failed", panorama=None, levels=record["levels"][:2], warnings=["the graph fell apart"])
+    record.update(status="failed", panorama=None, verdict=None, levels=record["levels"][:2], warnings=["the graph fell apart"])
     page = render_report(record, None, None)
     check_self_contained(page)
     text = text_of(page)
@@ -169,7 +189,7 @@ def test_page_of_failed_run_has_no_panorama(record):
 
 
 def test_page_of_run_that_failed_before_level_1(record):
-    record.update(status="failed", panorama=None, levels=[], warnings=[])
+    record.update(status="failed", panorama=None, verdict=None, levels=[], warnings=[])
     page = render_report(record, None, None)
     check_self_contained(page)
     assert "<svg" not in page

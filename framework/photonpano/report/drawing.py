@@ -1,0 +1,155 @@
+"""What the figures of the report share: inline SVG whose colours the page's style sheet decides, for light, dark and print."""
+
+from __future__ import annotations
+
+import base64
+import importlib
+import io
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # importing matplotlib takes a second
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+JPEG_QUALITY = 90
+WIDTH_IN = 10.0
+MAX_MAP_HEIGHT_IN = 5.0
+MIN_MAP_IN = 0.8
+MAP_PIXELS = 1000
+
+# matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
+INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
+SERIES = ("#010201", "#010202", "#010203", "#010204", "#010205")
+_VARIABLES = {
+    INK: "var(--ink)",
+    MUTED: "var(--muted)",
+    LINE: "var(--line)",
+    PAPER: "var(--paper)",
+    **{colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, start=1)},
+}
+
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "photonpano",
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": INK,
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.7,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "figure.facecolor": "none",
+    "lines.linewidth": 1.5,
+    "lines.solid_capstyle": "round",
+    "lines.solid_joinstyle": "round",
+    "legend.frameon": False,
+}
+
+
+@contextmanager
+def loading_figures() -> Iterator[None]:
+    """Import matplotlib in another thread while the block runs: it takes a second that nothing waits for."""
+    with ThreadPoolExecutor(1) as aside:
+        aside.submit(lambda: [importlib.import_module(f"matplotlib.{name}") for name in ("figure", "backends.backend_svg")])
+        yield
+
+
+@contextmanager
+def plain_figure(width_in: float, height_in: float) -> Iterator[Figure]:
+    """Open a figure in the style of the report."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        yield Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+@contextmanager
+def map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[Figure, Axes]]:
+    """Open a figure with the proportions of a panorama, with `side_in` inches beside it for a colour bar."""
+    margin_in = 0.9 + side_in
+    map_width = min(WIDTH_IN - margin_in, MAX_MAP_HEIGHT_IN * width / height)
+    size_in = max(map_width, MIN_MAP_IN), max(map_width * height / width, MIN_MAP_IN)
+    with plain_figure(size_in[0] + margin_in, size_in[1] + 0.55) as figure:
+        axes = figure.subplots()
+        axes.grid(visible=False)
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(height - 0.5, -0.5)
+        axes.set_aspect("equal")
+        axes.locator_params(axis="x", nbins=max(2, min(9, int(map_width))))
+        axes.locator_params(axis="y", nbins=5)
+        for ticks in (axes.xaxis, axes.yaxis):
+            ticks.set_major_formatter("{x:,.0f}")
+        yield figure, axes
+
+
+def svg_of(figure: Figure, name: str) -> str:
+    """Return the SVG element, with unique identifiers and the colour variables of the page."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    # Inside HTML the namespaces are known, and several drawings share one space of identifiers.
+    svg = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg).replace("xlink:href=", "href=")
+    svg = re.sub(r'\b(id="|href="#|url\(#)', rf"\g<1>{name}-", svg)
+    for stand_in, variable in _VARIABLES.items():
+        svg = svg.replace(stand_in, variable)
+    return svg.strip()
+
+
+def add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:
+    """Add the time along the top, in seconds or milliseconds."""
+    factor, unit = (1.0, "s") if n_frames / frame_rate_hz >= 1 else (1e3, "ms")
+    scale = factor / frame_rate_hz
+
+    def to_time(frame: Any) -> Any:
+        return frame * scale
+
+    def to_frame(time: Any) -> Any:
+        return time / scale
+
+    time = axes.secondary_xaxis("top", functions=(to_time, to_frame))
+    time.set_xlabel(f"time ({unit})")
+    time.spines["top"].set_visible(False)
+
+
+def extent_of(height: int, width: int) -> tuple[float, float, float, float]:
+    """Return the edges of an image in its own pixels, whose centres are integers."""
+    return -0.5, width - 0.5, height - 0.5, -0.5
+
+
+def shrunk(image: NDArray[Any], max_pixels: int) -> NDArray[Any]:
+    """Reduce an image by averaging until its longer side has at most `max_pixels`; smaller images are not changed."""
+    import cv2
+
+    height, width = image.shape[:2]
+    scale = max_pixels / max(height, width)
+    if scale >= 1:
+        return image
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def jpeg_uri(image: NDArray[np.uint8]) -> str:
+    """Return an (H, W) grey or (H, W, 3) red-green-blue image as a data URI."""
+    import cv2
+
+    in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
+    _, encoded = cv2.imencode(".jpg", in_opencv_order, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()

@@ -1,0 +1,225 @@
+"""The figures of what the panorama does not explain: maps of the misfit, brightness and shifts over the sensor, spectra."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from photonpano.geometry import apply
+from photonpano.report.drawing import (
+    INK,
+    LINE,
+    MUTED,
+    SERIES,
+    WIDTH_IN,
+    extent_of,
+    map_figure,
+    plain_figure,
+    svg_of,
+)
+from photonpano.residuals.block_sums import BLOCK_PX, M, R
+from photonpano.residuals.measure import Residuals
+from photonpano.residuals.unexplained import SYSTEMATIC_PX
+from photonpano.residuals.verdict import block_shifts
+from photonpano.values import FloatArray, Homography
+
+if TYPE_CHECKING:  # importing matplotlib takes a second
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MAX_DOTS = 500
+"""Number of spans whose shifts are drawn, evenly spaced."""
+SMALLEST_SHIFT_PX = 0.06
+"""Shifts of blocks are drawn if their root mean square exceeds this, and three times their noise."""
+_FEWEST_BLOCKS = 16
+"""Blocks that must have fallen on a square of the panorama."""
+_FEWEST_SPANS = 16
+"""Fewer spans than this have no spectrum."""
+_WINDOW_SPANS = 512
+"""Longest window of the spectrum."""
+_MISFIT_RANGE = (0.5, 2.0)
+"""The smallest range of colours of the misfit; the largest misfit that is drawn may widen it."""
+_GAIN_RANGE_PERCENT = 5.0
+"""The smallest range of colours of the brightness, to both sides."""
+
+
+def misfit_over_panorama(residuals: Residuals, to_panorama: Homography, shape: tuple[int, int]) -> str:
+    """Draw the misfit of each place of the panorama.
+
+    Args:
+        residuals: of the run.
+        to_panorama: (3, 3), pixels of the panorama of the residuals to pixels of the panorama.
+        shape: (height, width) of the panorama.
+    """
+    misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
+    rows, columns = misfit.shape
+    (left, top), (right, bottom) = apply(to_panorama, [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]])
+    with map_figure(*shape, side_in=0.9) as (figure, axes):
+        axes.set_facecolor(LINE)
+        extent = float(left), float(right), float(bottom), float(top)
+        image = axes.imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
+        axes.set_xlim(-0.5, shape[1] - 0.5)
+        axes.set_ylim(shape[0] - 0.5, -0.5)
+        _add_colour_bar(figure, axes, image, "misfit", 0.15)
+        return svg_of(figure, "misfit-panorama")
+
+
+def over_sensor(residuals: Residuals) -> str:
+    """Draw the misfit and the brightness of the blocks of the sensor, and their shifts if these are significant."""
+    height, width = residuals.frame_shape
+    shifts = significant_shifts(residuals)
+    n_maps = 2 if shifts is None else 3
+    map_in = WIDTH_IN / n_maps
+    with plain_figure(WIDTH_IN, float(np.clip((map_in - 0.8) * height / width, 1.0, 4.0)) + 0.9) as figure:
+        maps = figure.subplots(1, n_maps)
+        for axes in maps:
+            axes.grid(visible=False)
+            axes.set_facecolor(LINE)
+            axes.locator_params(nbins=4)
+            axes.xaxis.set_major_formatter("{x:,.0f}")
+        extent = _blocks_extent(residuals)
+        misfit = np.ma.masked_invalid(residuals.block_misfit)
+        image = maps[0].imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
+        _add_colour_bar(figure, maps[0], image, "misfit", 0.05)
+        gain = np.ma.masked_invalid(100 * _brightness(residuals))
+        limit = max(_GAIN_RANGE_PERCENT, float(np.abs(gain).max())) if gain.count() else _GAIN_RANGE_PERCENT
+        image = maps[1].imshow(gain, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
+        _add_colour_bar(figure, maps[1], image, "brightness (%)", 0.05, "{x:+.3g}")
+        if shifts is not None:
+            _draw_shifts(maps[2], shifts)
+        for axes in maps:
+            axes.set_xlim(-0.5, width - 0.5)
+            axes.set_ylim(height - 0.5, -0.5)
+            axes.set_aspect("equal")
+        return svg_of(figure, "sensor")
+
+
+def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
+    """Draw the shifts of short spans beyond the motion with the scatter that noise explains, and their spectrum."""
+    found = residuals.steps()
+    steps, stds = found.steps[:, :2], _noise_px(found.information)
+    with plain_figure(WIDTH_IN, 5.2) as figure:
+        time, spectrum = figure.subplots(2, 1, height_ratios=(1, 1))
+        shown = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), MAX_DOTS)).round().astype(int))
+        instants, band = residuals.instants[shown], 2 * stds[shown].max(axis=1)
+        band = np.where(np.isfinite(band), band, np.nan)
+        time.fill_between(instants, -band, band, color=MUTED, alpha=0.25, linewidth=0)
+        for values, name, colour in zip(steps[shown].T, ("x", "y"), SERIES, strict=False):
+            _draw_dots(time, instants, values, colour)
+            time.plot([], [], "o", color=colour, markersize=4, label=name)
+        limit = float(np.nanquantile(np.abs(np.c_[steps[shown], 1.5 * band]), 0.995))
+        time.set_ylim(-1.1 * limit, 1.1 * limit)
+        time.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
+        time.set_ylabel("shift (px)")
+        time.set_xlabel("frame")
+        time.xaxis.set_major_formatter("{x:,.0f}")
+        time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, handletextpad=0.2, columnspacing=1.2)
+        _draw_spectrum(spectrum, residuals, frame_rate_hz)
+        figure.align_ylabels()
+        return svg_of(figure, "shifts")
+
+
+def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+    """Return the power spectrum of the shifts of short spans, divided by that of their photon noise.
+
+    It is the mean of windows that overlap by half, and of both directions (Welch 1967).
+
+    Returns:
+        (F,) frequencies in cycles per frame, and (F,) power; 1 is noise. Both are empty for fewer than 16 spans.
+    """
+    found = residuals.steps()
+    stds = _noise_px(found.information)
+    ratios = np.where(np.isfinite(stds), found.steps[:, :2] / stds, 0)
+    if len(ratios) < _FEWEST_SPANS:
+        return np.zeros(0), np.zeros(0)
+    size = min(_WINDOW_SPANS, len(ratios))
+    taper = np.hanning(size + 2)[1:-1, None]
+    starts = range(0, len(ratios) - size + 1, max(1, size // 2))
+    windows = np.stack([ratios[start : start + size] * taper for start in starts])
+    power = (np.abs(np.fft.rfft(windows, axis=1)) ** 2).mean(axis=(0, 2)) / (taper**2).sum()
+    step = float(np.median(np.diff(residuals.instants)))
+    return np.fft.rfftfreq(size, step)[1:], np.asarray(power[1:])
+
+
+def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | None:
+    """Return places and shifts of the blocks of the sensor, (N, 2) each in px; None if noise explains the shifts."""
+    field, information = block_shifts(residuals)
+    with np.errstate(divide="ignore"):
+        noise = np.sqrt(1 / np.linalg.eigvalsh(information).clip(min=0)[..., 0])
+    length = np.linalg.norm(field, axis=-1)
+    known = noise < np.maximum(SMALLEST_SHIFT_PX, length / 2)
+    if not known.any() or np.sqrt(np.mean(length[known] ** 2)) < max(SMALLEST_SHIFT_PX, 3 * float(np.median(noise[known]))):
+        return None
+    height, width = residuals.frame_shape
+    y, x = np.nonzero(known)
+    ends = np.minimum((y + 1) * BLOCK_PX, height), np.minimum((x + 1) * BLOCK_PX, width)
+    places = np.stack([(x * BLOCK_PX + ends[1] - 1) / 2, (y * BLOCK_PX + ends[0] - 1) / 2], axis=-1)
+    return places, field[known]
+
+
+def _misfit_colours(residuals: Residuals) -> dict[str, Any]:
+    """Return one scale of colours for all maps of the misfit."""
+    drawn = np.r_[residuals.cell_misfit[residuals.cell_count >= _FEWEST_BLOCKS], residuals.block_misfit.ravel()]
+    drawn = drawn[np.isfinite(drawn)]
+    high = float(np.quantile(drawn, 0.99)) if len(drawn) else 0.0
+    return {"cmap": "inferno", "vmin": _MISFIT_RANGE[0], "vmax": max(_MISFIT_RANGE[1], high)}
+
+
+def _brightness(residuals: Residuals) -> FloatArray:
+    """Return the relative excess of photons of each block of the sensor: (h, w), NaN where nothing was predicted."""
+    predicted = residuals.blocks[..., M]
+    nothing = np.full(predicted.shape, np.nan)
+    return np.divide(residuals.blocks[..., R], predicted, out=nothing, where=predicted > 0)
+
+
+def _noise_px(information: FloatArray) -> FloatArray:
+    """Return the standard deviation of the shifts along x and y that noise and interpolation explain: (S, 2)."""
+    with np.errstate(divide="ignore"):
+        return np.sqrt(1 / np.diagonal(information, axis1=1, axis2=2)[:, :2].clip(min=0) + SYSTEMATIC_PX**2)
+
+
+def _blocks_extent(residuals: Residuals) -> tuple[float, float, float, float]:
+    rows, columns = residuals.block_misfit.shape
+    return extent_of(rows * BLOCK_PX, columns * BLOCK_PX)
+
+
+def _add_colour_bar(figure: Figure, axes: Axes, image: Any, label: str, fraction: float, numbers: str = "{x:.3g}") -> None:
+    bar = figure.colorbar(image, ax=axes, fraction=fraction, pad=0.02, shrink=0.9, aspect=14, format=numbers)
+    bar.outline.set_visible(False)
+    bar.set_label(label)
+
+
+def _draw_shifts(axes: Axes, shifts: tuple[FloatArray, FloatArray]) -> None:
+    """Draw arrows, as long as a block for the longest, and one of a known length."""
+    places, field = shifts
+    typical = float(np.quantile(np.linalg.norm(field, axis=1), 0.95))
+    arrows = axes.quiver(
+        *places.T, *field.T, color=SERIES[1], angles="xy", scale_units="xy", scale=typical / (1.5 * BLOCK_PX), width=0.006
+    )
+    axes.quiverkey(arrows, 0.5, 1.08, typical, f"{typical:.2g} px", labelpos="E", coordinates="axes", labelcolor=INK)
+    axes.set_facecolor("none")
+
+
+def _draw_dots(axes: Axes, x: FloatArray, y: FloatArray, colour: str) -> None:
+    """Draw dots as one path of short dashes, which takes a tenth of the bytes of markers."""
+    dash = float(np.ptp(x)) / 1e4 if len(x) > 1 else 0.1
+    xs, ys = np.stack([x, x + dash, np.full_like(x, np.nan)], axis=1), np.stack([y, y, np.full_like(y, np.nan)], axis=1)
+    axes.plot(xs.ravel(), ys.ravel(), color=colour, linewidth=3.0)
+
+
+def _draw_spectrum(axes: Axes, residuals: Residuals, frame_rate_hz: float | None) -> None:
+    frequencies, power = spectrum_over_noise(residuals)
+    scale, label = (1.0, "frequency (cycles per frame)") if frame_rate_hz is None else (frame_rate_hz, "frequency (Hz)")
+    axes.axhline(1, color=MUTED, linewidth=1, linestyle="--")
+    if len(frequencies):
+        axes.plot(scale * frequencies, power, color=SERIES[2])
+        axes.set_xlim(0, scale * frequencies[-1])
+        axes.set_yscale("log")
+        axes.set_ylim(min(0.2, 0.8 * float(power.min())), max(10.0, 1.5 * float(power.max())))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
+        axes.tick_params(which="minor", length=0)
+    axes.xaxis.set_major_formatter("{x:,g}")
+    axes.set_xlabel(label)
+    axes.set_ylabel("power / noise")
