@@ -139,7 +139,7 @@ def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     windows = np.stack([ratios[start : start + size] * taper for start in starts])
     power = (np.abs(np.fft.rfft(windows, axis=1)) ** 2).mean(axis=(0, 2)) / (taper**2).sum()
     step = float(np.median(np.diff(residuals.instants)))
-    return np.fft.rfftfreq(size, step)[1:], np.asarray(power[1:])
+    return np.asarray(np.fft.rfftfreq(size, step)[1:], np.float64), np.asarray(power[1:], np.float64)
 
 
 def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | None:
@@ -176,7 +176,7 @@ def _brightness(residuals: Residuals) -> FloatArray:
 def _noise_px(information: FloatArray) -> FloatArray:
     """Return the standard deviation of the shifts along x and y that noise and interpolation explain: (S, 2)."""
     with np.errstate(divide="ignore"):
-        return np.sqrt(1 / np.diagonal(information, axis1=1, axis2=2)[:, :2].clip(min=0) + SYSTEMATIC_PX**2)
+        return np.asarray(np.sqrt(1 / np.diagonal(information, axis1=1, axis2=2)[:, :2].clip(min=0) + SYSTEMATIC_PX**2))
 
 
 def _blocks_extent(residuals: Residuals) -> tuple[float, float, float, float]:

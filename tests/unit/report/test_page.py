@@ -64,7 +64,7 @@ def test_page_shows_facts_warnings_and_failures(record, explained, panorama, no_
         "scatter of short spans 1.01",
         "Each span of 16 frames is compared",
         "Over the whole capture it is 1.",
-        "short-spans moved the frames by 0.664 px on average, in 2 rounds: tremor at 223 Hz; a little more.",
+        "short-spans moved the frames by 0.66 px on average, in 2 rounds: tremor at 223 Hz; a little more.",
         "other found nothing to correct.",
         "The shifts of parts of the frame are not larger than their noise.",
         "level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it",
