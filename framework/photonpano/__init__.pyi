@@ -9,6 +9,8 @@ from .api.explanation import explain as explain
 from .api.explanation import forecast as forecast
 from .api.pictures import Preview as Preview
 from .api.pictures import preview as preview
+from .api.run_check import RunCheck as RunCheck
+from .api.run_check import check_run as check_run
 from .api.runs import evaluate as evaluate
 from .api.runs import warm_up as warm_up
 from .contributions import Config as Config

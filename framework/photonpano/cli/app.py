@@ -8,6 +8,7 @@ from typer.core import TyperGroup
 
 import photonpano
 from photonpano.cli.check import check
+from photonpano.cli.check_run import check_run
 from photonpano.cli.convert import convert
 from photonpano.cli.dark import dark
 from photonpano.cli.errors import reported
@@ -40,7 +41,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, explain, info, preview, convert, simulate, dark, evaluate, schema, warm_up):
+for command in (run, check, check_run, explain, info, preview, convert, simulate, dark, evaluate, schema, warm_up):
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

@@ -15,7 +15,7 @@ from photonpano.corrections.masks import ColourFilter, Mask
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import CorrectedSource, corrected_source
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
-from photonpano.corrections.vignette import Vignette, divided_by, estimate_vignette
+from photonpano.corrections.vignette import VIGNETTE_DECISION, Vignette, divided_by, estimate_vignette
 
 _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
@@ -28,6 +28,7 @@ CORRECTIONS = {correction.name: correction for correction in _ALL}
 
 __all__ = [
     "CORRECTIONS",
+    "VIGNETTE_DECISION",
     "CorrectedSource",
     "Correction",
     "DarkCounts",

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from photonpano.protocols import Source, Trajectory
     from photonpano.values import Counts, FloatArray, FluxImage
 
+VIGNETTE_DECISION = "vignette_gain"
+"""What a record names the decision to divide by a vignette."""
 _SPANS, _SPAN_FRAMES, _SPAN_PX = 48, 64, 8.0
 """48 spans all over the capture are summed, each of at most 64 frames, in which the image moves by about 8 px at most."""
 _CELL_PX = 8
@@ -54,7 +56,7 @@ class Vignette:
         """What was found, for the record."""
         corner, n_frames = float(self.gain[0, 0]), sum(map(len, self.spans))
         reason = f"light that reaches the corners, relative to the middle, from {n_frames} frames; the flux is divided by it"
-        return Decision("vignette_gain", round(corner, 3), reason)
+        return Decision(VIGNETTE_DECISION, round(corner, 3), reason)
 
 
 def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None:

@@ -2,7 +2,7 @@
 
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
-from photonpano.evaluation.inputs import Truth, load_truth
+from photonpano.evaluation.inputs import RunTrajectory, Truth, load_run_trajectory, load_truth
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 
@@ -10,6 +10,7 @@ __all__ = [
     "Evaluation",
     "ImageScore",
     "Renderer",
+    "RunTrajectory",
     "TrajectoryScore",
     "Truth",
     "corner_errors",
@@ -17,6 +18,7 @@ __all__ = [
     "evaluate",
     "exposure_bound_px",
     "image_score",
+    "load_run_trajectory",
     "load_truth",
     "pair_bound_px",
     "true_panorama",

@@ -40,7 +40,7 @@ class RunTrajectory:
         canvas: (3, 3), reference pixels to panorama pixels.
         frame_shape: (height, width) of a frame.
         located: (T,), False where a frame lies outside what was located.
-        std_px: (T,) expected corner error.
+        std_px: (T,) expected corner error; NaN if the run did not record it.
     """
 
     homographies: FloatArray
@@ -73,8 +73,12 @@ def load_truth(path: Path) -> Truth:
     )
 
 
-def load_run_trajectory(folder: Path) -> RunTrajectory:
+def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajectory:
     """Read the trajectory of a run folder.
+
+    Args:
+        folder: the run folder.
+        needs_std_px: whether the expected error must be there; runs of older versions lack it, and it is NaN then.
 
     Raises:
         InputError: the file is missing or damaged.
@@ -84,9 +88,12 @@ def load_run_trajectory(folder: Path) -> RunTrajectory:
     path = folder / "trajectory.npz"
     if not path.exists():
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
-    arrays = _read_archive(path, "the trajectory of a run", ("homographies", "canvas", "frame_shape", "located", "std_px"), ())
+    required, error = ("homographies", "canvas", "frame_shape", "located"), ("std_px",)
+    names = ((*required, *error), ()) if needs_std_px else (required, error)
+    arrays = _read_archive(path, "the trajectory of a run", *names)
     homographies = _homographies(path, arrays)
-    canvas, located, std_px = arrays["canvas"], arrays["located"], arrays["std_px"]
+    canvas, located = arrays["canvas"], arrays["located"]
+    std_px = arrays.get("std_px", np.full(len(homographies), np.nan))
     if canvas.shape != (3, 3):
         raise InputError(f"{path}: canvas must have the shape (3, 3), got {canvas.shape}")
     if located.shape != (len(homographies),):

@@ -82,7 +82,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)
         results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged)
-        if vignette := _vignette(plan, source, results[-1].trajectory):
+        if vignette := vignette_of(plan, source, results[-1].trajectory):
             decisions.append(vignette.decision)
             source, last, known = divided_by(source, vignette), results[-1].level, results[-1].trajectory
             results[-1:] = estimate_motion(source, [last], plan.graph, reference, context, previous=known)
@@ -102,7 +102,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
     return RunResult(plan.output.directory, record, verdict)
 
 
-def _vignette(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
+def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
     """Measure the vignette of a capture, unless its spec lists corrections, or a merger takes frames that have none."""
     merged_singly = any(level.merge.contribution.name == "splat" for level in plan.levels)
     if not plan.corrects_itself or source.info.kind != "binary" or merged_singly:

@@ -279,14 +279,24 @@ def _contradictions(levels: Sequence[LevelResult]) -> Reason | None:
     if not levels:
         return None
     located = levels[-1].located
-    share = len(located.solution.outliers) / max(len(located.edges), 1)
+    return contradictions(len(located.solution.outliers), len(located.edges))
+
+
+def contradictions(dropped: int, pairs: int) -> Reason | None:
+    """Judge the pairs of the last level.
+
+    Args:
+        dropped: pairs that contradict the others.
+        pairs: all pairs.
+    """
+    share = dropped / max(pairs, 1)
     if share <= MAX_CONTRADICTIONS:
         return None
     return Reason(
         "pairs of exposures contradict each other, as where a scene repeats",
         share,
         MAX_CONTRADICTIONS,
-        f"{len(located.solution.outliers)} of {len(located.edges)} pairs of the last level",
+        f"{dropped} of {pairs} pairs of the last level",
         "look at the path in the report; use a slower motion, or smaller groups",
     )
 

@@ -12,7 +12,7 @@ import pytest
 from pydantic import Field
 from ruamel.yaml import YAML
 
-from photonpano import Config, LocatorContribution, Requirement, hookimpl
+from photonpano import Config, LocatorContribution, Requirement, RunCheck, hookimpl
 from photonpano.cli.plugins import KindName
 from photonpano.pipeline.run import RunResult
 from photonpano.registry import KINDS, BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
@@ -116,6 +116,27 @@ def test_strict_run_fails_if_and_only_if_doubtful(run_with: Callable[..., Any]) 
         "error: the verdict is doubtful, and --strict accepts only a trusted one; all files of the run folder are written\n"
     )
     assert run_with(Verdict("trusted", (), 1.02), "--strict").exit_code == 0
+
+
+@pytest.mark.parametrize(("ratio", "scatter"), [(24.123, "24.12 times what noise explains"), (None, "unknown: too few frames")])
+def test_check_run_prints_verdict_and_what_is_unknown(
+    folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, ratio: float | None, scatter: str
+) -> None:
+    found = RunCheck(Verdict("doubtful", (TREMBLING,), ratio), ("pairs are not judged",))
+    monkeypatch.setattr("photonpano.api.run_check.check_run", lambda *_: found)
+    result = invoke("check-run", "run")
+    assert (result.exit_code, result.stdout) == (0, f"verdict   doubtful\nscatter   {scatter}\n")
+    assert result.stderr == f"{SENTENCE}warning: pairs are not judged\n"
+    strict = invoke("check-run", "run", "--strict")
+    assert strict.exit_code == 1
+    assert strict.stderr.endswith(
+        "error: the verdict is doubtful, and --strict accepts only a trusted one; nothing was written\n"
+    )
+
+
+def test_check_run_agrees_with_run(finished: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("check-run", finished / "run")
+    assert result.stdout.splitlines()[0] == (finished / "run.out").read_text().splitlines()[0]
 
 
 def test_evaluate_table_agrees_with_json(finished: Path, invoke: Callable[..., Any]) -> None:
