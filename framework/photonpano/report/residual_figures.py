@@ -169,8 +169,9 @@ def _misfit_colours(residuals: Residuals) -> dict[str, Any]:
 def _brightness(residuals: Residuals) -> FloatArray:
     """Return the relative excess of photons of each block of the sensor: (h, w), NaN where nothing was predicted."""
     predicted = residuals.blocks[..., M]
-    nothing = np.full(predicted.shape, np.nan)
-    return np.divide(residuals.blocks[..., R], predicted, out=nothing, where=predicted > 0)
+    gain: FloatArray = np.full(predicted.shape, np.nan)
+    np.divide(residuals.blocks[..., R], predicted, out=gain, where=predicted > 0)
+    return gain
 
 
 def _noise_px(information: FloatArray) -> FloatArray:

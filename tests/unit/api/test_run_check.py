@@ -66,7 +66,8 @@ def test_check_run_refuses_missing_capture(finished: Path) -> None:
     cube = finished.parent / "cube.npy"
     cube.unlink()
     assert error_of(finished) == (
-        f"{finished}: the capture of this run cannot be opened by its recorded spec (source: there is no file {cube}; check the path)"
+        f"{finished}: the capture of this run cannot be opened by its recorded spec "
+        f"(source: there is no file {cube}; check the path)"
     )
 
 
