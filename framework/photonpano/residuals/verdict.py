@@ -11,6 +11,7 @@ import numpy as np
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX, GXY, GY_R, GYY, M, R, V
+from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
 from photonpano.values import BoolArray, FloatArray
@@ -25,6 +26,8 @@ MAX_GAIN = 0.03
 """Root mean square of the relative brightness, over the blocks of the sensor or over the spans of the capture."""
 MAX_HOT_SHARE = 0.005
 """Share of the pixels that count far more, or far fewer, photons than the panorama predicts."""
+MAX_LENS_SIGMAS = 5.0
+"""Significance of a lens distortion, in its standard deviations: even a small one bends a long path."""
 MAX_DEFORMATION_PX = 0.1
 """Root mean square of the shifts of blocks of the sensor that no motion of the whole frame explains."""
 MAX_STD_PX = 1.0
@@ -90,6 +93,7 @@ def judge(explained: Explained, levels: Sequence[LevelResult]) -> Verdict:
         lambda: _light(residuals),
         lambda: _sensor(residuals),
         lambda: _hot_pixels(residuals),
+        lambda: _lens(residuals, motion),
         lambda: _deformation(residuals),
         lambda: _uncertain(motion),
         lambda: _contradictions(levels),
@@ -197,20 +201,34 @@ def _hot_pixels(residuals: Residuals) -> Reason | None:
     )
 
 
-def _deformation(residuals: Residuals) -> Reason | None:
-    field, information = block_shifts(residuals)
-    known = information[..., 0, 0] > 0
-    if known.sum() < 12:
-        return None
-    rms, kind = _unexplained_field(field[known], information[known], _unit_places(known))
-    if rms <= MAX_DEFORMATION_PX:
+def _lens(residuals: Residuals, motion: FrameMotion) -> Reason | None:
+    found = lens_distortion(*block_shifts(residuals), motion.homographies[motion.located], residuals.frame_shape)
+    if found is None or found.sigmas <= MAX_LENS_SIGMAS:
         return None
     return Reason(
-        f"frames are deformed as no motion of the whole frame explains{kind}",
-        rms,
+        "the lens distorts the frames, which bends the motion",
+        found.sigmas,
+        MAX_LENS_SIGMAS,
+        f"standard deviations; about {found.k1:.1%} at the corners",
+        "undistort the frames before, or use their middle only (corrections: crop)",
+    )
+
+
+def _deformation(residuals: Residuals) -> Reason | None:
+    shifts, information = block_shifts(residuals)
+    known = information[..., 0, 0] > 0
+    if not known.any():
+        return None
+    noise = np.trace(np.linalg.inv(information[known]), axis1=-2, axis2=-1)
+    size = float(np.sqrt(max(float(np.mean((shifts[known] ** 2).sum(axis=-1) - noise)), 0)))
+    if size <= MAX_DEFORMATION_PX:
+        return None
+    return Reason(
+        "frames are deformed as no motion of the whole frame explains",
+        size,
         MAX_DEFORMATION_PX,
         "px, over the frame",
-        "correct the lens before, or use its middle only (corrections: crop)",
+        "look at the arrows in the report; correct the lens or the rolling shutter before",
     )
 
 
@@ -227,37 +245,6 @@ def block_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     information = np.where(determined[..., None, None], information, 0)
     field = np.linalg.solve(np.where(determined[..., None, None], information, np.eye(2)), right[..., None])[..., 0]
     return np.where(determined[..., None], field, 0), information
-
-
-def _unit_places(known: BoolArray) -> FloatArray:
-    """Return the centres of blocks relative to the centre of the frame, in half diagonals: (N, 2)."""
-    y, x = np.nonzero(known)
-    places = np.stack([x - (known.shape[1] - 1) / 2, y - (known.shape[0] - 1) / 2], axis=-1)
-    return np.asarray(places / np.linalg.norm([(known.shape[1] - 1) / 2, (known.shape[0] - 1) / 2]))
-
-
-def _unexplained_field(field: FloatArray, information: FloatArray, places: FloatArray) -> tuple[float, str]:
-    """Fit a cubic radial field and an affine one to shifts; return the rms of the radial part in px if it is significant."""
-    x, y = places.T
-    radius = (places**2).sum(axis=1)
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    columns = [
-        np.stack([one, zero], axis=-1),
-        np.stack([zero, one], axis=-1),
-        *(np.stack([each, zero], axis=-1) for each in (x, y)),
-        *(np.stack([zero, each], axis=-1) for each in (x, y)),
-        np.stack([x * radius, y * radius], axis=-1),
-    ]
-    design = np.stack(columns, axis=-1)
-    normal = np.einsum("nip,nij,njq->pq", design, information, design) + 1e-9 * np.eye(len(columns))
-    right = np.einsum("nip,nij,nj->p", design, information, field)
-    covariance = np.linalg.inv(normal)
-    found = covariance @ right
-    radial = float(found[-1])
-    if abs(radial) < _SIGMAS * np.sqrt(covariance[-1, -1]):
-        return 0.0, ""
-    shifts = design[..., -1] * radial
-    return float(np.sqrt(np.mean((shifts**2).sum(axis=-1)))), ", growing with the distance from the centre as with a lens"
 
 
 def _uncertain(motion: FrameMotion) -> Reason | None:

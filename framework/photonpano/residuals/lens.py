@@ -1,0 +1,99 @@
+"""Find lens distortion in the mean shifts of blocks of the sensor, with what homographies and panorama absorb left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from photonpano.geometry import apply, corners
+from photonpano.residuals.block_sums import BLOCK_PX
+from photonpano.values import FloatArray
+
+_INSTANTS = 64
+"""Instants of the motion at which the effect of a lens is computed."""
+_SYSTEMATIC_PX = 0.015
+"""Error of the shift of a block beside photon noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensDistortion:
+    """Radial distortion, as residuals show it.
+
+    Attributes:
+        k1: displacement of a corner, relative to its distance from the centre; negative for a barrel. To first order: a strong
+            distortion is found too small.
+        std: its standard deviation.
+    """
+
+    k1: float
+    std: float
+
+    @property
+    def sigmas(self) -> float:
+        """How significant it is."""
+        return abs(self.k1) / self.std
+
+
+def lens_distortion(
+    shifts: FloatArray, information: FloatArray, homographies: FloatArray, frame_shape: tuple[int, int]
+) -> LensDistortion | None:
+    """Estimate radial distortion from the mean shifts of blocks against the panorama; None if there are too few blocks.
+
+    The panorama averages the distortions of all frames that saw a place, and each homography follows the distortion as far as
+    it can. What is left is a pattern over the sensor, which depends on the path and is computed here to first order. Its size
+    in the shifts is the distortion.
+
+    Args:
+        shifts: (h, w, 2) mean shift of each block, in px.
+        information: (h, w, 2, 2) inverse covariances, 0 for blocks without a shift.
+        homographies: (T, 3, 3) of the located frames.
+        frame_shape: (height, width) of a frame.
+    """
+    known = information[..., 0, 0] > 0
+    if known.sum() < _INSTANTS // 4 or len(homographies) < 2:
+        return None
+    pattern = _pattern(known, homographies, frame_shape)
+    covariance = np.linalg.inv(information[known]) + _SYSTEMATIC_PX**2 * np.eye(2)
+    weighted = np.linalg.solve(covariance, pattern[..., None])[..., 0]
+    energy = float((pattern * weighted).sum())
+    if energy < 1:
+        return None
+    # Shifts point from what the motion predicts to what the photons show.
+    return LensDistortion(-float((weighted * shifts[known]).sum()) / energy, energy**-0.5)
+
+
+def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the mean shifts of blocks, in px, that a distortion of 1 would leave: (N, 2)."""
+    rows, columns = np.nonzero(known)
+    height, width = frame_shape
+    x = (columns * BLOCK_PX + np.minimum((columns + 1) * BLOCK_PX, width) - 1) / 2
+    y = (rows * BLOCK_PX + np.minimum((rows + 1) * BLOCK_PX, height) - 1) / 2
+    points = np.stack([x, y], axis=1)
+    centre = corners(frame_shape).mean(axis=0)
+    radius_px = float(np.linalg.norm(corners(frame_shape)[0] - centre))
+    u, v = ((points - centre) / radius_px).T
+    distortion = radius_px * (u**2 + v**2)[:, None] * np.stack([u, v], axis=1)
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    along_x = np.stack([one, zero, u, v, zero, zero, u * u, u * v], axis=1)
+    along_y = np.stack([zero, one, zero, zero, u, v, u * v, v * v], axis=1)
+    moves = sparse.csr_array(np.concatenate([along_x, along_y]))
+
+    instants = np.linspace(0, len(homographies) - 1, min(_INSTANTS, len(homographies))).astype(int)
+    seen = apply(homographies[instants], points)
+    cells = np.floor((seen - seen.min(axis=(0, 1))) / BLOCK_PX).astype(int)
+    cell = (cells[..., 1] * (cells[..., 0].max() + 1) + cells[..., 0])[:, None, :] * 2 + np.arange(2)[:, None]
+    place = np.unique(cell.ravel(), return_inverse=True)[1]
+    # Observations: instant, then coordinate, then block.
+    averages = sparse.csr_array((np.ones(len(place)), (np.arange(len(place)), place)))
+    averages = averages @ sparse.diags_array(1 / np.sqrt(averages.sum(axis=0)))
+    motions = sparse.block_diag([moves] * len(instants), format="csr")
+    shared = averages.T @ motions
+    observed = np.tile(distortion.T.ravel(), len(instants))
+    normal = (motions.T @ motions - shared.T @ shared).toarray()
+    right = motions.T @ observed - shared.T @ (averages.T @ observed)
+    absorbed = motions @ np.linalg.lstsq(normal, right, rcond=1e-7)[0]
+    left = observed - absorbed
+    left -= averages @ (averages.T @ left)
+    return np.asarray(left.reshape(len(instants), 2, -1).mean(axis=0).T)
