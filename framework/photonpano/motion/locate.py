@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,12 +96,16 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
-            solution = solve(len(groups), edges, anchor, shape, registrar.to_plane)
+            start = registrar.to_plane
+            solution = solve(len(groups), edges, anchor, shape, start)
             candidates = closure_candidates(groups, solution, shape, graph)
         closures = tuple(registrar.closures(candidates, solution.homographies, pool))
     with exposures.clock("locate"):
         if closures:
-            solution = solve(len(groups), edges + closures, anchor, shape, registrar.to_plane)
+            alone, solution = solution, solve(len(groups), edges + closures, anchor, shape, start)
+            fair = _not_outvoting(closures, edges, alone, solution)
+            if fair != closures:
+                closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, start)
         information, std_px = solution.assess()
     return LocatedLevel(
         groups,
@@ -112,6 +116,34 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
         std_px,
         shape,
         _ambiguity(level.number, registrar.alternatives_px, edges),
+    )
+
+
+def _not_outvoting(
+    closures: tuple[Edge, ...], edges: Sequence[Edge], alone: GraphSolution, together: GraphSolution
+) -> tuple[Edge, ...]:
+    """Return the loop closures; those are not located that turn other pairs between their exposures into outliers.
+
+    Where a scene repeats, many closures may be wrong by the same distance, and agree with each other. A pair that is uncertain
+    gives way to closures without becoming an outlier; one that becomes an outlier is surer than they are.
+
+    Args:
+        closures: all closures.
+        edges: the other pairs.
+        alone: the solution of the other pairs, whose outliers are wrong anyway.
+        together: the solution with all closures.
+    """
+    outvoted = [edges[index] for index in set(together.outliers) - set(alone.outliers) if index < len(edges)]
+
+    def outvotes(closure: Edge) -> bool:
+        return any(closure.fixed <= edge.fixed and edge.moving <= closure.moving for edge in outvoted)
+
+    reason = "this loop closure contradicts pairs in between that are surer"
+    return tuple(
+        replace(each, motion=NotLocated(reason, each.motion.evidence), locator="")
+        if isinstance(each.motion, Located) and outvotes(each)
+        else each
+        for each in closures
     )
 
 

@@ -207,6 +207,22 @@ def test_similar_but_wrong_closure_is_dropped_as_outlier(run: Callable, level: C
     assert drift_px(found) < 0.15
 
 
+def test_closures_that_agree_on_the_next_period_do_not_outvote_neighbours(run: Callable, level: Callable) -> None:
+    """All closures are off by the period of the plane; two of the other pairs alone stand against them at the turn."""
+
+    def answer(moving: Group, fixed: Group, found: Located) -> Located:
+        motion = drifting(moving, fixed, found)
+        sure = replace(motion, residual_px=0.05)
+        off = translation(PERIOD_PX, 0) @ motion.homography
+        return replace(sure, homography=off) if is_closure(moving, fixed) else sure
+
+    found = run(level(answer))
+    assert all("contradicts pairs in between that are surer" in edge.motion.reason for edge in found.failures)
+    assert len(found.failures) >= len(PAIRS) - 2
+    assert all(index >= len(found.edges) - len(found.closures) for index in found.solution.outliers)
+    assert abs(float(found.homographies[-1, 0, 2] - found.homographies[0, 0, 2])) < 0.5
+
+
 @pytest.mark.parametrize("threads", [2, 4])
 def test_closures_do_not_depend_on_the_number_of_threads(run: Callable, level: Callable, threads: int) -> None:
     alone, several = run(level(), threads=1), run(level(), threads=threads)
