@@ -89,7 +89,7 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         motion = motion_of_frames(results, source.info, reference)
         refiners = build_refiners(plan, source, decisions)
         explained = refine(source, motion, refiners, plan.render.tolerance_px, memory, context)
-        verdict = judge(explained, results)
+        verdict = judge(explained, results, decisions)
         motion = explained.motion
         panorama = render_panorama(
             source, motion.trajectory, motion.span, plan.render, memory, folder.write_tile, context, explained.panorama

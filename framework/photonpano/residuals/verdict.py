@@ -14,7 +14,7 @@ from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX, GXY, GY_R, GYY,
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
-from photonpano.values import BoolArray, FloatArray
+from photonpano.values import BoolArray, Decision, FloatArray
 
 MAX_RATIO = 2.0
 """Scatter of the shifts of short spans, in units of what noise explains."""
@@ -34,6 +34,10 @@ MAX_STD_PX = 1.0
 """Mean expected error of the motion."""
 MAX_CONTRADICTIONS = 0.1
 """Share of the pairs of the last level that were dropped because they contradict the others."""
+MAX_AMBIGUOUS = 0.05
+"""Share of the pairs of a level that fit the scene at another place as well."""
+MAX_STANDING = 0.5
+"""Share of the frame that stands still while the rest moves."""
 _SIGMAS = 6.0
 """A place stands out if it exceeds what is expected by this many standard deviations."""
 _FEWEST = 16
@@ -78,12 +82,13 @@ class Verdict:
     residual_ratio: float | None
 
 
-def judge(explained: Explained, levels: Sequence[LevelResult]) -> Verdict:
+def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
     """Test the result of a run.
 
     Args:
         explained: motion and residuals.
         levels: the results of the loop; empty if they are not known.
+        decisions: what was chosen from the capture, such as the share of the frame that stands still.
     """
     residuals, motion = explained.residuals, explained.motion
     tests: list[Callable[[], Reason | None]] = [
@@ -97,6 +102,8 @@ def judge(explained: Explained, levels: Sequence[LevelResult]) -> Verdict:
         lambda: _deformation(residuals),
         lambda: _uncertain(motion),
         lambda: _contradictions(levels),
+        lambda: _ambiguous(levels),
+        lambda: _standing(decisions),
     ]
     reasons = tuple(reason for test in tests if (reason := test()) is not None)
     ratio = explained.ratio if np.isfinite(explained.ratio) else None
@@ -220,7 +227,12 @@ def _deformation(residuals: Residuals) -> Reason | None:
     if not known.any():
         return None
     noise = np.trace(np.linalg.inv(information[known]), axis1=-2, axis2=-1)
-    size = float(np.sqrt(max(float(np.mean((shifts[known] ** 2).sum(axis=-1) - noise)), 0)))
+    # A shift, roll, zoom or shear of the whole frame is no deformation.
+    rows, columns = np.nonzero(known)
+    affine = np.stack([np.ones(len(rows)), columns, rows], axis=1) / np.sqrt(noise)[:, None]
+    fitted = np.linalg.lstsq(affine, shifts[known] / np.sqrt(noise)[:, None])[0]
+    left = shifts[known] - np.sqrt(noise)[:, None] * (affine @ fitted)
+    size = float(np.sqrt(max(float(np.mean((left**2).sum(axis=-1) - noise)), 0)))
     if size <= MAX_DEFORMATION_PX:
         return None
     return Reason(
@@ -285,6 +297,37 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
         MAX_CONTRADICTIONS,
         f"{dropped} of {pairs} pairs of the last level",
         "look at the path in the report; use a slower motion, or smaller groups",
+    )
+
+
+def _ambiguous(levels: Sequence[LevelResult]) -> Reason | None:
+    for result in levels:
+        located = result.located
+        if located.ambiguity is None:
+            continue
+        share = len(located.ambiguity.pairs) / max(len(located.edges), 1)
+        if share > MAX_AMBIGUOUS:
+            return Reason(
+                "the scene repeats, and pairs of exposures fit at several places",
+                share,
+                MAX_AMBIGUOUS,
+                f"{len(located.ambiguity.pairs)} of {len(located.edges)} pairs of level {result.level.number}, "
+                f"{located.ambiguity.alternative_px:.0f} px away",
+                "look at the path in the report; a slower motion tells the places apart",
+            )
+    return None
+
+
+def _standing(decisions: Sequence[Decision]) -> Reason | None:
+    share = next((float(each.value) for each in decisions if each.what == "standing_share"), 0.0)
+    if share <= MAX_STANDING:
+        return None
+    return Reason(
+        "more than half of the frame stands still while the rest moves",
+        share,
+        MAX_STANDING,
+        "share of the parts that show motion or rest",
+        "mask what stands in the frame (corrections: mask); the motion may be that of either part",
     )
 
 
