@@ -28,6 +28,7 @@ from photonpano import discover, hookspecs, parse_spec
 from photonpano.captures.writing import truth_path
 from photonpano.cli.app import app
 from photonpano.corrections import CORRECTIONS
+from photonpano.residuals import verdict
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "examples").glob("*/README.md"))]
@@ -278,6 +279,17 @@ def test_architecture_page_lists_import_layers_bottom_up():
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
     layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
     assert shown == [set(re.findall(r"photonpano\.(\w+)", layer)) for layer in reversed(layers)]
+
+
+def test_trust_page_shows_thresholds_of_verdict():
+    page = (ROOT / "docs" / "explanation" / "trust.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\|[^|]+\|[^|]+\| ([\d.]+) \|$", page, re.MULTILINE)
+    limits = (
+        *(verdict.MAX_MISFIT, verdict.MAX_MOVING_SHARE, verdict.MAX_RATIO, verdict.MAX_GAIN, verdict.MAX_GAIN),
+        *(verdict.MAX_HOT_SHARE, verdict.MAX_DEFORMATION_PX, verdict.MAX_STD_PX, verdict.MAX_CONTRADICTIONS),
+    )
+    assert shown == [f"{limit:g}" for limit in limits]
+    assert f"more than {100 * verdict.MAX_CONTRAST:g} % of the light" in page
 
 
 @pytest.fixture(scope="module")
