@@ -104,7 +104,7 @@ def align(
         max_steps: step limit.
     """
     shape = (template.image.shape[0], template.image.shape[1])
-    buffers = _buffers(shape)
+    buffers = buffers_of(template)
     status, homography, pixels, squares, weights = descent.descend(
         template,
         fixed,
@@ -137,8 +137,9 @@ def _to_corners(shape: tuple[int, int], free: tuple[int, ...]) -> FloatArray:
 _of_thread = local()
 
 
-def _buffers(shape: tuple[int, ...]) -> Buffers:
-    """Return the buffers of this thread for images of a shape."""
+def buffers_of(layer: Layer) -> Buffers:
+    """Return the buffers of this thread for images of the shape of a layer."""
+    shape = layer.image.shape
     buffers: dict[tuple[int, ...], Buffers] = _of_thread.__dict__.setdefault("buffers", {})
     if shape not in buffers:
         buffers[shape] = Buffers(*(np.empty(size, np.float32) for size in (shape, shape, (2, *shape))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from photonpano.photometry import Similarity
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.layers import Layer
+from photonpano_direct.majority import JUDGED, Follows, follows, masked, shifts_between
 from photonpano_direct.pyramid import Pyramid, pyramid_of
 from photonpano_direct.similarity import similarity_under
 from photonpano_direct.small_matrices import rescaled
@@ -26,13 +28,32 @@ _PEAK_PX = 0.5
 """Standard deviation of the peaks of the phase correlation, px of the coarsest layer."""
 _RIVAL = 0.7
 """Peaks of at least this share of the highest one are hypotheses, too."""
+_RESTRICTED = 2
+"""A motion that is tried is aligned twice, each time where the last one fits."""
 _BLUR_DIFFERENCE = 0.1
 """Largest residual that different motion blur explains, as a fraction of the contrast. In much light this is many times the
 photon noise."""
 
 
+class _Descent(NamedTuple):
+    """The alignment of some layers.
+
+    Attributes:
+        homography: (3, 3) the motion, in pixels of the finest layer.
+        found: scales of the layers on which all parameters were estimated, and their alignments, coarsest first.
+        failure: why a layer could not be aligned, of the last one that could not; None if all could.
+    """
+
+    homography: Homography
+    found: Sequence[tuple[float, Aligned]]
+    failure: NotLocated | None
+
+
 class DirectLocator:
-    """Aligns exposures by their brightness, coarse to fine, weighted by the photon statistics of both."""
+    """Aligns exposures by their brightness, coarse to fine, weighted by the photon statistics of both.
+
+    Where a part of the image follows another motion than most of it, such as an object, that part is left out.
+    """
 
     def __init__(self, config: DirectConfig) -> None:
         self._config = config
@@ -58,11 +79,31 @@ class DirectLocator:
         if not (moving.layers[-1].weight.any() and fixed.layers[-1].weight.any()):
             return NotLocated(NOTHING_SEEN)
         n_layers = len(moving.layers)
+        searches = initial is None
         if initial is None:
             initial = next(iter(self.hypotheses(moving, fixed)), np.eye(3))
-        prior_mean = homography = np.array(initial, dtype=np.float64)
+        start = np.array(initial, dtype=np.float64)
+        judged = min(JUDGED, n_layers - 1)
+        coarse = self._descend(moving, fixed, start, start, range(judged, n_layers))
+        moving, coarse = self._of_majority(moving, fixed, coarse, judged, searches)
+        fine = self._descend(moving, fixed, coarse.homography, start, range(judged))
+        found = [*coarse.found, *fine.found]
+        # The failure of a coarse layer does not count: the next one starts where it started.
+        if not found:
+            return fine.failure or coarse.failure or NotLocated(NOTHING_SEEN)
+        scale, homography, quality = _best(found)
+        similarity = similarity_under(rescaled(homography, 0.5**moving.compared), moving.details, fixed.details)
+        # The variance of noise, in pixels of a layer, falls with their area.
+        contrast = moving.details.contrast * (0.5**moving.compared / scale) ** 2
+        return self._judged(homography, quality, scale, similarity, contrast)
+
+    def _descend(
+        self, moving: Pyramid, fixed: Pyramid, homography: Homography, prior_mean: Homography, depths: range
+    ) -> _Descent:
+        """Align some layers, the coarsest first; a layer that fails is skipped."""
+        n_layers, failure = len(moving.layers), None
         found: list[tuple[float, Aligned]] = []
-        for depth in reversed(range(n_layers)):
+        for depth in reversed(depths):
             free, scale = free_parameters(depth, n_layers), 0.5**depth
             aligned = align(
                 moving.layers[depth],
@@ -78,18 +119,47 @@ class DirectLocator:
                 aligned = NotLocated(
                     f"both exposures see {aligned.overlap:.0%} of the image, less than min_overlap = {least:g}"
                 )
-            if isinstance(aligned, Aligned):
-                homography = rescaled(aligned.homography, 1 / scale)
-                if free == ALL_PARAMETERS:
-                    found.append((scale, aligned))
-            elif depth == 0 and not found:
-                # The failure of a coarse layer does not count: the next one starts where it started.
-                return aligned
-        scale, homography, quality = _best(found)
-        similarity = similarity_under(rescaled(homography, 0.5**moving.compared), moving.details, fixed.details)
-        # The variance of noise, in pixels of a layer, falls with their area.
-        contrast = moving.details.contrast * (0.5**moving.compared / scale) ** 2
-        return self._judged(homography, quality, scale, similarity, contrast)
+            if isinstance(aligned, NotLocated):
+                failure = aligned
+                continue
+            homography = rescaled(aligned.homography, 1 / scale)
+            if free == ALL_PARAMETERS:
+                found.append((scale, aligned))
+        return _Descent(homography, found, failure)
+
+    def _of_majority(
+        self, moving: Pyramid, fixed: Pyramid, first: _Descent, judged: int, searches: bool
+    ) -> tuple[Pyramid, _Descent]:
+        """Restrict an alignment to the larger part that follows one motion, if the images do not follow it as a whole.
+
+        Of several motions, that of the camera fits most of the image.
+
+        Args:
+            moving: the template.
+            fixed: the other image.
+            first: the alignment of the coarse layers, down to the layer `judged`.
+            judged: number of the layer on which parts are compared.
+            searches: whether other motions are tried.
+        """
+        n_layers = len(moving.layers)
+
+        def part_of(homography: Homography) -> Follows:
+            return follows(moving.layers[judged], fixed.layers[judged], rescaled(homography, 0.5**judged))
+
+        def aligned(kept: Pyramid, motion: Homography) -> _Descent:
+            return self._descend(kept, fixed, motion, motion, range(judged, n_layers))
+
+        part, motion = part_of(first.homography), first.homography
+        if not part.suspect:
+            return moving, first
+        for shift in shifts_between(moving.layers[-1], fixed.layers[-1]) if searches else ():
+            other = rescaled(shift, 2.0 ** (n_layers - 1))
+            for _ in range(_RESTRICTED):
+                other = aligned(masked(moving, part_of(other).rather_than(part)), other).homography
+            if (larger := part_of(other)).more_than(part):
+                part, motion = larger, other
+        moving = masked(moving, part.part)
+        return moving, aligned(moving, motion)
 
     def _judged(
         self, homography: Homography, quality: Quality, scale: float, similarity: Similarity, contrast: float

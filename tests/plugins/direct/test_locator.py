@@ -14,6 +14,8 @@ from photonpano.locating import NO_TEXTURE, NOTHING_SEEN
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.locator import DirectLocator
+from photonpano_direct.majority import JUDGED, follows
+from photonpano_direct.small_matrices import rescaled
 
 SHAPE = (160, 240)
 STILL = np.eye(3)
@@ -163,3 +165,29 @@ def test_difference_by_motion_blur_is_accepted_in_much_light(street: np.ndarray)
     flickering = register(seen(400, 0.8), seen(402, 0.8, brightness=0.5), STILL)
     assert isinstance(flickering, NotLocated)
     assert "times that blur explains" in flickering.reason
+
+
+def with_object(scene: VirtualExposure, front: VirtualExposure) -> VirtualExposure:
+    """Put the middle of another exposure, 37 % of the image, in front of a scene."""
+    flux = scene.flux.copy()
+    flux[32:127, 45:195] = front.flux[32:127, 45:195]
+    return replace(scene, flux=flux)
+
+
+@pytest.mark.parametrize("initial", [None, translation(13, -4)], ids=["no motion known", "motion known"])
+def test_object_that_moves_by_itself_does_not_change_motion(seen_from: Callable, initial: np.ndarray | None) -> None:
+    true, elsewhere, own = translation(14, -5), translation(-300, 150), translation(-3, 2)
+    moving = with_object(seen_from(true, seed=1), seen_from(elsewhere @ own, seed=3))
+    fixed = with_object(seen_from(STILL, seed=2), seen_from(elsewhere, seed=4))
+    located = register(moving, fixed, initial)
+    assert isinstance(located, Located), located
+    error_px = corner_displacements(located.homography, true, SHAPE).mean()
+    assert error_px < min(0.2, 3 * located.residual_px)
+
+
+def test_image_that_moves_as_a_whole_is_aligned_as_a_whole(seen_from: Callable) -> None:
+    """No part is left out, so that nothing of its information is lost."""
+    moving, fixed = (LOCATOR.describe(seen_from(motion, seed)) for seed, motion in enumerate((translation(9, 4), STILL)))
+    part = follows(moving.layers[JUDGED], fixed.layers[JUDGED], rescaled(translation(9, 4), 0.5**JUDGED))
+    assert not part.suspect
+    assert part.part.mean() > 0.99

@@ -1,0 +1,170 @@
+"""Find the part of an image that follows a motion; objects that move by themselves do not follow that of the camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+
+from photonpano.geometry import translation
+from photonpano_direct.alignment import buffers_of
+from photonpano_direct.moments import residuals_and_moments
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano import BoolArray, Homography
+    from photonpano_direct.layers import Layer
+    from photonpano_direct.pyramid import Pyramid
+
+JUDGED = 1
+"""Number of the layer on which parts are compared: coarse, so that neither noise nor a small error of the motion matters."""
+_SIDE_PX = 7
+"""Side of the square in which both images are compared, px of that layer."""
+_DIFFERENT = 0.5
+"""Least variance of the difference of two aligned images, relative to the sum of their variances, where they show different
+things; it is 0 for the same thing and 1 for unrelated ones."""
+_SURE = 4.0
+"""Standard errors by which the variances must exceed those of noise."""
+_ALIKE = 0.25
+"""Largest such difference of a part that is aligned by itself."""
+_SUSPECT = 0.12
+"""Mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less."""
+_CLEARLY = 0.5
+"""A pixel clearly follows the motion that leaves less than half of the difference of another one."""
+_SEARCH_PX, _NEAR_PX = 5, 2
+"""Side of the squares that are compared in a search for shifts, and the distance of two shifts that are tried, px."""
+_LEAST_SEEN = 0.3
+"""Least share of the template that both images show under a shift."""
+_TRIED = 3
+"""Number of shifts that a search returns."""
+
+
+class Follows(NamedTuple):
+    """What follows a motion.
+
+    Attributes:
+        difference: (H, W) float32, local variance of the difference of the aligned images relative to the sum of their
+            variances, from 0 to 1; NaN where there is too little texture to tell.
+    """
+
+    difference: NDArray[np.float32]
+
+    @property
+    def part(self) -> BoolArray:
+        """(H, W), True where the image follows, and where it has too little texture to tell."""
+        return ~(self.difference > _ALIKE)
+
+    def rather_than(self, other: Follows) -> BoolArray:
+        """(H, W), True where the image clearly follows this motion and not another one."""
+        return np.asarray(self.difference < _CLEARLY * other.difference)
+
+    @property
+    def suspect(self) -> bool:
+        """Whether a part of the image may move otherwise."""
+        textured = self.difference[np.isfinite(self.difference)]
+        return bool(textured.size) and float(np.minimum(textured, _DIFFERENT).mean()) > _SUSPECT
+
+    def more_than(self, other: Follows) -> bool:
+        """Whether the part that clearly follows this motion is larger, and spreads further, than that of another motion.
+
+        The scene surrounds an object, so an area counts by its extent.
+        """
+        return _spread(self.rather_than(other)) > _spread(other.rather_than(self))
+
+
+def _spread(part: BoolArray) -> float:
+    """Return the number of pixels of a part times the standard deviations of their coordinates."""
+    y, x = np.nonzero(part)
+    return float(len(y) * y.std() * x.std()) if len(y) else 0.0
+
+
+def follows(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
+    """Find the part of a template that follows a motion.
+
+    Args:
+        moving: the template.
+        fixed: the other image, of the same shape.
+        homography: (3, 3), pixels of the template to pixels of the fixed image.
+    """
+    buffers = buffers_of(moving)
+    buffers = buffers_of(moving)
+    residuals_and_moments(moving, fixed, homography, buffers, np.empty((3, 3)), np.empty((3, 3)))
+    seen = (buffers.weight > 0).astype(np.float32)
+    near = _averaged(seen)
+    noise_left = 1 / (4 * np.pi * moving.blur_px**2)
+    noise = noise_left * np.divide(seen, buffers.weight, out=np.zeros_like(seen), where=seen > 0)
+    noise = _averaged(np.asarray(noise, np.float32)) / np.maximum(near, np.float32(1e-6))
+    difference, first, second = (
+        _variance(image * seen, near) for image in (buffers.residual, moving.image, moving.image + buffers.residual)
+    )
+    chance = _SURE * np.sqrt(2 / (_SIDE_PX**2 * noise_left)) * noise
+    texture = first + second - noise
+    textured = (near > _DIFFERENT) & (seen > 0) & (texture > chance)
+    relative = np.clip((difference - noise) / np.maximum(texture, np.float32(1e-12)), 0, 1)
+    return Follows(np.where(textured, relative, np.float32(np.nan)))
+
+
+def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
+    """Return the shifts under which most of a template fits, the best first: whatever moves otherwise counts at most half.
+
+    All shifts by whole pixels, up to a third of the image, are compared.
+
+    Args:
+        moving: the template.
+        fixed: the other image, of the same shape.
+    """
+    height, width = moving.image.shape
+    reach_y, reach_x = height // 3, width // 3
+    seen, margins = (moving.weight > 0).astype(np.float32), ((reach_y, reach_y), (reach_x, reach_x))
+    image, known = np.pad(fixed.image, margins), np.pad((fixed.weight > 0).astype(np.float32), margins)
+    shifts = [(y, x) for y in range(-reach_y, reach_y + 1) for x in range(-reach_x, reach_x + 1)]
+    squares = np.empty((len(shifts), height, width), np.float32)
+    for index, (y, x) in enumerate(shifts):
+        part = slice(reach_y + y, reach_y + y + height), slice(reach_x + x, reach_x + x + width)
+        both = known[part] * seen
+        near = _blur(both, _SEARCH_PX)
+        difference = _blur(((image[part] - moving.image) * both) ** 2, _SEARCH_PX)
+        squares[index] = np.where(near > 0.5, difference / np.maximum(near, np.float32(1e-6)), np.float32(np.nan))
+    n_seen = np.isfinite(squares).sum(axis=(1, 2))
+    # Each pixel counts relative to its usual difference, so that a part with strong contrast counts no more than others.
+    ordered = np.sort(squares, axis=0)  # NaN comes last
+    middle = np.isfinite(squares).sum(axis=0, keepdims=True) // 2
+    usual = np.maximum(np.nan_to_num(np.take_along_axis(ordered, middle, axis=0)), np.float32(1e-12))
+    relative = np.minimum(squares / usual, _DIFFERENT)
+    misfit = np.nansum(relative, axis=(1, 2)) / np.maximum(np.isfinite(relative).sum(axis=(1, 2)), 1)
+    misfit[n_seen < _LEAST_SEEN * height * width] = np.inf
+    found: list[tuple[int, int]] = []
+    for index in np.argsort(misfit):
+        y, x = shifts[index]
+        if all(max(abs(y - other_y), abs(x - other_x)) >= _NEAR_PX for other_y, other_x in found):
+            found.append((y, x))
+        if len(found) == _TRIED:
+            break
+    return [translation(x, y) for y, x in found]
+
+
+def masked(pyramid: Pyramid, part: BoolArray) -> Pyramid:
+    """Return a pyramid of which only a part is used, given on any of its layers."""
+
+    def limited(weight: NDArray[np.float32]) -> NDArray[np.float32]:
+        size = weight.shape[1], weight.shape[0]
+        return weight * cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+
+    layers = tuple(layer._replace(weight=limited(layer.weight)) for layer in pyramid.layers)
+    return pyramid._replace(layers=layers, details=pyramid.details._replace(weight=limited(pyramid.details.weight)))
+
+
+def _variance(image: NDArray[np.float32], near: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the variance in the square around each pixel; `image` is 0 where nothing is seen."""
+    near = np.maximum(near, np.float32(1e-6))
+    return np.asarray(_averaged(image * image) / near - (_averaged(image) / near) ** 2, np.float32)
+
+
+def _averaged(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return _blur(image, _SIDE_PX)
+
+
+def _blur(image: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    return np.asarray(cv2.blur(image, (side, side)), np.float32)
