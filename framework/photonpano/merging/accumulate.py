@@ -21,7 +21,7 @@ from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
 """Chunks that are summed before they are added to the grid."""
-_PART_ROWS = 128
+_PART_ROWS = 64
 """Rows of the grid, about, that a thread adds to at a time."""
 MIN_WEIGHT = 1.0
 """Pixels with less weight than this, in frames, are unknown."""
@@ -61,7 +61,6 @@ def accumulate(
     shape: tuple[int, int],
     advance: Callable[[int], None] | None = None,
     pool: Executor | None = None,
-    threads: int = 1,
     counts_of: Callable[[FrameSpan], Counts] | None = None,
 ) -> PhotonSum:
     """Sum the frames of chunks on a grid, each chunk warped once.
@@ -76,13 +75,14 @@ def accumulate(
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
         advance: called with the number of frames of each chunk that is done; first with that of all chunks off the grid.
-        pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on it.
-        threads: number of threads of the pool.
+        pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on its
+            number of threads.
         counts_of: returns the uncorrected sum of the frames of a span, such as a `CountsCache`; `source.counts` by default.
     """
     total = _Total.zeros(shape)
-    # Parts are narrow, so that every thread has work wherever frames lie on the grid.
-    n_parts = 1 if threads == 1 else max(threads, shape[0] // _PART_ROWS)
+    # Parts are narrow, so that every thread has work wherever frames lie on the grid. Their number does not depend on that of
+    # the threads, since OpenCV rounds a warp by where it starts.
+    n_parts = max(1, shape[0] // _PART_ROWS) if pool else 1
     parts = [total.rows(part) for part in divided(shape[0], n_parts)]
     masked = None if source.valid.all() else source.valid.astype(np.float32)
     corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None

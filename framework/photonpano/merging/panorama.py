@@ -156,7 +156,7 @@ def render_tiles(
     ):
         for tile in tiles:
             grid = tile.canvas
-            photons = accumulate(source, chunks, grid.transform, grid.shape, advance, pool, context.threads)
+            photons = accumulate(source, chunks, grid.transform, grid.shape, advance, pool)
             yield Panorama(*photons.estimate(source.response), grid.transform)
 
 
