@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from photonpano.geometry import corners
 from photonpano.residuals.measure import Residuals
@@ -16,6 +17,9 @@ _LOCAL_SPANS = 33
 """The size is averaged over this many spans."""
 _SIGNIFICANT = 3.0
 """Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations."""
+_STANDS_OUT = 30.0
+"""A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
+200,000 spans."""
 
 
 def residual_ratio(residuals: Residuals) -> float:
@@ -38,7 +42,8 @@ def residual_ratio(residuals: Residuals) -> float:
 def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
     """Return the corner error that the residuals show beyond photon noise, for every frame: (n_frames,).
 
-    It is the root mean square over 33 spans around the frame, 0 where noise explains it.
+    It is the root mean square over 33 spans around the frame, or the step of a single span if that stands out, as at a place
+    where frames are missing; 0 where noise explains it.
 
     Args:
         residuals: of the motion.
@@ -58,7 +63,10 @@ def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
     )
     excess = local - floor
     found = np.where(excess > _SIGNIFICANT * np.sqrt(width / size), np.sqrt(np.maximum(excess, 0)), 0)
-    return np.interp(np.arange(n_frames), residuals.instants[known], found)
+    # The frames of a span and of its neighbours may move by as much as its step.
+    single = np.where((steps[known] ** 2 / variances[known]).sum(axis=1) > _STANDS_OUT, np.sqrt(squares), 0)
+    found = np.maximum(found, sliding_window_view(np.pad(single, 1), 3).max(axis=1))
+    return np.asarray(np.interp(np.arange(n_frames), residuals.instants[known], found))
 
 
 def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
