@@ -40,6 +40,7 @@ _WINDOW_SPANS = 512
 """Longest window of the spectrum."""
 _MISFIT_RANGE = (0.5, 2.0)
 """The smallest range of colours of the misfit; the largest misfit that is drawn may widen it."""
+_MISFIT_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _GAIN_RANGE_PERCENT = 5.0
 """The smallest range of colours of the brightness, to both sides."""
 
@@ -123,7 +124,8 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
 def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     """Return the power spectrum of the shifts of short spans, divided by that of their photon noise.
 
-    It is the mean of windows that overlap by half, and of both directions (Welch 1967).
+    It is the mean of windows that overlap by half, and of both directions (Welch 1967). The mean shift is left out: it moves
+    the whole panorama.
 
     Returns:
         (F,) frequencies in cycles per frame, and (F,) power; 1 is noise. Both are empty for fewer than 16 spans.
@@ -133,6 +135,7 @@ def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     ratios = np.where(np.isfinite(stds), found.steps[:, :2] / stds, 0)
     if len(ratios) < _FEWEST_SPANS:
         return np.zeros(0), np.zeros(0)
+    ratios = ratios - ratios.mean(axis=0)
     size = min(_WINDOW_SPANS, len(ratios))
     taper = np.hanning(size + 2)[1:-1, None]
     starts = range(0, len(ratios) - size + 1, max(1, size // 2))
@@ -159,11 +162,13 @@ def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | 
 
 
 def _misfit_colours(residuals: Residuals) -> dict[str, Any]:
-    """Return one scale of colours for all maps of the misfit."""
+    """Return one scale of colours for all maps of the misfit: logarithmic, as noise is near 1 and a moving thing at 100."""
+    from matplotlib.colors import LogNorm
+
     drawn = np.r_[residuals.cell_misfit[residuals.cell_count >= _FEWEST_BLOCKS], residuals.block_misfit.ravel()]
     drawn = drawn[np.isfinite(drawn)]
     high = float(np.quantile(drawn, 0.99)) if len(drawn) else 0.0
-    return {"cmap": "inferno", "vmin": _MISFIT_RANGE[0], "vmax": max(_MISFIT_RANGE[1], high)}
+    return {"cmap": "inferno", "norm": LogNorm(_MISFIT_RANGE[0], max(_MISFIT_RANGE[1], high))}
 
 
 def _brightness(residuals: Residuals) -> FloatArray:
@@ -187,6 +192,9 @@ def _blocks_extent(residuals: Residuals) -> tuple[float, float, float, float]:
 
 def _add_colour_bar(figure: Figure, axes: Axes, image: Any, label: str, fraction: float, numbers: str = "{x:.3g}") -> None:
     bar = figure.colorbar(image, ax=axes, fraction=fraction, pad=0.02, shrink=0.9, aspect=14, format=numbers)
+    if image.norm.vmin > 0:
+        bar.set_ticks([tick for tick in _MISFIT_TICKS if image.norm.vmin <= tick <= image.norm.vmax])
+        bar.ax.minorticks_off()
     bar.outline.set_visible(False)
     bar.set_label(label)
 
