@@ -22,10 +22,10 @@ from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
 from photonpano.residuals.refinement import refine
-from photonpano.residuals.verdict import Reason, Verdict, contradictions, judge
+from photonpano.residuals.verdict import REPEATS, Reason, Verdict, contradictions, judge
 from photonpano.specs import Plan, parse_spec
 from photonpano.threads import one_thread_inside, thread_count
-from photonpano.values import FrameSpan, StreamInfo
+from photonpano.values import Decision, FrameSpan, StreamInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,8 @@ class RunCheck:
 def check_run(run_folder: Path | str, progress: Progress | None = None, catalog: Catalog | None = None) -> RunCheck:
     """Judge a finished run: render the panorama along its motion, and compare it with the photons of the capture.
 
-    Writes nothing. The panorama is rendered with the scale of the frames, whatever that of the run was.
+    Writes nothing. The panorama is rendered with the scale of the frames, whatever that of the run was. What only the loop can
+    find, such as pairs that fit at several places, is taken from the record.
 
     Args:
         run_folder: written by `run`.
@@ -64,7 +65,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
             source = divided_by(source, vignette)
         context = Context(thread_count(plan.run.threads), progress or Quiet())
         explained = refine(source, motion, (), plan.render.tolerance_px, int(plan.run.memory), context)
-    verdict = judge(explained, ())
+    verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
     unknown = []
     if np.isnan(run.std_px).any():
         unknown.append("trajectory.npz has no std_px, as it is of an older version: the expected error is not judged")
@@ -73,6 +74,9 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
         unknown.append("run.json does not list contradicting pairs, as it is of an older version: they are not judged")
     elif (reason := contradictions(*pairs)) is not None:
         verdict = _with(verdict, reason)
+    for found in (record.get("verdict") or {"reasons": ()})["reasons"]:
+        if found["what"] == REPEATS:
+            verdict = _with(verdict, Reason(**found))
     return RunCheck(verdict, tuple(unknown))
 
 

@@ -38,6 +38,8 @@ MAX_AMBIGUOUS = 0.05
 """Share of the pairs of a level that fit the scene at another place as well."""
 MAX_STANDING = 0.5
 """Share of the frame that stands still while the rest moves."""
+REPEATS = "the scene repeats, and pairs of exposures fit at several places"
+"""The reason that only the loop can find: a run folder does not hold the other places."""
 _SIGMAS = 6.0
 """A place stands out if it exceeds what is expected by this many standard deviations."""
 _FEWEST = 16
@@ -308,7 +310,7 @@ def _ambiguous(levels: Sequence[LevelResult]) -> Reason | None:
         share = len(located.ambiguity.pairs) / max(len(located.edges), 1)
         if share > MAX_AMBIGUOUS:
             return Reason(
-                "the scene repeats, and pairs of exposures fit at several places",
+                REPEATS,
                 share,
                 MAX_AMBIGUOUS,
                 f"{len(located.ambiguity.pairs)} of {len(located.edges)} pairs of level {result.level.number}, "

@@ -13,6 +13,7 @@ import pytest
 
 from photonpano import InputError, check_run
 from photonpano.pipeline.run import RunResult
+from photonpano.residuals.verdict import REPEATS
 
 
 @pytest.fixture
@@ -100,6 +101,17 @@ def test_check_run_judges_recorded_contradictions(finished: Path) -> None:
     pair = {"moving": [0, 50], "fixed": [50, 100]}
     change(finished, lambda record: record["levels"][-1].update(pairs=10, contradictions=[pair, pair]))
     assert check_run(finished).verdict.reasons[-1].where == "2 of 10 pairs of the last level"
+
+
+def test_check_run_keeps_what_only_the_run_can_find(finished: Path) -> None:
+    repeats = {"what": REPEATS, "figure": 0.2, "threshold": 0.05, "where": "4 of 20 pairs", "what_to_do": "look"}
+    other = repeats | {"what": "the light changes over time"}
+    standing = {"what": "standing_share", "value": 0.7, "reason": "measured"}
+    change(finished, lambda record: record["verdict"].update(reasons=[repeats, other]))
+    change(finished, lambda record: record["decisions"].insert(0, standing))
+    found = [reason.what for reason in check_run(finished).verdict.reasons]
+    assert found[-2:] == ["more than half of the frame stands still while the rest moves", REPEATS]
+    assert other["what"] not in found
 
 
 def test_check_run_refuses_folder_that_is_no_run(finished: Path, tmp_path: Path) -> None:
