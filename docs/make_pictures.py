@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 from photonpano import FrameSpan, Group, StageContext, StreamInfo, discover, evaluate, load_spec, open_source, parse_spec, run
 from photonpano.captures.writing import truth_path, write_packed
+from photonpano.context import Context
 from photonpano.geometry import (
     FrameTrajectory,
     corner_displacements,
@@ -32,7 +33,11 @@ from photonpano.geometry import (
     parameters,
     translation,
 )
+from photonpano.merging.panorama import plan_canvas, render
 from photonpano.photometry import BinaryResponse, tone_mapped
+from photonpano.report.residual_figures import spectrum_over_noise
+from photonpano.residuals.measure import measure
+from photonpano.residuals.prediction import Prediction
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -80,6 +85,27 @@ HIGH_SPEED = {
     },
 }
 """A conventional camera pans along the street in 0.4 seconds."""
+TREMOR = {
+    "version": 1,
+    "source": {
+        "use": "simulator",
+        "with": {
+            "scene": {"kind": "street", "width": 1024, "height": 682},
+            "path": {
+                "kind": "pan",
+                "length_px": 100,
+                "angle_deg": 10,
+                "shake": {"rms_px": 1.0, "frequencies_hz": [223, 590, 1270]},
+            },
+            "flux": 0.2,
+            "n_frames": 6000,
+            "frame_shape": [160, 240],
+        },
+    },
+}
+"""The camera trembles faster than groups of 180 frames."""
+REFINERS = {"without": ("tab:orange", "[]"), "with": ("tab:blue", "short-spans")}
+"""Runs without and with the refiner, with the colours of their lines."""
 GROUP_SIZE = 125
 LEVELS = ("one level", "two levels", "three levels")
 WAYS = ("scan", "constant groups", "naive average")
@@ -119,6 +145,12 @@ def main() -> None:
     save("first-panorama.png", picture(tifffile.imread(in_folder(folder, "scan") / "panorama.tiff"), 0.67))
     save("baselines.png", baselines(folder))
     save("hot-pixels.png", hot_pixels(folder))
+
+    trembling = written(parse_spec(TREMOR), folder / "tremor.npy")
+    for name, (_, refiner) in REFINERS.items():
+        plan = parse_spec(tremor_spec(trembling), overrides=[f"refine={refiner}"], output=in_folder(folder, f"tremor {name}"))
+        finish(plan, f"tremor {name}", trembling)
+    save("tremor.png", tremor(folder, trembling))
 
     video = filmed(parse_spec(HIGH_SPEED), folder / "high-speed.mp4")
     source = {"use": "video", "with": {"path": str(video.absolute()), "frame_rate_hz": 500}}
@@ -288,6 +320,36 @@ def interpolation(cube: Path) -> Picture:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., 2::-1]
+
+
+def tremor_spec(cube: Path) -> dict[str, Any]:
+    """Return a spec whose groups are longer than the periods of the tremor."""
+    source = {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96800}}
+    return {"version": 1, "source": source, "resample": {"with": {"group_size": 180}}}
+
+
+def tremor(folder: Path, cube: Path) -> Picture:
+    """Return a plot of the spectra of the shifts of short spans against the panorama."""
+    figure = Figure(figsize=(10, 3.2), dpi=100, layout="constrained")
+    panel = figure.subplots()
+    with open_source(parse_spec(tremor_spec(cube))) as source:
+        span, shape = source.info.span, source.info.frame_shape
+        for name, (colour, _) in REFINERS.items():
+            trajectory = motion(in_folder(folder, f"tremor {name}"))
+            canvas = plan_canvas(trajectory, span, shape, 1.0, 2**30)
+            panorama = render(source, trajectory, span, canvas, 0.25, Context())
+            residuals = measure(source, span, Prediction.of(panorama, source.response, trajectory, shape), Context())
+            frequencies, power = spectrum_over_noise(residuals)
+            panel.semilogy(96_800 * frequencies, power, color=colour, linewidth=1.2, label=f"{name} the refiner short-spans")
+    panel.axhline(1, color="0.5", linewidth=0.8, linestyle="--")
+    panel.set_xlim(0, 3000)
+    panel.set_xlabel("frequency (Hz)", fontsize=9)
+    panel.set_ylabel("power / noise", fontsize=9)
+    panel.tick_params(labelsize=8)
+    panel.legend(fontsize=8)
+    drawn = FigureCanvasAgg(figure)
+    drawn.draw()
+    return np.asarray(drawn.buffer_rgba())[..., 2::-1]
 
 
 def between_knots(
