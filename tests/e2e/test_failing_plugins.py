@@ -189,7 +189,7 @@ def test_run_names_failing_plugin_and_keeps_run_folder(
     [
         (bool, Fragile.fails, "failed at frames 0 to 15: RuntimeError: the cable came loose"),
         (lambda span: len(span) > 16, Fragile.fails, "failed at frames 0 to 49: RuntimeError: the cable came loose"),
-        (lambda span: span.start > 289, Fragile.fails, "failed at frames 290 to 290: RuntimeError: the cable came loose"),
+        (lambda span: span.start > 289, Fragile.fails, "failed at frames 290 to 293: RuntimeError: the cable came loose"),
         (
             bool,
             lambda *_: np.zeros(4, np.uint32),

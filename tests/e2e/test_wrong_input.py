@@ -91,8 +91,8 @@ CASES = {
     "wrong dtype": Case(
         saved(FRAMES),
         2,
-        "DIR/spec.yaml:2:1: source: DIR/cube.npy holds bool values, not packed uint8; "
-        "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)\n" + ONE_PROBLEM,
+        "DIR/spec.yaml:2:1: source: DIR/cube.npy holds bool values, not bytes of eight pixels; "
+        "write source: {use: npy, with: {path: DIR/cube.npy, holds: bits}}\n" + ONE_PROBLEM,
     ),
     "too few dimensions": Case(
         saved(PACKED[0]),
@@ -115,7 +115,7 @@ CASES = {
         saved(FRAMES.astype(np.uint8)),
         2,
         "DIR/spec.yaml:2:1: source: DIR/cube.npy has rows of 48 bytes, which hold a width of 377 to 384, not 48; "
-        "it seems not to be packed: use numpy.packbits(cube, axis=-1)\n" + ONE_PROBLEM,
+        "it seems not to be packed: write source: {use: npy, with: {path: DIR/cube.npy, holds: bits}}\n" + ONE_PROBLEM,
         ("cube.npy}", "cube.npy, width: 48}"),
     ),
     "fewer frames than a group": Case(
