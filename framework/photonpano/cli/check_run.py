@@ -12,9 +12,9 @@ def check_run(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", show_default=False)],
     strict: Strict = False,
 ) -> None:
-    """Judge a finished run by its capture: do motion and panorama explain the photons?
+    """Judge a finished run by its capture.
 
-    Opens the capture of the spec in run.json, renders the panorama along trajectory.npz, and compares each span of a few frames
+    Opens the capture that run.json names, renders the panorama along trajectory.npz, and compares each span of a few frames
     with what the panorama predicts. Writes nothing.
 
     Example: photonpano check-run runs/first --strict

@@ -44,6 +44,7 @@ def test_commands_are_complete() -> None:
     assert {" ".join(name) for name in COMMANDS} == {
         "run",
         "check",
+        "check-run",
         "explain",
         "info",
         "preview",
