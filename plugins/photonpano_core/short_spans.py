@@ -20,6 +20,9 @@ _SIGNIFICANT = 3.0
 """A frequency is corrected if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies."""
 _SYSTEMATIC_PX = 0.015
 """Shifts are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
+_SLOW_BINS, _SLOW_PX = 2, 0.04
+"""The two lowest frequencies of a window must exceed an error of this size, too: the panorama follows a slow motion, and is
+no better itself."""
 _NAMED_LINES = 3
 """Frequencies that a summary names at most."""
 _NAMED_SHARE = 0.003
@@ -135,7 +138,9 @@ def _filtered(steps: FloatArray, variances: FloatArray) -> _Filtered:
     taper = np.sin(np.pi * (np.arange(size) + 0.5) / size)
     windows = np.fft.rfft(sliding_window_view(series, size)[::half] * taper)
     expected = sliding_window_view(variance, size)[::half] @ taper**2
-    excess = np.abs(windows) ** 2 / np.maximum(expected, 1e-30)[:, None]
+    floor = np.tile(expected[:, None], windows.shape[1])
+    floor[:, :_SLOW_BINS] += (_SLOW_PX * taper.sum()) ** 2
+    excess = np.abs(windows) ** 2 / np.maximum(floor, 1e-30)
     mean = _mean_of_neighbours(excess)
     gain = np.where(mean > _SIGNIFICANT, 1 - 1 / np.maximum(mean, 1), 0)
     restored = np.fft.irfft(windows * gain, size) * taper
