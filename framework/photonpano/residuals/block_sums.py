@@ -48,7 +48,7 @@ def sample_view(
 
 @compiled
 def add_block_sums(
-    counts: NDArray[np.float32],
+    counts: NDArray[np.float32] | NDArray[np.int32],
     dark: NDArray[np.float32],
     n_frames: float,
     mean: NDArray[np.float32],
@@ -81,7 +81,7 @@ def add_block_sums(
             xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
             for t in range(size):
                 m, gx, gy = here[t] * n, (right[t] - left[t]) * half, (down[t] - up[t]) * half
-                r = k[t] - m
+                r = np.float32(k[t]) - m
                 w = p[t] / (n * (one + e[t] * p[t]))
                 seen = gx + gy + r
                 ok = seen == seen and w > zero
@@ -121,7 +121,7 @@ def add_block_sums(
 
 @compiled
 def add_pixel_sums(
-    counts: NDArray[np.float32],
+    counts: NDArray[np.float32] | NDArray[np.int32],
     n_frames: float,
     mean: NDArray[np.float32],
     residual: NDArray[np.float32],
@@ -141,7 +141,7 @@ def add_pixel_sums(
         k, m, residuals, totals = counts[y], mean[y], residual[y], total[y]
         for t in range(len(k)):
             expected = m[t] * n
-            r = k[t] - expected
+            r = np.float32(k[t]) - expected
             known = r == r
             residuals[t] += r if known else zero
             totals[t] += expected if known else zero
@@ -151,7 +151,8 @@ def add_pixel_sums(
 def fold(
     sums: NDArray[np.float32],
     lever: NDArray[np.float64],
-    places: NDArray[np.int64],
+    middle: NDArray[np.float64],
+    to_canvas: NDArray[np.float64],
     variance_share: float,
     normal: NDArray[np.float64],
     gradient: NDArray[np.float64],
@@ -166,7 +167,8 @@ def fold(
     Args:
         sums: (h, w, 12) of the span.
         lever: (h, w, 2) centres of the blocks, relative to the centre of the frame.
-        places: (h, w, 2) square of the panorama, x and y, on which each block lies.
+        middle: (h, w, 2) centres of the blocks, in pixels of the frame.
+        to_canvas: (3, 3), pixels of the frame to pixels of the panorama.
         variance_share: expected variance of residuals, relative to that of the photons.
         normal: (5, 5), added to: see `Residuals`.
         gradient: (5,), added to.
@@ -210,7 +212,10 @@ def fold(
             n += 1
             block_misfit[y, x] += misfit
             block_count[y, x] += 1
-            i, j = places[y, x, 1], places[y, x, 0]
+            px, py = middle[y, x]
+            depth = to_canvas[2, 0] * px + to_canvas[2, 1] * py + to_canvas[2, 2]
+            i = int(np.floor((to_canvas[1, 0] * px + to_canvas[1, 1] * py + to_canvas[1, 2]) / depth / BLOCK_PX))
+            j = int(np.floor((to_canvas[0, 0] * px + to_canvas[0, 1] * py + to_canvas[0, 2]) / depth / BLOCK_PX))
             if 0 <= i < cell_misfit.shape[0] and 0 <= j < cell_misfit.shape[1]:
                 cell_misfit[i, j] += misfit
                 cell_count[i, j] += 1

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from photonpano.context import Context
-from photonpano.geometry import apply, corner_displacements, corners, inverse
+from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
 from photonpano.residuals.prediction import Prediction
@@ -21,7 +21,7 @@ N_STEPS = 4
 """Steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span."""
 _NOISE_PX = 0.025
 """Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it."""
-_SHORTEST, _LONGEST = 8, 64
+_SHORTEST, _LONGEST = 12, 64
 """Fewest and most frames of a span, if the motion is slow."""
 _MAX_MOTION_PX = 2.0
 """A span is short enough that the image moves by no more than this."""
@@ -233,7 +233,8 @@ def _measured(
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
         raw = source.counts(span)
-        counts = raw.astype(np.float32) if corrected is None else corrected(raw, len(span))
+        # Signed integers become floats at no cost in the loop.
+        counts = np.ascontiguousarray(raw).view(np.int32) if corrected is None else corrected(raw, len(span))
         if masked is not None:
             counts = counts + masked
         prediction.view(homography, images)
@@ -244,13 +245,13 @@ def _measured(
         add_block_sums(counts, extra, float(len(span)), images[0], images[1], sums)
         if index % _PIXEL_STRIDE == 0:
             add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
-        places = np.floor(apply(prediction.canvas @ homography, middle.reshape(-1, 2)) / BLOCK_PX).astype(np.int64)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / max(prediction.frames_seen, 1.0))
         total.misfit[index] = fold(
             sums,
             lever,
-            places.reshape(*grid, 2),
+            middle,
+            prediction.canvas @ homography,
             1 - own,
             total.normal[index],
             total.gradient[index],
