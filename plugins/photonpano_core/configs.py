@@ -97,7 +97,7 @@ class ShortSpansConfig(Config):
     """Keys of `short-spans`."""
 
     smallest_px: float = Field(
-        0.03,
+        0.04,
         ge=0,
         le=10,
         description="smallest motion that is corrected: its root mean square over the capture, in px of a frame",

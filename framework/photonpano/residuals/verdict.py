@@ -26,9 +26,10 @@ MAX_GAIN = 0.03
 """Root mean square of the relative brightness, over the blocks of the sensor or over the spans of the capture."""
 MAX_HOT_SHARE = 0.005
 """Share of the pixels that count far more, or far fewer, photons than the panorama predicts."""
-MAX_LENS_SIGMAS = 5.0
-"""Significance of a lens distortion, in its standard deviations: even a small one bends a long path."""
-MAX_DEFORMATION_PX = 0.1
+MAX_LENS, _LENS_SIGMAS = 0.002, 5.0
+"""Radial distortion at the corners, relative to their distance from the centre, and its significance: both must be exceeded.
+Even a small one bends a long path; half of this is seen without a lens."""
+MAX_DEFORMATION_PX = 0.05
 """Root mean square of the shifts of blocks of the sensor that no motion of the whole frame explains."""
 MAX_STD_PX = 1.0
 """Mean expected error of the motion."""
@@ -212,13 +213,13 @@ def _hot_pixels(residuals: Residuals) -> Reason | None:
 
 def _lens(residuals: Residuals, motion: FrameMotion) -> Reason | None:
     found = lens_distortion(*block_shifts(residuals), motion.homographies[motion.located], residuals.frame_shape)
-    if found is None or found.sigmas <= MAX_LENS_SIGMAS:
+    if found is None or abs(found.k1) <= MAX_LENS or found.sigmas <= _LENS_SIGMAS:
         return None
     return Reason(
         "the lens distorts the frames, which bends the motion",
-        found.sigmas,
-        MAX_LENS_SIGMAS,
-        f"standard deviations; about {found.k1:.1%} at the corners",
+        abs(found.k1),
+        MAX_LENS,
+        f"about {found.k1:.1%} at the corners",
         "undistort the frames before, or use their middle only (corrections: crop)",
     )
 
