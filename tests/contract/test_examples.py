@@ -51,7 +51,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "splat": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}
-    | {"source.with.flux": 0.5, "resample.with.group_size": 50, "graph.skips": "[1, 2]"},
+    | {"source.with.flux": 0.5, "resample.with.group_size": 25, "graph.skips": "[1, 2]"},
     "high-speed-video": {"resample.with.group_size": 8},
     "photograph": SMALL
     | {"source.with.n_frames": 300, "source.with.scene.width": 640}
