@@ -207,10 +207,16 @@ class ResamplerContribution(StageContribution):
 
 @dataclass(frozen=True, kw_only=True)
 class MergerContribution(StageContribution):
-    """Offers a merger."""
+    """Offers a merger.
+
+    Attributes:
+        accepts_corrected_sums: whether it merges a `LinearlyCorrectedSource`. The framework then divides the sums of frames by
+            a vignette that it finds.
+    """
 
     kind: ClassVar[str] = "merger"
     build: Callable[[Any, StageContext], Merger]
+    accepts_corrected_sums: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,6 +98,7 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
         summary="Warps each photon along the motion of its own frame: for low light and fast motion",
         config=SplatConfig,
         build=_build_splat,
+        accepts_corrected_sums=False,
     )
 
 

@@ -89,7 +89,6 @@ def follows(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
         homography: (3, 3), pixels of the template to pixels of the fixed image.
     """
     buffers = buffers_of(moving)
-    buffers = buffers_of(moving)
     residuals_and_moments(moving, fixed, homography, buffers, np.empty((3, 3)), np.empty((3, 3)))
     seen = (buffers.weight > 0).astype(np.float32)
     near = _averaged(seen)

@@ -11,7 +11,8 @@ import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.locating import shift_by_phase
-from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.merging import binned_mean, binning_of
+from photonpano.protocols import Source
 from photonpano.values import CaptureSummary, FluxImage, FrameSpan
 
 _PLACES = 12
@@ -22,8 +23,6 @@ _SHORTEST = {"binary": 4, "intensity": 1}
 """The shortest span, in frames: sums of fewer binary frames are mostly noise."""
 _SPANS_IN_CAPTURE = 6
 """A span is at most a sixth of the capture."""
-_SIDE_PX = 64
-"""Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable."""
 _LARGE_SHIFT_PX = 2.0
 """Stop lengthening the span once the shift is at least 2 binned pixels."""
 _PEAK_PX = 1.5
@@ -57,7 +56,7 @@ def summarise(source: Source, threads: int = 1) -> CaptureSummary:
     n_frames = source.info.n_frames
     lengths = [length for length in _SPANS if _SHORTEST[source.info.kind] <= length <= n_frames // _SPANS_IN_CAPTURE]
     if not lengths:
-        flux = _mean_flux(source, [_mean_count(source, source.info.span)], n_frames)
+        flux = _mean_flux(source, [binned_mean(source, source.info.span)], n_frames)
         return CaptureSummary(flux, None, f"{n_frames} frames are too few to estimate a motion")
     centres = ((np.arange(_PLACES) + 0.5) / _PLACES * n_frames).tolist()
     with ThreadPoolExecutor(threads, thread_name_prefix="summary") as pool:
@@ -73,12 +72,12 @@ def summarise(source: Source, threads: int = 1) -> CaptureSummary:
 def _measure(source: Source, centre: float, lengths: Sequence[int]) -> tuple[float, _Speed | None]:
     """Return the mean flux around an instant, and the speed there if it was found."""
     n_frames = source.info.n_frames
-    binning = _binning(source)
+    binning = binning_of(source)
     speed = None
     for length in lengths:
         start = int(np.clip(centre - 1.5 * length, 0, n_frames - 3 * length))
         spans = (FrameSpan(first, first + length) for first in range(start, start + 3 * length, length))
-        means = [_mean_count(source, span) for span in spans]
+        means = [binned_mean(source, span) for span in spans]
         shift = _common_shift([_stabilised(source, mean, length) for mean in means])
         if shift is not None:
             speed = _Speed(shift * binning / length, length)
@@ -102,35 +101,15 @@ def _common_shift(images: Sequence[FluxImage]) -> float | None:
     return float(np.linalg.norm(both)) / 2
 
 
-def _binning(source: Source) -> int:
-    """Return the side of a binned pixel, in px."""
-    return max(1, min(source.info.frame_shape) // _SIDE_PX)
-
-
-def _mean_count(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the mean count per frame of a span in binned pixels; NaN where no pixel is valid."""
-    binning = _binning(source)
-    height, width = (side // binning * binning for side in source.info.frame_shape)
-    size = (width // binning, height // binning)
-    valid = source.valid[:height, :width].astype(np.float32)
-    counts = source.counts(span)
-    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
-    lit = lit[:height, :width] * valid
-    share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, lit.astype(np.float32)))
-    mean = np.full(share.shape, np.nan, dtype=np.float32)
-    np.divide(summed, share * len(span), out=mean, where=share > 0)
-    return mean
-
-
 def _mean_flux(source: Source, means: Sequence[FluxImage], n_frames: int) -> float:
     """Return the flux, averaged over the pixels, of mean counts that `n_frames` frames were summed for."""
-    flux = source.response.flux(np.mean(means, axis=0), float(n_frames * _binning(source) ** 2))
+    flux = source.response.flux(np.mean(means, axis=0), float(n_frames * binning_of(source) ** 2))
     return float(np.nanmean(flux))
 
 
 def _stabilised(source: Source, mean_count: FluxImage, n_frames: int) -> FluxImage:
     """Return an image on the scale on which its noise is uniform, with mean 0; 0 where no pixel is valid."""
-    frames = float(n_frames * _binning(source) ** 2)
+    frames = float(n_frames * binning_of(source) ** 2)
     image = source.response.stabilised(source.response.flux(mean_count, frames), frames)
     return np.nan_to_num(image - np.nanmean(image))
 

@@ -94,7 +94,7 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
     return Vignette(np.exp(log_gain).astype(np.float32), counts.astype(np.float32), tuple(spans))
 
 
-def divided_by(source: Source, vignette: Vignette) -> Source:
+def divided_by(source: Source, vignette: Vignette) -> FlatSource:
     """Return a source whose corrected sums are those of a lens without vignette."""
     capabilities: list[type[SourceWrapper]] = [PackedWrapper] if isinstance(source, PackedSource) else []
     return with_capabilities(FlatSource, capabilities)(source, vignette)

@@ -1,6 +1,7 @@
 """Sums of frames along a motion: frames are summed in chunks, and each chunk is warped once."""
 
 from photonpano.merging.accumulate import PhotonSum, accumulate, divided
+from photonpano.merging.binning import binned_mean, binning_of
 from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
 
-__all__ = ["Chunk", "CountsCache", "PhotonSum", "accumulate", "chunks_of", "clipped", "divided"]
+__all__ = ["Chunk", "CountsCache", "PhotonSum", "accumulate", "binned_mean", "binning_of", "chunks_of", "clipped", "divided"]

@@ -15,16 +15,15 @@ from scipy import fft
 
 from photonpano.geometry import translation
 from photonpano.locating import correlation_peaks, correlation_surface
+from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.pairs import lengths_of
-from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.protocols import Source
 from photonpano.values import FloatArray, FrameSpan, Group
 
 _SPANS = 16
 """A window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur."""
 _SHORTEST = {"binary": 4, "intensity": 1}
 """Frames of the shortest span: sums of fewer binary frames are mostly noise."""
-_SIDE_PX = 64
-"""Pixels are binned until the shorter side has about 64 of them."""
 _PEAK_PX = 1.0
 """Standard deviation of the peak of the phase correlation, in binned pixels."""
 _SIGNIFICANT = 7.0
@@ -129,7 +128,7 @@ def _hypotheses(source: Source, length: int, start: int) -> Hypotheses | None:
     if found is None:
         return None
     shifts, heights, doubled = found
-    px_per_frame = _binning(source) / (short * doubled)
+    px_per_frame = binning_of(source) / (short * doubled)
     sizes = np.linalg.norm(shifts, axis=1)
     slow = sizes <= _SLOWER * max(1.0, sizes.min())
     return Hypotheses(shifts[slow] * px_per_frame, heights[slow] / heights[0], px_per_frame)
@@ -214,22 +213,10 @@ def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:
     return np.asarray(-np.sum((change / std) ** 2, axis=-1) / 2)
 
 
-def _binning(source: Source) -> int:
-    """Return the side of a binned pixel, in px."""
-    return max(1, min(source.info.frame_shape) // _SIDE_PX)
-
-
 def _binned(source: Source, span: FrameSpan) -> NDArray[np.float32]:
-    """Return the sum of a span in binned pixels; 0 where no pixel is valid, and elsewhere per valid pixel."""
-    binning = _binning(source)
-    height, width = (side // binning * binning for side in source.info.frame_shape)
-    size = (width // binning, height // binning)
-    counts = source.counts(span)
-    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
-    valid = source.valid[:height, :width].astype(np.float32)
-    images = valid * lit[:height, :width].astype(np.float32), valid
-    summed, share = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images)
-    return np.divide(summed, share, out=np.full_like(summed, summed.mean()), where=share > 0)
+    """Return the mean of a span in binned pixels; where no pixel is valid, the mean of the others."""
+    mean = binned_mean(source, span)
+    return np.where(np.isnan(mean), np.nanmean(mean), mean)
 
 
 @cache

@@ -12,6 +12,7 @@ from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
+from photonpano.contributions import MergerContribution
 from photonpano.corrections import CorrectedSource, Vignette, divided_by, estimate_vignette
 from photonpano.errors import InputError
 from photonpano.merging.panorama import render_panorama
@@ -103,9 +104,10 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
-    """Measure the vignette of a capture, unless its spec lists corrections, or a merger takes frames that have none."""
-    merged_singly = any(level.merge.contribution.name == "splat" for level in plan.levels)
-    if not plan.corrects_itself or source.info.kind != "binary" or merged_singly:
+    """Measure the vignette of a capture, unless its spec lists corrections, or a merger does not accept corrected sums."""
+    mergers = [level.merge.contribution for level in plan.levels]
+    accepted = all(isinstance(merger, MergerContribution) and merger.accepts_corrected_sums for merger in mergers)
+    if not plan.corrects_itself or source.info.kind != "binary" or not accepted:
         return None
     return estimate_vignette(source, trajectory)
 

@@ -234,7 +234,7 @@ def _measured(
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
         raw = source.counts(span)
         # Signed integers become floats at no cost in the loop.
-        counts = np.ascontiguousarray(raw).view(np.int32) if corrected is None else corrected(raw, len(span))
+        counts = np.ascontiguousarray(raw, np.uint32).view(np.int32) if corrected is None else corrected(raw, len(span))
         if masked is not None:
             counts = counts + masked
         prediction.view(homography, images)

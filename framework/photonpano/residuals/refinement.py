@@ -22,8 +22,6 @@ MAX_ROUNDS = 6
 """Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough."""
 _WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
 """A refined motion is not used if the scatter of the shifts grows by this factor, or the misfit of the photons by this much."""
-_CHANGE_PX = 0.01
-"""A refined motion that differs by less than this is the same."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ _STANDS_OUT = 30.0
 def residual_ratio(residuals: Residuals) -> float:
     """Return the scatter of the shifts of short spans, divided by what photon noise and interpolation explain.
 
-    It is 1 where the motion is all there is, and 24 at a tremor of 1 px. Slow changes are left out, since the panorama follows
-    them. NaN for fewer than 50 spans.
+    It is 1 where the motion is all there is. Slow changes are left out, since the panorama follows them.
+    NaN for fewer than 50 spans.
     """
     steps, variances = _series(residuals)
     shifts, expected = steps[:, :2], variances[:, :2]

@@ -95,9 +95,9 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
     """
     residuals, motion = explained.residuals, explained.motion
     tests: list[Callable[[], Reason | None]] = [
+        lambda: _fast_motion(explained.ratio),
         lambda: _photons(residuals),
         lambda: _moving(residuals),
-        lambda: _fast_motion(explained.ratio),
         lambda: _light(residuals),
         lambda: _sensor(residuals),
         lambda: _hot_pixels(residuals),

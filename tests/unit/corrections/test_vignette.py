@@ -61,7 +61,7 @@ def test_divided_sums_are_on_average_those_without_vignette() -> None:
     lit = -np.expm1(-0.7 * gain)
     source = MemorySource((np.random.default_rng(0).random((2000, *SHAPE)) < lit).astype(np.uint8))
     flat = divided_by(source, Vignette(gain, lit.astype(np.float32), (FrameSpan(0, 2000),)))
-    corrected = flat.corrected(flat.counts(FrameSpan(0, 2000)), 2000) / 2000  # type: ignore[attr-defined]
+    corrected = flat.corrected(flat.counts(FrameSpan(0, 2000)), 2000) / 2000
     assert corrected.mean() == pytest.approx(-np.expm1(-0.7), abs=0.002)
     corners = RADIUS > 0.8
     assert corrected[corners].mean() == pytest.approx(-np.expm1(-0.7), abs=0.005)
