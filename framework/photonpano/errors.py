@@ -65,6 +65,15 @@ class Problem:
         return ": ".join(part for part in (head, self.where, message) if part)
 
 
+def described(error: BaseException) -> str:
+    """Describe an exception that is not for users: its type and its message, even if that cannot be written."""
+    try:
+        message = str(error)
+    except Exception:
+        message = "(its message cannot be written)"
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
+
+
 class SpecError(PhotonpanoError):
     """A spec is wrong; carries every problem that was found, not only the first."""
 

@@ -21,6 +21,7 @@ from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
 from photonpano.cli.warm_up import warm_up
+from photonpano.interrupts import interrupt
 
 
 class _Commands(TyperGroup):
@@ -72,5 +73,7 @@ def photonpano_options(
 def main() -> None:
     """Run the program with the arguments of the process."""
     # Batch systems end jobs with SIGTERM: clean up as after Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # shells have their background jobs ignore it
+        signal.signal(signal.SIGINT, interrupt)
     app()

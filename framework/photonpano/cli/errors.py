@@ -40,6 +40,9 @@ def reported(*, debug: bool = False) -> Iterator[None]:
         if debug:
             traceback.print_exc()
         raise typer.Exit(_print(error, debug)) from error
+    except SystemExit as error:  # a command ends with typer.Exit
+        what = f"a plugin or a library called sys.exit({error.code!r}) in the middle of the command"
+        raise typer.Exit(_print(PluginError(what), debug)) from error
     except KeyboardInterrupt as error:
         typer.echo("\ninterrupted; no file is left half-written under its final name", err=True)
         raise typer.Exit(INTERRUPTED) from error

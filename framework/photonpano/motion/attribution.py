@@ -8,7 +8,8 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photonpano.errors import PhotonpanoError, PluginError
+from photonpano.errors import PhotonpanoError, PluginError, described
+from photonpano.interrupts import is_interrupt
 from photonpano.protocols import Source, Trajectory
 from photonpano.source_wrapper import ArrayT, SourceWrapper, capabilities_of, with_capabilities
 from photonpano.values import FloatArray, FrameSpan
@@ -20,7 +21,7 @@ class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
 
 @contextmanager
 def attributing(origin: str, where: str) -> Iterator[None]:
-    """Attribute errors of the block to a component. Errors that are written for users pass unchanged.
+    """Attribute errors of the block to a component. Errors that are written for users, and interrupts, pass unchanged.
 
     Args:
         origin: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
@@ -35,8 +36,10 @@ def attributing(origin: str, where: str) -> Iterator[None]:
         raise
     except BrokenContract as error:
         raise PluginError(f"{origin} broke its contract at {where}: {error}") from None
-    except Exception as error:
-        raise PluginError(f"{origin} failed at {where}: {type(error).__name__}: {error}") from error
+    except BaseException as error:  # a plugin that calls sys.exit() must not end the program in silence
+        if is_interrupt(error):
+            raise
+        raise PluginError(f"{origin} failed at {where}: {described(error)}") from error
 
 
 def attributed(source: Source, origin: str) -> AttributedSource:

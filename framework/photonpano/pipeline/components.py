@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from photonpano.contributions import SourceContext, StageContext, install_command
 from photonpano.corrections import corrected_source, without_still_pixels
-from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError
+from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
+from photonpano.interrupts import is_interrupt
 from photonpano.motion.attribution import attributed, attributing
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.protocols import Resampler, Source
@@ -206,5 +207,7 @@ def _built(choice: Choice, context: SourceContext | StageContext) -> Any:
         return contribution.build(choice.config, context)
     except PhotonpanoError:
         raise
-    except Exception as error:
-        raise PluginError(f"{who} could not be built: {type(error).__name__}: {error}") from error
+    except BaseException as error:
+        if is_interrupt(error):
+            raise
+        raise PluginError(f"{who} could not be built: {described(error)}") from error

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from photonpano.errors import described
 from photonpano.geometry import Canvas
+from photonpano.interrupts import is_interrupt
 from photonpano.motion.loop import LevelResult
 from photonpano.registry import Observer
 
@@ -67,8 +69,10 @@ class Observers:
         for observer in self.observers:
             try:
                 getattr(observer.hook, hook)(directory=self.directory, **values)
-            except (Exception, SystemExit) as error:
-                what = f"{type(error).__name__}: {error}"
+            except BaseException as error:
+                if is_interrupt(error):
+                    raise
+                what = described(error)
                 logger.warning("%s of %s raised %s; the run goes on", hook, observer.origin, what, exc_info=True)
 
 

@@ -7,8 +7,9 @@ import os
 import re
 from importlib.metadata import EntryPoint, entry_points
 
-from photonpano.errors import PluginError
+from photonpano.errors import PluginError, described
 from photonpano.hookspecs import PROJECT
+from photonpano.interrupts import is_interrupt
 from photonpano.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer, Origin, make_entry, ordered
 from photonpano.registry.plugins import contributions_of, observation_of
 from photonpano.text import listed, suggestion
@@ -45,7 +46,9 @@ def discover() -> Catalog:
             rows += [make_entry(contribution, origin) for contribution in contributions_of(loaded)]
             if hook:
                 observers.append(Observer(origin, hook))
-        except (Exception, SystemExit) as error:  # whatever the plugin's import does, it is a row
+        except BaseException as error:  # whatever the plugin's import does, it is a row
+            if is_interrupt(error):
+                raise
             broken.append(BrokenPlugin(origin, _in_a_line(error)))
     _warn_of_unknown([word for key, word in disabling.items() if key not in set(map(_canonical, names))], names)
     return Catalog(
@@ -71,8 +74,7 @@ def _warn_of_unknown(words: list[str], names: set[str]) -> None:
 
 
 def _in_a_line(error: BaseException) -> str:
-    head = "" if isinstance(error, PluginError) else f"{type(error).__name__}: "
-    return head + " ".join(str(error).split())
+    return " ".join((str(error) if isinstance(error, PluginError) else described(error)).split())
 
 
 def _origin(entry_point: EntryPoint) -> Origin:

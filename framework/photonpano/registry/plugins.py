@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from photonpano import hookspecs
 from photonpano.contributions import API_VERSION, Contribution
-from photonpano.errors import PluginError
+from photonpano.errors import PluginError, described
+from photonpano.interrupts import is_interrupt
 from photonpano.registry.kinds import KINDS, Kind
 from photonpano.text import listed
 
@@ -20,6 +22,8 @@ HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
 """All hooks, in the order in which they are specified."""
 OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
 """The hooks that offer nothing: a run calls them, so that a plugin can watch it."""
+MAX_OFFERED = 1000
+"""Most components that a hook may offer."""
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:
@@ -90,8 +94,12 @@ def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[Contribution]:
     try:
         results: list[Any] = getattr(manager.hook, kind.hook)()
         offered = [item for result in results for item in _items(result)]
-    except Exception as error:
-        raise PluginError(f"{kind.hook} raised {type(error).__name__}: {error}") from error
+    except BaseException as error:
+        if is_interrupt(error):
+            raise
+        raise PluginError(f"{kind.hook} raised {described(error)}") from error
+    if len(offered) > MAX_OFFERED:
+        raise PluginError(f"{kind.hook} offers more than {MAX_OFFERED} components; does it end?")
     for item in offered:
         if not isinstance(item, kind.contribution):
             raise PluginError(f"{kind.hook} offers {_short(item)}, expected a {kind.contribution.__name__}")
@@ -100,7 +108,7 @@ def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[Contribution]:
 
 
 def _items(result: Any) -> list[Any]:
-    return [result] if isinstance(result, Contribution) else list(result)
+    return [result] if isinstance(result, Contribution) else list(islice(result, MAX_OFFERED + 1))
 
 
 def _short(item: object) -> str:

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ConfigDict, Field
 
 from photonpano.contributions import Config, Recognised, SourceContribution, SpecPath
+from photonpano.errors import described
 from photonpano.hookspecs import hookimpl
+from photonpano.interrupts import is_interrupt
 from photonpano.reading import missing_file
 from photonpano.specs.aliases import LocatorAlias, SourceAlias
 from photonpano.specs.checks import complaints
@@ -123,8 +125,10 @@ def ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recogni
             continue
         try:
             answer = entry.contribution.recognise(path)
-        except Exception as error:
-            failures.append(f"recognise of the {entry.label} raised {type(error).__name__}: {error}")
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
+            failures.append(f"recognise of the {entry.label} raised {described(error)}")
             continue
         returned = f"recognise of the {entry.label} returned"
         if not isinstance(answer, Recognised | None):
@@ -147,7 +151,9 @@ def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Path) -> Iter
             continue
         try:
             config = validate(contribution.config, written, "", replace(spec, problems=[]))
-        except Exception:  # what is wrong with the config is reported once the source is named
+        except BaseException as error:  # what is wrong with the config is reported once the source is named
+            if is_interrupt(error):
+                raise
             config = None
         if config is not None:
             yield from (f"{entry.name}: {each}" for each in complaints(Choice(contribution, config, entry.origin)))

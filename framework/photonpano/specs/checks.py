@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING
 
+from photonpano.errors import described
+from photonpano.interrupts import is_interrupt
 from photonpano.registry.kinds import KINDS
 
 if TYPE_CHECKING:
@@ -13,6 +16,8 @@ if TYPE_CHECKING:
 
 STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner"))
 """The sections of a spec that choose the components of a level, in the order of the loop."""
+MAX_COMPLAINTS = 100
+"""Most problems of one component that are reported."""
 
 
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
@@ -44,6 +49,8 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
     """Run the `check` of a component; one that raises is a complaint itself."""
     try:
         found = choice.contribution.check(choice.config, *stream)
-        return (found,) if isinstance(found, str) else tuple(map(str, found))
-    except Exception as error:
-        return (f"the check of the {choice.label} raised {type(error).__name__}: {error}",)
+        return (found,) if isinstance(found, str) else tuple(map(str, islice(found, MAX_COMPLAINTS)))
+    except BaseException as error:
+        if is_interrupt(error):
+            raise
+        return (f"the check of the {choice.label} raised {described(error)}",)

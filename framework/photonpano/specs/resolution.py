@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from photonpano.errors import PluginError, SpecError
+from photonpano.errors import PluginError, SpecError, described
+from photonpano.interrupts import is_interrupt
 from photonpano.registry.kinds import KINDS
 from photonpano.specs.aliases import Alias
 from photonpano.specs.checks import STAGES, complaints
@@ -272,9 +273,10 @@ class _Resolver:
             config = validate(entry.contribution.config, section.get("with"), f"{where}.with", self.spec)
             if config is not None:
                 config.model_dump(mode="json")  # a run records it
-        except Exception as error:
-            raised = f"raised {type(error).__name__}: {error}"
-            self.spec.wrong_key(f"{where}.with", f"the config of the {entry.label} {raised}")
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
+            self.spec.wrong_key(f"{where}.with", f"the config of the {entry.label} raised {described(error)}")
             return None
         return None if config is None else Choice(entry.contribution, config, entry.origin)
 
