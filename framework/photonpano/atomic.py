@@ -14,6 +14,24 @@ from pathlib import Path
 from photonpano.errors import OutputError
 from photonpano.text import byte_size
 
+_unfinished: set[Path] = set()
+"""Files and folders under temporary names, which are to become final."""
+
+
+def discard_unfinished() -> None:
+    """Remove the files and folders that are being written, in a program that ends now. Never raises.
+
+    Each is renamed first. So a thread that still works finds nothing that it could give the final name to.
+    """
+    for each in list(_unfinished):
+        doomed = each.with_name(f".part-{secrets.token_hex(4)}")
+        with suppress(OSError):
+            each.rename(doomed)
+            if doomed.is_dir():
+                shutil.rmtree(doomed, ignore_errors=True)
+            else:
+                doomed.unlink()
+
 
 @contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
@@ -32,12 +50,14 @@ def atomic_path(final: Path) -> Iterator[Path]:
         OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
     """
     temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.partial{final.suffix}")
+    _unfinished.add(temporary)
     try:
         with _becoming(final, temporary):
             temporary.touch(exist_ok=False)
             yield temporary
     finally:
         temporary.unlink(missing_ok=True)
+        _unfinished.discard(temporary)
 
 
 def part_path(final: Path) -> Path:
@@ -75,6 +95,7 @@ def atomic_files(directory: Path, last: str = "") -> Iterator[Path]:
     made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     directory.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(prefix=".part-", dir=directory))
+    _unfinished.add(staging)
     try:
         yield staging
         files = sorted(staging.iterdir(), key=lambda file: file.name == last)
@@ -85,6 +106,7 @@ def atomic_files(directory: Path, last: str = "") -> Iterator[Path]:
         made.clear()
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+        _unfinished.discard(staging)
         with suppress(OSError):  # another program has put something there
             for folder in made:
                 folder.rmdir()
@@ -99,6 +121,7 @@ def atomic_folder(final: Path) -> Iterator[Path]:
     """
     place = final.absolute()
     temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
+    _unfinished.add(temporary)
     try:
         if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
             raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
@@ -111,6 +134,7 @@ def atomic_folder(final: Path) -> Iterator[Path]:
         raise OutputError(_message(final, error)) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        _unfinished.discard(temporary)
 
 
 @contextmanager

@@ -6,14 +6,19 @@ import signal
 import threading
 from types import FrameType
 
-_noted = threading.Event()
-"""Set once a signal has interrupted the program."""
+_noted: list[int] = []
+"""The numbers of the signals that have interrupted the program, in their order."""
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
     """Handle a signal: note that it came, and raise `KeyboardInterrupt` in the main thread."""
-    _noted.set()
+    _noted.append(number)
     signal.default_int_handler(number, frame)
+
+
+def interrupted_by() -> int:
+    """Return the number of the signal that has interrupted the program first; that of Ctrl-C if none was noted."""
+    return _noted[0] if _noted else signal.SIGINT
 
 
 def is_interrupt(error: BaseException) -> bool:
@@ -25,4 +30,4 @@ def is_interrupt(error: BaseException) -> bool:
     if not isinstance(error, KeyboardInterrupt):
         return False
     unnoted = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    return _noted.is_set() or (unnoted and threading.current_thread() is threading.main_thread())
+    return bool(_noted) or (unnoted and threading.current_thread() is threading.main_thread())

@@ -1,6 +1,5 @@
 """The program `photonpano`. Commands import their modules when they run, to keep `--help` fast."""
 
-import signal
 from typing import Annotated, Any
 
 import typer
@@ -11,7 +10,8 @@ from photonpano.cli.check import check
 from photonpano.cli.check_run import check_run
 from photonpano.cli.convert import convert
 from photonpano.cli.dark import dark
-from photonpano.cli.errors import reported
+from photonpano.cli.ending import end_on_signals, leave
+from photonpano.cli.errors import FAILED, SIGNALLED, print_error, reported
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
 from photonpano.cli.info import info
@@ -20,8 +20,10 @@ from photonpano.cli.preview import preview
 from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
+from photonpano.cli.streams import prepare_streams
 from photonpano.cli.warm_up import warm_up
-from photonpano.interrupts import interrupt
+from photonpano.errors import OutputError
+from photonpano.interrupts import interrupted_by
 
 
 class _Commands(TyperGroup):
@@ -72,8 +74,13 @@ def photonpano_options(
 
 def main() -> None:
     """Run the program with the arguments of the process."""
-    # Batch systems end jobs with SIGTERM: clean up as after Ctrl-C.
-    signal.signal(signal.SIGTERM, interrupt)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # shells have their background jobs ignore it
-        signal.signal(signal.SIGINT, interrupt)
-    app()
+    prepare_streams()
+    end_on_signals()
+    try:
+        app()
+    except SystemExit as error:
+        leave(error.code if isinstance(error.code, int) else FAILED)
+    except KeyboardInterrupt:  # before the command or after it
+        leave(SIGNALLED + interrupted_by())
+    except OutputError as error:  # while help is printed
+        leave(print_error(error))

@@ -9,10 +9,12 @@ from contextlib import contextmanager
 import typer
 
 from photonpano.errors import PhotonpanoError, PluginError, SpecError
+from photonpano.interrupts import interrupted_by
 
 FAILED = 1
 WRONG_SPEC = 2
-INTERRUPTED = 130
+SIGNALLED = 128
+"""Plus the number of the signal: 130 for Ctrl-C."""
 
 
 class WrongArgumentError(PhotonpanoError):
@@ -39,13 +41,13 @@ def reported(*, debug: bool = False) -> Iterator[None]:
     except PhotonpanoError as error:
         if debug:
             traceback.print_exc()
-        raise typer.Exit(_print(error, debug)) from error
+        raise typer.Exit(print_error(error, debug)) from error
     except SystemExit as error:  # a command ends with typer.Exit
         what = f"a plugin or a library called sys.exit({error.code!r}) in the middle of the command"
-        raise typer.Exit(_print(PluginError(what), debug)) from error
+        raise typer.Exit(print_error(PluginError(what), debug)) from error
     except KeyboardInterrupt as error:
         typer.echo("\ninterrupted; no file is left half-written under its final name", err=True)
-        raise typer.Exit(INTERRUPTED) from error
+        raise typer.Exit(SIGNALLED + interrupted_by()) from error
     finally:
         logger.removeHandler(handler)
 
@@ -65,7 +67,7 @@ class _Warnings(logging.Handler):
         sys.stderr.write(f"warning: {record.getMessage()}\n")
 
 
-def _print(error: PhotonpanoError, debug: bool) -> int:
+def print_error(error: PhotonpanoError, debug: bool = False) -> int:
     """Print an error, each problem of a spec on its own line, and return the exit code."""
     if not isinstance(error, SpecError):
         typer.echo(f"error: {error}", err=True)

@@ -1,0 +1,167 @@
+"""Commands end in time: on signals, whatever plugins do, and when their work is done."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ENDS_WITHIN_S = 2.0
+PROGRAM = """\
+import ctypes, hashlib, itertools, threading, time
+from pathlib import Path
+from photonpano.atomic import atomic_files, atomic_path
+from photonpano.cli.app import app, main
+from photonpano.threads import thread_pool
+
+def swallow():
+    while True:
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            pass
+
+@app.command()
+def work():
+    with atomic_path(Path("cube.npy")), atomic_files(Path("run")) as folder:
+        (folder / "run.json").write_text("{}")
+        print("working", flush=True)
+        WORK
+
+main()
+"""
+IN_WORKER = "with thread_pool(2) as pool: pool.submit(time.sleep, 60); time.sleep(60)"
+IN_THREAD = "threading.Thread(target=time.sleep, args=(60,)).start(); time.sleep(60)"
+IN_C = "hashlib.pbkdf2_hmac('sha256', b'', b'', 2**30)"
+HOLDING_INTERPRETER = "sum(itertools.repeat(0))"
+
+
+@pytest.fixture
+def working(tmp_path: Path) -> Callable[[str], subprocess.Popen[str]]:
+    """Start a program whose only command does something in the middle of writing files, and wait until it does."""
+
+    def start(work: str) -> subprocess.Popen[str]:
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM.replace("WORK", work), "work"], cwd=tmp_path, preexec_fn=heed_signals, **pipes
+        )
+        assert process.stdout.readline() == "working\n"
+        time.sleep(0.05)
+        return process
+
+    return start
+
+
+def heed_signals() -> None:
+    """Restore signals that shells disable in their background jobs."""
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, signal.SIG_DFL)
+
+
+def code_in_shell(process: subprocess.Popen[str]) -> int:
+    """Return the exit code as shells show it, also if the signal itself has ended the process."""
+    return process.returncode if process.returncode >= 0 else 128 - process.returncode
+
+
+@pytest.mark.parametrize(
+    ("work", "sent"),
+    [
+        (IN_WORKER, signal.SIGINT),
+        (IN_THREAD, signal.SIGINT),
+        (IN_C, signal.SIGHUP),
+        ("swallow()", signal.SIGTERM),
+        (HOLDING_INTERPRETER, signal.SIGINT),
+    ],
+    ids=["worker", "thread", "C", "swallowed", "holds the interpreter"],
+)
+def test_signal_ends_command_in_time_and_leaves_no_file(
+    tmp_path: Path, working: Callable[[str], subprocess.Popen[str]], work: str, sent: signal.Signals
+) -> None:
+    with working(work) as process:
+        start = time.monotonic()
+        process.send_signal(sent)
+        out, err = process.communicate(timeout=10)
+        took = time.monotonic() - start
+    assert code_in_shell(process) == 128 + sent
+    assert out == ""
+    assert took < ENDS_WITHIN_S
+    if work != HOLDING_INTERPRETER:
+        assert process.returncode == 128 + sent
+        assert "\ninterrupted" in err
+        assert list(tmp_path.rglob("*.npy")) + list(tmp_path.rglob(".part-*")) == []
+
+
+@pytest.mark.parametrize("work", ["swallow()", HOLDING_INTERPRETER], ids=["swallowed", "holds the interpreter"])
+def test_second_signal_ends_command_at_once(working: Callable[[str], subprocess.Popen[str]], work: str) -> None:
+    with working(work) as process:
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+        start = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=10)
+        took = time.monotonic() - start
+    assert code_in_shell(process) == 130
+    assert took < 0.7
+
+
+def test_thread_left_by_plugin_keeps_no_process_alive(working: Callable[[str], subprocess.Popen[str]]) -> None:
+    with working("threading.Thread(target=time.sleep, args=(60,)).start(); print('done')") as process:
+        out = process.stdout.read()
+        code = process.wait(timeout=20)
+    assert (code, out) == (0, "done\n")
+
+
+def test_killed_command_leaves_no_process(working: Callable[[str], subprocess.Popen[str]]) -> None:
+    with working("time.sleep(60)") as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        if not children.exists():
+            pytest.skip("only Linux lists the children of a process")
+        guard = int(children.read_text())
+        process.kill()
+        process.communicate(timeout=10)
+    for _ in range(100):
+        if not is_alive(guard):
+            return
+        time.sleep(0.02)
+    pytest.fail("the guard goes on")
+
+
+def is_alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+    return re.search(r"\) (\w)", state)[1] != "Z"
+
+
+def test_ignored_signal_stays_ignored(tmp_path: Path) -> None:
+    work = "import os, signal; os.kill(os.getpid(), signal.SIGHUP); time.sleep(0.05)"
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM.replace("WORK", work), "work"],
+        cwd=tmp_path,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+        check=False,
+    )
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["plugins", "list"]], ids=" ".join)
+def test_full_standard_output_is_one_sentence(folder: Path, program: list[str], arguments: list[str]) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full")
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([*program, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "error: cannot write to standard output: No space left on device\n")
+
+
+def test_closed_streams_are_no_error_and_files_do_not_take_their_place(folder: Path, program: list[str]) -> None:
+    command = '"$@" schema --output schema.json <&- >&- 2>&-'
+    done = subprocess.run(["sh", "-c", command, "sh", *program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (folder / "schema.json").read_text().startswith("{")
