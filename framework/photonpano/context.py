@@ -1,11 +1,13 @@
-"""How a long computation runs: number of threads, progress and callbacks."""
+"""How a long computation runs: number of threads, progress, callbacks, and what it keeps for the case of an interruption."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
+
+ResultT = TypeVar("ResultT")
 
 
 class Progress(Protocol):
@@ -33,6 +35,75 @@ class Quiet:
         """Ignore a line."""
 
 
+class Log(Protocol):
+    """The results of one step, in order: first those that an interrupted computation kept, then those that are added."""
+
+    @property
+    def found(self) -> Sequence[Any]:
+        """The results that were kept before; the first that is added is the next one."""
+        ...
+
+    def add(self, result: Any) -> None:
+        """Keep the next result."""
+        ...
+
+    def finish(self) -> None:
+        """Mark the step as finished: there are no more results."""
+        ...
+
+
+class Checkpoints(Protocol):
+    """Keeps what a computation finds, so that it can go on after an interruption.
+
+    A result is found again by the name of its step and by everything that it depends on: numbers, texts, arrays, and the
+    dataclasses and sequences that hold them. It is the same to the last bit. Components, settings and capture are given by the
+    run, and need not be repeated.
+    """
+
+    def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
+        """Return the result of a step: the one that was kept, or else the one that `compute` returns, which is kept."""
+        ...
+
+    def log(self, step: str, *given: Any) -> Log:
+        """Open the results of a step that has many of them."""
+        ...
+
+    def within(self, *given: Any) -> Checkpoints:
+        """Return checkpoints whose results depend on more."""
+        ...
+
+
+class NoLog:
+    """A log that is never kept."""
+
+    found: tuple[()] = ()
+
+    def add(self, result: Any) -> None:
+        """Keep nothing."""
+
+    def finish(self) -> None:
+        """Keep nothing."""
+
+
+class KeepNothing:
+    """Checkpoints that are never kept."""
+
+    def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
+        """Compute the result."""
+        del step, given
+        return compute()
+
+    def log(self, step: str, *given: Any) -> Log:
+        """Open an empty log."""
+        del step, given
+        return NoLog()
+
+    def within(self, *given: Any) -> KeepNothing:
+        """Return the same."""
+        del given
+        return self
+
+
 @dataclass(frozen=True, slots=True)
 class Context:
     """How a computation runs; its result does not depend on it.
@@ -41,8 +112,10 @@ class Context:
         threads: how many threads work at once.
         progress: receives stages and messages.
         on_level: called with the `LevelResult` of each level of the loop when it is done.
+        checkpoints: keep what is found, for the case of an interruption.
     """
 
     threads: int = 1
     progress: Progress = field(default_factory=Quiet)
     on_level: Callable[[Any], object] = lambda _: None
+    checkpoints: Checkpoints = field(default_factory=KeepNothing)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -154,10 +155,14 @@ def render_tiles(
         context.progress.stage("panorama", len(span) * len(tiles), "frames") as advance,
         ThreadPoolExecutor(context.threads, thread_name_prefix="render") as pool,
     ):
-        for tile in tiles:
-            grid = tile.canvas
+
+        def rendered(grid: Canvas) -> Panorama:
             photons = accumulate(source, chunks, grid.transform, grid.shape, advance, pool)
-            yield Panorama(*photons.estimate(source.response), grid.transform)
+            return Panorama(*photons.estimate(source.response), grid.transform)
+
+        homographies = trajectory.at(np.arange(span.start, span.stop))
+        for tile in tiles:
+            yield context.checkpoints.once("tile", partial(rendered, tile.canvas), homographies, span, tile.canvas)
 
 
 class Thumbnail:

@@ -85,8 +85,9 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
     pairs = pairs_of(groups, graph.skips)
+    log = context.checkpoints.log(f"level-{level.number}", groups, pairs, exposures.previous_homographies())
     with thread_pool(context.threads) as pool:
-        registrar = Registrar(exposures, pool)
+        registrar = Registrar(exposures, pool, log)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
@@ -99,7 +100,9 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
             start = registrar.to_plane
             solution = solve(len(groups), edges, anchor, shape, start)
             candidates = closure_candidates(groups, solution, shape, graph)
-        closures = tuple(registrar.closures(candidates, solution.homographies, pool))
+        revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
+        closures = tuple(registrar.closures(candidates, solution.homographies, pool, revisits))
+    log.finish()
     with exposures.clock("locate"):
         if closures:
             alone, solution = solution, solve(len(groups), edges + closures, anchor, shape, start)

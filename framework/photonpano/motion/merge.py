@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from photonpano.motion.attribution import BrokenContract
 from photonpano.motion.level import Level
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
-from photonpano.values import Group, VirtualExposure
+from photonpano.values import FloatArray, Group, VirtualExposure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +36,10 @@ class VirtualExposures:
     def frame_shape(self) -> tuple[int, int]:
         """Height and width of a frame."""
         return self.source.info.frame_shape
+
+    def previous_homographies(self) -> FloatArray | None:
+        """Return the motion known so far at every frame of the capture: (T, 3, 3); None at the first level."""
+        return None if self.previous is None else self.previous.at(np.arange(self.source.info.n_frames))
 
     def merged(self, index: int) -> VirtualExposure:
         """Merge a group along the motion known so far. Nothing is cached: a second call merges it again.

@@ -9,6 +9,7 @@ from functools import partial
 from threading import Lock
 from typing import Any
 
+from photonpano.context import Log
 from photonpano.geometry import inverse, why_implausible
 from photonpano.motion.checks import require_no_standstill, require_valid
 from photonpano.motion.closures import MIN_SIMILARITY, exposure_similarity
@@ -45,6 +46,23 @@ class _Described:
     exposure: VirtualExposure | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """What is known of an exposure once its pairs with earlier ones are registered.
+
+    Attributes:
+        edges: these pairs.
+        contrast: how much there is to see in it.
+        place: where it lies, at a first level that is tracked; None at others.
+        alternatives_px: the other exposures of pairs that may as well have another motion, and how far away that is.
+    """
+
+    edges: tuple[Edge, ...]
+    contrast: Contrast
+    place: Place | None
+    alternatives_px: Mapping[int, float]
+
+
 class Registrar:
     """Describes the exposures of a level and registers pairs of them.
 
@@ -56,8 +74,16 @@ class Registrar:
         to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
-    def __init__(self, exposures: VirtualExposures, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, exposures: VirtualExposures, pool: ThreadPoolExecutor, log: Log) -> None:
+        """Prepare to register.
+
+        Args:
+            exposures: of the level.
+            pool: merges, describes and registers.
+            log: the first exposures in order, as `Registered`; receives the others.
+        """
         self._exposures, self._level, self._clock = exposures, exposures.level, exposures.clock
+        self._log = log
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
         self.to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))
         self._from_plane = None if self.to_plane is None else inverse(self.to_plane)
@@ -87,17 +113,30 @@ class Registrar:
         for moving, fixed in pairs:
             partners[moving].append(fixed)
             needed_until[fixed] = max(needed_until[fixed], moving)
+        known = len(self._log.found)
+        for moving, registered in enumerate(self._log.found):
+            self._restore(moving, registered)
+            yield from registered.edges
+            advance(1)
+        needed = {index: partners[index] for index in partners if max(index, needed_until[index]) >= known}
+        if known == len(partners):
+            return
         # Pairs of several exposures are under way at once, so that no thread waits for the last pair of one.
-        for moving, jobs in lagging(self._submitted(partners, pool, threads), threads):
+        for moving, jobs in lagging(self._submitted(needed, known, pool, threads), threads):
+            if moving < known:
+                continue
             found = [edge for job in jobs for edge in job.result()]
             if found and not any(isinstance(edge.motion, Located) for edge in found):
                 found += self._bridge(moving, partners[moving])
+            self._log.add(self._registered(moving, tuple(found)))
             yield from found
             for index in [index for index in self._described if needed_until[index] <= moving]:
                 del self._described[index]
             advance(1)
 
-    def closures(self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor) -> Iterator[Edge]:
+    def closures(
+        self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor, log: Log
+    ) -> Iterator[Edge]:
         """Register candidates for loop closures; pairs that are not similar once aligned are not located.
 
         Both exposures of a pair are merged and described again.
@@ -106,25 +145,56 @@ class Registrar:
             pairs: (moving, fixed), ordered by the moving exposure.
             homographies: (N, 3, 3) solution of the graph without these pairs, frame pixels to a common plane.
             pool: describes the two exposures of a pair at the same time.
+            log: the first pairs in order, as `Edge`; receives the others.
         """
         self._described.clear()
         needed_until = {index: position for position, pair in enumerate(pairs) for index in pair}
+        yield from log.found
         for position, (moving, fixed) in enumerate(pairs):
+            if position < len(log.found):
+                continue
             missing = [index for index in (moving, fixed) if index not in self._described]
             for index, described in zip(missing, pool.map(lambda each: self._describe(each, keep=True), missing), strict=True):
                 self._described[index] = described
             expected = FrameHomography(inverse(homographies[fixed]) @ homographies[moving])
-            yield self._similar(self._register(moving, fixed, expected))
+            closure = self._similar(self._register(moving, fixed, expected))
+            log.add(closure)
+            yield closure
             for index in [index for index in self._described if needed_until[index] <= position]:
                 del self._described[index]
 
+    def _registered(self, moving: int, edges: tuple[Edge, ...]) -> Registered:
+        alternatives = {edge.fixed: self.alternatives_px.get((moving, edge.fixed)) for edge in edges}
+        return Registered(
+            edges,
+            self.contrasts[moving],
+            None if self._track is None else self._track.place(moving),
+            {fixed: alternative for fixed, alternative in alternatives.items() if alternative is not None},
+        )
+
+    def _restore(self, moving: int, registered: Registered) -> None:
+        """Take over what was found before an interruption."""
+        self.contrasts[moving] = registered.contrast
+        if self._track is not None:
+            self._track.settle(moving, registered.place)
+            self._track.alternatives_px |= {(moving, fixed): px for fixed, px in registered.alternatives_px.items()}
+
     def _submitted(
-        self, partners: Mapping[int, Sequence[int]], pool: ThreadPoolExecutor, threads: int
+        self, partners: Mapping[int, Sequence[int]], known: int, pool: ThreadPoolExecutor, threads: int
     ) -> Iterator[tuple[int, list[Future[list[Edge]]]]]:
-        """Describe one exposure after the other; yield each with its pairs, which are being registered."""
-        for moving, described in enumerate(in_order(self._describe, partners, threads, pool)):
+        """Describe one exposure after the other; yield each with its pairs, which are being registered.
+
+        Args:
+            partners: the exposures to describe, with the earlier ones that each is registered with.
+            known: the number of exposures whose pairs are registered already.
+            pool: merges, describes and registers.
+            threads: how many exposures are worked on ahead.
+        """
+        for moving, described in zip(partners, in_order(self._describe, partners, threads, pool), strict=True):
             self._described[moving], self.contrasts[moving] = described, described.contrast
-            if self._track is not None:
+            if moving < known:
+                yield moving, []
+            elif self._track is not None:
                 yield moving, [pool.submit(self._register_along, self._track, moving, partners[moving])]
             else:
                 yield moving, [pool.submit(self._register_each, moving, [fixed]) for fixed in partners[moving]]
@@ -207,7 +277,8 @@ class Registrar:
         if not any(isinstance(locator.component, KeepsHypotheses) for locator in level.locators):
             return None
         with self._clock("locate"):
-            start = starting_motion(self._exposures.source, groups, pool)
+            complete = len(self._log.found) == len(groups)
+            start = None if complete else starting_motion(self._exposures.source, groups, pool)
         return Track(start, instants_of(groups), self._exposures.frame_shape)
 
     def _hypotheses(self, moving: int, fixed: int) -> list[Homography]:

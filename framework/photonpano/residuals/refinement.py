@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -75,17 +76,43 @@ class Explained:
     refinements: tuple[Refinement, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Look:
-    """A motion, the panorama along it, and what it does not explain."""
+class Look:
+    """A motion, the panorama along it, and what it does not explain.
 
-    motion: FrameMotion
-    panorama: Panorama
-    prediction: Prediction
-    residuals: Residuals
-    ratio: float
+    The panorama is rendered when it is first needed; where the residuals were kept, that may be never.
 
-    def worse_than(self, other: _Look) -> str:
+    Attributes:
+        motion: of every frame.
+        residuals: what the panorama along the motion does not explain.
+        ratio: see `residual_ratio`.
+    """
+
+    def __init__(self, source: Source, motion: FrameMotion, tolerance_px: float, memory: int, context: Context) -> None:
+        self.motion = motion
+        self._source, self._tolerance_px, self._memory, self._context = source, tolerance_px, memory, context
+        given = motion.homographies, motion.span
+        self.residuals: Residuals = context.checkpoints.once("residuals", self._measured, *given)
+        self.ratio = residual_ratio(self.residuals)
+
+    @cached_property
+    def panorama(self) -> Panorama:
+        """The panorama along the motion, at the scale of the frames or the largest that fits."""
+        motion, shape = self.motion, self.motion.frame_shape
+        canvas = plan_canvas(motion.trajectory, motion.span, shape, 1.0, self._memory)
+        excess = canvas.height * canvas.width * BYTES_PER_PIXEL / self._memory
+        if excess > 1:
+            canvas = plan_canvas(motion.trajectory, motion.span, shape, float(0.99 / np.sqrt(excess)), self._memory)
+        return render(self._source, motion.trajectory, motion.span, canvas, self._tolerance_px, self._context)
+
+    @cached_property
+    def prediction(self) -> Prediction:
+        """The panorama as the camera would see it."""
+        return Prediction.of(self.panorama, self._source.response, self.motion.trajectory, self.motion.frame_shape)
+
+    def _measured(self) -> Residuals:
+        return measure(self._source, self.motion.span, self.prediction, self._context)
+
+    def worse_than(self, other: Look) -> str:
         """Return how the photons are explained worse than by another motion, as a clause; empty if they are not."""
         misfit, before = (float(look.residuals.misfit.mean()) for look in (self, other))
         if misfit > before + _WORSE_MISFIT:
@@ -113,13 +140,16 @@ def refine(
         LocationError: frames reach the horizon of the reference plane.
         PluginError: a refiner failed, or broke its contract.
     """
-    look = _look(source, motion, tolerance_px, memory, context)
+    look = Look(source, motion, tolerance_px, memory, context)
     refinements = []
-    for refiner in refiners:
+    for place, refiner in enumerate(refiners):
         start, kept_out = look.motion, ""
         rounds: list[str] = []
         while len(rounds) < MAX_ROUNDS and not kept_out:
-            refined = _refined(refiner, source, look, len(rounds) + 1)
+            number = len(rounds) + 1
+            correct = partial(_refined, refiner, source, look, number)
+            given = place, number, look.motion.homographies, look.motion.std_px
+            refined = context.checkpoints.once("refined", correct, *given)
             if refined is None:
                 break
             corrected = replace(
@@ -128,7 +158,7 @@ def refine(
                 homographies=refined.homographies,
                 std_px=refined.std_px,
             )
-            seen = _look(source, corrected, tolerance_px, memory, context)
+            seen = Look(source, corrected, tolerance_px, memory, context)
             kept_out = seen.worse_than(look)
             if not kept_out:
                 look = seen
@@ -140,20 +170,7 @@ def refine(
     return Explained(motion, look.panorama, look.residuals, look.ratio, tuple(refinements))
 
 
-def _look(source: Source, motion: FrameMotion, tolerance_px: float, memory: int, context: Context) -> _Look:
-    """Render the panorama along a motion, at the scale of the frames or the largest that fits, and measure the residuals."""
-    shape = motion.frame_shape
-    canvas = plan_canvas(motion.trajectory, motion.span, shape, 1.0, memory)
-    excess = canvas.height * canvas.width * BYTES_PER_PIXEL / memory
-    if excess > 1:
-        canvas = plan_canvas(motion.trajectory, motion.span, shape, float(0.99 / np.sqrt(excess)), memory)
-    panorama = render(source, motion.trajectory, motion.span, canvas, tolerance_px, context)
-    prediction = Prediction.of(panorama, source.response, motion.trajectory, shape)
-    residuals = measure(source, motion.span, prediction, context)
-    return _Look(motion, panorama, prediction, residuals, residual_ratio(residuals))
-
-
-def _refined(refiner: NamedRefiner, source: Source, look: _Look, number: int) -> Refined | None:
+def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> Refined | None:
     """Call a refiner, and check what it returns.
 
     Raises:
