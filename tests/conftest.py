@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, VirtualExposure
+from photonpano import FrameSpan, Group, VirtualExposure, interrupts
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
@@ -161,3 +162,12 @@ def write_video(tmp_path: Path) -> Callable[..., Path]:
         return tmp_path / name
 
     return write
+
+
+@pytest.fixture
+def heeded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Handle SIGINT as the program does."""
+    monkeypatch.setattr(interrupts, "_noted", [])
+    before = signal.signal(signal.SIGINT, interrupts.interrupt)
+    yield
+    signal.signal(signal.SIGINT, before)

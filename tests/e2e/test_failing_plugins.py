@@ -35,7 +35,7 @@ class Fragile:
     def fails(self, *_: Any) -> Any:
         raise RuntimeError("the cable came loose")
 
-    groups = merge = describe = fit = fails
+    groups = merge = describe = register = fit = fails
 
 
 class FailsToRegister(Fragile):
@@ -77,15 +77,18 @@ class GivesNoExposure:
 class FailsLater:
     """An interpolator whose trajectory fails after the number of calls that fitting makes."""
 
-    def __init__(self, answer: Callable[[Any], Any], good_for: int = 1) -> None:
+    def __init__(self, answer: Callable[[Any], Any], good_for: int = 2) -> None:
         self.answer, self.good_for = answer, good_for
 
-    def fit(self, *_: Any) -> FailsLater:
+    def fit(self, instants: Any, homographies: Any, information: Any) -> FailsLater:
+        self.instants, self.rows = instants, homographies.reshape(-1, 9).T
         return self
 
     def at(self, frames: Any) -> Any:
         self.good_for -= 1
-        return np.array([np.eye(3)] * len(frames)) if self.good_for >= 0 else self.answer(frames)
+        if self.good_for < 0:
+            return self.answer(frames)
+        return np.stack([np.interp(frames, self.instants, row) for row in self.rows], axis=-1).reshape(-1, 3, 3)
 
 
 class FailsToRead:
@@ -158,7 +161,7 @@ CASES: dict[str, tuple[str, type, Callable[..., Any], str]] = {
         "interpolate",
         InterpolatorContribution,
         lambda *_: FailsLater(lambda _: np.eye(3), good_for=0),
-        "broke its contract at level 1: expected homographies of the shape (1, 3, 3), got (3, 3)",
+        "broke its contract at level 1: expected homographies of the shape (11, 3, 3), got (3, 3)",
     ),
     "fit": ("interpolate", InterpolatorContribution, lambda *_: Fragile(), FAILED),
 }

@@ -4,22 +4,11 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
 
 import pytest
 
-from photonpano import interrupts
 from photonpano.errors import described
-from photonpano.interrupts import interrupt, is_interrupt
-
-
-@pytest.fixture
-def heeded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Handle SIGINT as the program does."""
-    monkeypatch.setattr(interrupts, "_noted", threading.Event())
-    before = signal.signal(signal.SIGINT, interrupt)
-    yield
-    signal.signal(signal.SIGINT, before)
+from photonpano.interrupts import is_interrupt
 
 
 @pytest.mark.usefixtures("heeded")

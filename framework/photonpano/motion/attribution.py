@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -10,13 +10,17 @@ from numpy.typing import ArrayLike
 
 from photonpano.errors import PhotonpanoError, PluginError, described
 from photonpano.interrupts import is_interrupt
-from photonpano.protocols import Source, Trajectory
-from photonpano.source_wrapper import ArrayT, SourceWrapper, capabilities_of, with_capabilities
-from photonpano.values import FloatArray, FrameSpan
+from photonpano.protocols import Trajectory
+from photonpano.values import FloatArray
 
 
 class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
     """What a component returned although its protocol does not allow it, as a clause; raised inside `attributing`."""
+
+
+def shown(value: object) -> str:
+    """Describe a value by its type, and an array by its shape and type."""
+    return f"{value.shape} of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
 
 
 @contextmanager
@@ -42,37 +46,6 @@ def attributing(origin: str, where: str) -> Iterator[None]:
         raise PluginError(f"{origin} failed at {where}: {described(error)}") from error
 
 
-def attributed(source: Source, origin: str) -> AttributedSource:
-    """Return a source whose errors name the plugin, whether a merger, the renderer or a preview reads it.
-
-    It has the methods `packed`, `corrected` and `truth` if the source has them.
-
-    Args:
-        source: the source.
-        origin: who provides it, such as "source 'packed-npy' of photonpano 0.1.0".
-    """
-    return with_capabilities(AttributedSource, capabilities_of(source))(source, origin)
-
-
-class AttributedSource(SourceWrapper):
-    """A source that names its plugin in errors: made by `attributed`.
-
-    Reading a span raises a `PluginError` if the source failed with an exception that is not for users, or broke its contract.
-    """
-
-    def __init__(self, source: Source, origin: str) -> None:
-        super().__init__(source)
-        self._origin = origin
-
-    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
-        """See `SourceWrapper`."""
-        with attributing(self._origin, str(span)):
-            found = method(span)
-            if np.shape(found) != shape:
-                raise BrokenContract(f"expected the shape {shape}, got {np.shape(found)}")
-            return found
-
-
 class AttributedTrajectory:
     """A trajectory whose errors name its interpolator, and whose homographies are checked.
 
@@ -95,7 +68,9 @@ class AttributedTrajectory:
         """
         frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
         with attributing(self._origin, f"level {self._level}"):
-            found = np.asarray(self._trajectory.at(frame_indices), dtype=np.float64)
+            found = np.asarray(self._trajectory.at(frame_indices))
+            if found.dtype.kind not in "fiu":
+                raise BrokenContract(f"homographies are float64, got {shown(found)}")
             if found.shape != (len(frames), 3, 3):
                 raise BrokenContract(f"expected homographies of the shape ({len(frames)}, 3, 3), got {found.shape}")
             if (bad := ~np.isfinite(found).all(axis=(1, 2)) | (found[:, 2, 2] == 0)).any():
@@ -103,4 +78,4 @@ class AttributedTrajectory:
                 raise BrokenContract(
                     f"a homography is finite with h33 = 1, that of frame {frames[first]:g} is {found[first].tolist()}"
                 )
-            return found
+            return np.asarray(found, dtype=np.float64)

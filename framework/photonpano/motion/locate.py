@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from photonpano.motion.graph import GraphOptions, GraphSolution, components, sol
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
+from photonpano.motion.start import starting_motion
 from photonpano.threads import thread_pool
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
@@ -91,7 +94,7 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
-        require_motion(level, edges)
+        require_motion(level, edges, shape, partial(_seen_px, exposures, edges, pool))
         with exposures.clock("locate"):
             labels = components(len(groups), edges)
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
@@ -120,6 +123,15 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
         shape,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
+
+
+def _seen_px(exposures: VirtualExposures, edges: Sequence[Edge], pool: ThreadPoolExecutor) -> float:
+    """Return the largest motion of a pair at the first level, in px, as short spans of frames show it; 0 where they do not."""
+    if exposures.previous is not None:
+        return 0.0
+    start, instants = starting_motion(exposures.source, exposures.groups, pool), instants_of(exposures.groups)
+    moved = [start.between(instants[edge.moving], instants[edge.fixed]) for edge in edges] if start else []
+    return max((float(np.hypot(*motion[:2, 2])) for motion in moved if motion is not None), default=0.0)
 
 
 def _not_outvoting(

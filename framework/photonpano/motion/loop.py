@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from numpy.typing import ArrayLike
 
 from photonpano.context import Context
 from photonpano.geometry import inverse, normalised
-from photonpano.motion.attribution import AttributedTrajectory, BrokenContract
+from photonpano.motion.attribution import AttributedTrajectory
+from photonpano.motion.checks import require_groups, require_knots_kept
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
@@ -105,23 +105,21 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
         PluginError: the resampler failed, or its groups are not in order, or lie outside the capture.
     """
     with clock("resample"), level.attributing("resampler"):
-        groups = tuple(level.resampler.groups(n_frames, level.number))
-        for group in groups:
-            if not isinstance(group, Group):
-                raise BrokenContract(f"expected groups, got {group!r:.60}")
-        instants = [group.reference for group in groups]
-        if not groups or any(later <= earlier for earlier, later in pairwise(instants)):
-            raise BrokenContract(f"expected at least one group, in order, each instant once; got the instants {instants}")
-        if beyond := [str(group) for group in groups if group.span.stop > n_frames]:
-            raise BrokenContract(f"the capture has {n_frames} frames (0 to {n_frames - 1}), got a group of {beyond[0]}")
-    return groups
+        return require_groups(level.resampler.groups(n_frames, level.number), n_frames)
 
 
 def interpolate(level: Level, located: LocatedLevel, reference: int, clock: Stopwatch) -> Trajectory:
-    """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate")."""
+    """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate").
+
+    Raises:
+        PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
+    """
     with clock("interpolate"), level.attributing("interpolator"):
-        free = level.interpolator.fit(located.instants, located.homographies, located.information)
-        return ReferencedTrajectory(AttributedTrajectory(free, level.origins["interpolator"], level.number), reference)
+        information = None if located.information is None else located.information.copy()
+        fitted = level.interpolator.fit(located.instants, located.homographies, information)
+        free = AttributedTrajectory(fitted, level.origins["interpolator"], level.number)
+        require_knots_kept(free, located.instants, located.homographies, located.std_px, located.frame_shape)
+        return ReferencedTrajectory(free, reference)
 
 
 class ReferencedTrajectory:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.motion.attribution import BrokenContract
+from photonpano.motion.checks import require_exposure
 from photonpano.motion.level import Level
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
@@ -45,16 +45,12 @@ class VirtualExposures:
         """Merge a group along the motion known so far. Nothing is cached: a second call merges it again.
 
         Raises:
-            PluginError: the merger failed, or returned anything but an exposure of the level's scale.
+            PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.
         """
         level = self.level
         with self.clock("merge"), level.attributing("merger"):
             exposure = level.merger.merge(self.source, self.groups[index], self.previous, level.scale)
-            if not isinstance(exposure, VirtualExposure):
-                raise BrokenContract(f"expected a VirtualExposure, got {type(exposure).__name__}")
-            if exposure.scale != level.scale:
-                raise BrokenContract(f"expected an exposure of scale {level.scale:g}, got {exposure.scale:g}")
-            return exposure
+            return require_exposure(exposure, self.groups[index], level.scale, self.frame_shape)
 
 
 def merge(

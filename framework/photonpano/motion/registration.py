@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from threading import Lock
 from typing import Any
 
@@ -25,6 +26,8 @@ from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated,
 
 BRIDGE = 3
 """If no pair of an exposure with earlier ones is located, pairs with this many predecessors are tried."""
+MAX_HYPOTHESES = 100
+"""Most hypotheses of a pair that are used."""
 MIN_PAIR_WEIGHT = 0.05
 """Lower bound of a pair's weight. Shared photons carry no new information: their noise agrees with the motion known so far."""
 
@@ -289,7 +292,8 @@ class Registrar:
                 continue
             features = self._features(locator, moving), self._features(locator, fixed)
             with self._clock("locate"), self._level.attributing(locator):
-                found = [require_valid(Located(each)) for each in component.hypotheses(*features)]
+                listed = list(islice(component.hypotheses(*features), MAX_HYPOTHESES))
+                found = [require_valid(Located(each)) for each in listed]
             return [self._level.in_frame_px(each).homography for each in found if isinstance(each, Located)]
         return []
 

@@ -13,11 +13,15 @@ from photonpano.contributions import SourceContext, StageContext, install_comman
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
-from photonpano.motion.attribution import attributed, attributing
+from photonpano.motion.attributed_source import attributed
+from photonpano.motion.attribution import attributing, shown
+from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.protocols import Resampler, Source
+from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
+from photonpano.text import listed
 from photonpano.threads import thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
 
@@ -157,7 +161,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
         resampler: Resampler = _built(level.resample, context)
         try:
             with attributing(level.resample.label, f"level {number}"):
-                foreseen.append(resampler.groups(source.info.n_frames, number))
+                foreseen.append(require_groups(resampler.groups(source.info.n_frames, number), source.info.n_frames))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
     return foreseen
@@ -175,7 +179,7 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
     resampler: Resampler = _built(choice, context)
     with attributing(choice.label, "level 1"):
-        resampler.groups(source.info.n_frames, 1)
+        require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
     return decisions
 
 
@@ -204,10 +208,14 @@ def _built(choice: Choice, context: SourceContext | StageContext) -> Any:
         if importlib.util.find_spec(requirement.module) is None:
             raise PluginError(f"{who} needs {requirement.module}, which is not installed: {install_command([requirement])}")
     try:
-        return contribution.build(choice.config, context)
+        built = contribution.build(choice.config, context)
+        lacking = [name for name in KINDS[contribution.kind].methods if not callable(getattr(built, name, None))]
     except PhotonpanoError:
         raise
     except BaseException as error:
         if is_interrupt(error):
             raise
         raise PluginError(f"{who} could not be built: {described(error)}") from error
+    if lacking:
+        raise PluginError(f"{who} could not be built: build returned {shown(built)}, which has no {listed(lacking, 'nor')}")
+    return built

@@ -28,23 +28,25 @@ class Kind:
         section: where a spec chooses it, such as `locate`.
         hook: the hook that offers it, such as `photonpano_locators`.
         contribution: the record that the hook yields.
+        methods: what the component does.
     """
 
     name: str
     section: str
     hook: str
     contribution: type[Contribution]
+    methods: tuple[str, ...]
 
 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
-        Kind("source", "source", "photonpano_sources", SourceContribution),
-        Kind("resampler", "resample", "photonpano_resamplers", ResamplerContribution),
-        Kind("merger", "merge", "photonpano_mergers", MergerContribution),
-        Kind("locator", "locate", "photonpano_locators", LocatorContribution),
-        Kind("interpolator", "interpolate", "photonpano_interpolators", InterpolatorContribution),
-        Kind("refiner", "refine", "photonpano_refiners", RefinerContribution),
+        Kind("source", "source", "photonpano_sources", SourceContribution, ("counts", "frames", "close")),
+        Kind("resampler", "resample", "photonpano_resamplers", ResamplerContribution, ("groups",)),
+        Kind("merger", "merge", "photonpano_mergers", MergerContribution, ("merge",)),
+        Kind("locator", "locate", "photonpano_locators", LocatorContribution, ("describe", "register")),
+        Kind("interpolator", "interpolate", "photonpano_interpolators", InterpolatorContribution, ("fit",)),
+        Kind("refiner", "refine", "photonpano_refiners", RefinerContribution, ("refine",)),
     )
 }
 """All kinds by name, in the order in which a run needs them."""

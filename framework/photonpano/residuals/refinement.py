@@ -9,9 +9,10 @@ from functools import cached_property, partial
 import numpy as np
 
 from photonpano.context import Context
+from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import FrameTrajectory, corner_displacements, inverse
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
-from photonpano.motion.attribution import BrokenContract, attributing
+from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
@@ -158,8 +159,11 @@ def refine(
                 homographies=refined.homographies,
                 std_px=refined.std_px,
             )
-            seen = Look(source, corrected, tolerance_px, memory, context)
-            kept_out = seen.worse_than(look)
+            try:
+                seen = Look(source, corrected, tolerance_px, memory, context)
+                kept_out = seen.worse_than(look)
+            except (CanvasTooLargeError, LocationError) as error:
+                kept_out = " ".join(str(error).split())
             if not kept_out:
                 look = seen
                 rounds.append(refined.summary)
@@ -178,11 +182,18 @@ def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> 
     """
     motion = look.motion
     with attributing(refiner.origin, f"round {number}"):
-        found = refiner.component.refine(source, motion.trajectory, motion.std_px, look.residuals.steps(), look.prediction)
+        std_px = motion.std_px.copy()
+        found = refiner.component.refine(source, motion.trajectory, std_px, look.residuals.steps(), look.prediction)
         if found is None:
             return None
         if not isinstance(found, Refined):
             raise BrokenContract(f"expected a Refined or None, got {type(found).__name__}")
+        for name in ("homographies", "std_px"):
+            array = getattr(found, name)
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+                raise BrokenContract(f"{name} are arrays of float64, got {shown(array)}")
+        if not isinstance(found.summary, str):
+            raise BrokenContract(f"the summary is a text, got {shown(found.summary)}")
         n_frames = len(motion.std_px)
         shapes = np.shape(found.homographies), np.shape(found.std_px)
         if shapes != ((n_frames, 3, 3), (n_frames,)):
@@ -193,6 +204,18 @@ def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> 
         bad = ~np.isfinite(found.homographies).all(axis=(1, 2)) | np.isnan(found.std_px) | (found.std_px < 0)
         if bad.any():
             raise BrokenContract(f"the motion of frame {int(np.argmax(bad))} is not finite, or its std_px is negative or NaN")
+        with np.errstate(all="ignore"):
+            singular = ~(np.abs(np.linalg.det(found.homographies)) > 0) | (found.homographies[:, 2, 2] == 0)
+        if singular.any():
+            first = int(np.argmax(singular))
+            matrix = found.homographies[first].tolist()
+            raise BrokenContract(f"a homography is invertible and has h33 = 1, that of frame {first} is {matrix}")
+        if (lost := np.isfinite(found.std_px) != np.isfinite(motion.std_px)).any():
+            first = int(np.argmax(lost))
+            raise BrokenContract(
+                f"std_px is infinite exactly where it was before; that of frame {first} was {motion.std_px[first]:g}, and is "
+                f"{found.std_px[first]:g}"
+            )
         homographies = inverse(found.homographies[motion.reference]) @ found.homographies
         return replace(found, homographies=homographies / homographies[:, 2:, 2:])
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
-from photonpano.motion.attribution import AttributedTrajectory, attributed
+from photonpano.motion.attributed_source import attributed
+from photonpano.motion.attribution import AttributedTrajectory
 
 ORIGIN = "source 'toy' of toys 1.0"
 SPAN = FrameSpan(2, 5)

@@ -22,6 +22,7 @@ from photonpano import (
     StageContext,
     StreamInfo,
 )
+from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry
@@ -38,7 +39,12 @@ class Built:
 
     def __init__(self, config: Keys, context: Any) -> None:
         self.config, self.context = config, context
-        self.info, self.response = StreamInfo(100, 8, 16, None), object()
+        self.info, self.response = StreamInfo(100, 8, 16, None), BinaryResponse()
+        self.valid = np.ones((8, 16), np.bool_)
+
+    def nothing(self, *_: Any) -> None: ...
+
+    counts = frames = close = groups = merge = describe = register = fit = refine = nothing
 
 
 KINDS: list[Any] = [
@@ -110,7 +116,7 @@ def test_decision_that_json_cannot_hold_is_refused() -> None:
 def test_foreseen_groups_reads_no_frames() -> None:
     made = plan(levels=[{}, {"resample": {"with": {"size": 2}}}], resampler={"build": Curious})
     assert foreseen_groups(made, build_source(made)) == ["chosen from flux and speed when the capture is read"] * 2
-    with pytest.raises(PluginError, match=r"^resampler 'toy' of toys 1\.0 failed at level 1: AttributeError: "):
+    with pytest.raises(PluginError, match=r"^resampler 'toy' of toys 1\.0 failed at level 1: TypeError: "):
         foreseen_groups(plan(), build_source(made))
 
 

@@ -54,6 +54,18 @@ def test_framework_offers_names_through_its_own_entry_point(kind, name):
         ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
         ("def photonpano_sources(:", "SyntaxError: invalid syntax (broken_hooks.py, line 15)"),
         ("raise SystemExit(3)", "SystemExit: 3"),
+        ("import sys\nsys.exit()", "SystemExit"),
+        ("raise BaseException('at once')", "BaseException: at once"),
+        ("raise GeneratorExit", "GeneratorExit"),
+        ("@hookimpl\ndef photonpano_sources(): raise SystemExit(0)", "photonpano_sources raised SystemExit: 0"),
+        (
+            "@hookimpl\ndef photonpano_sources():\n    while True:\n        yield source('again')",
+            "photonpano_sources offers more than 1000 components; does it end?",
+        ),
+        (
+            "from itertools import repeat\n@hookimpl\ndef photonpano_locators(): return repeat(locator('again'))",
+            "photonpano_locators offers more than 1000 components; does it end?",
+        ),
         (
             "@hookimpl\ndef photonpano_sources(config): return []",
             "Plugin 'broken_hooks' for hook 'photonpano_sources' hookimpl definition: photonpano_sources(config) "
@@ -231,3 +243,16 @@ def test_disabling_known_plugin_logs_nothing(words, install, monkeypatch, caplog
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     assert len(of_toys(discover().disabled)) == (words == "alpha")
     assert caplog.messages == []
+
+
+@pytest.mark.usefixtures("heeded")
+def test_keyboard_interrupt_that_a_plugin_raises_is_a_row(install):
+    install("broken", "0.3", "raise KeyboardInterrupt")
+    assert of_toys(discover().broken) == [BrokenPlugin(Origin("broken", "0.3", "broken = broken_hooks"), "KeyboardInterrupt")]
+
+
+@pytest.mark.usefixtures("heeded")
+def test_signal_during_discovery_is_an_interrupt(install):
+    install("slow", "0.3", "import signal\nsignal.raise_signal(signal.SIGINT)")
+    with pytest.raises(KeyboardInterrupt):
+        discover()
