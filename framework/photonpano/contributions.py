@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
 from photonpano.errors import CaptureUnreadError
+from photonpano.paths import given_path, refusal
 from photonpano.protocols import Interpolator, Locator, Merger, Refiner, Resampler, Source
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
@@ -29,12 +30,22 @@ class Config(BaseModel):
 
 def _relative_to_spec(path: Path, info: ValidationInfo) -> Path:
     directory = (info.context or {}).get("directory")
-    path = path.expanduser()
-    return path if directory is None else Path(directory) / path
+    path = given_path(path)
+    path = path if directory is None else Path(directory) / path
+    if reason := refusal(path):
+        raise ValueError(reason)
+    try:
+        path.exists()
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    return path
 
 
 SpecPath = Annotated[Path, AfterValidator(_relative_to_spec)]
-"""A path in a config: relative paths count from the folder of the spec, and arrive in the component resolved."""
+"""A path in a config: relative paths count from the folder of the spec, and arrive in the component resolved.
+
+Named pipes, devices and sockets are refused: they are not files that can be read twice.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from photonpano.atomic import discard_unfinished
-from photonpano.cli.errors import SIGNALLED
+from photonpano.cli.errors import INTERRUPTED, SIGNALLED
 from photonpano.interrupts import interrupt
 
 GRACE_S = 1.2
@@ -98,7 +98,7 @@ def _end_in_time(numbers: int, handlers: _Handlers) -> None:
 def _clean_up() -> None:
     discard_unfinished()
     with suppress(OSError):
-        os.write(2, b"\ninterrupted: a part of the program did not stop in time, and was ended; unfinished files are removed\n")
+        os.write(2, f"{INTERRUPTED}\n".encode())
 
 
 def _with_guard(numbers: int, to_write: int) -> int:

@@ -15,6 +15,7 @@ FAILED = 1
 WRONG_SPEC = 2
 SIGNALLED = 128
 """Plus the number of the signal: 130 for Ctrl-C."""
+INTERRUPTED = "\ninterrupted; no file is left half-written under its final name"
 
 
 class WrongArgumentError(PhotonpanoError):
@@ -46,7 +47,7 @@ def reported(*, debug: bool = False) -> Iterator[None]:
         what = f"a plugin or a library called sys.exit({error.code!r}) in the middle of the command"
         raise typer.Exit(print_error(PluginError(what), debug)) from error
     except KeyboardInterrupt as error:
-        typer.echo("\ninterrupted; no file is left half-written under its final name", err=True)
+        typer.echo(INTERRUPTED, err=True)
         raise typer.Exit(SIGNALLED + interrupted_by()) from error
     finally:
         logger.removeHandler(handler)

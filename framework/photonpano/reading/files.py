@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from photonpano.errors import InputError, PhotonpanoError
+from photonpano.paths import refusal
 
 Model = TypeVar("Model", bound=BaseModel)
 P = ParamSpec("P")
@@ -31,7 +32,7 @@ def missing_file(path: Path, kind: str = "file") -> str:
 
 @contextmanager
 def reading(path: Path, otherwise: str | None = None) -> Iterator[None]:
-    """Turn what reading a file raises into an `InputError`.
+    """Refuse what is no regular file before it is opened, and turn what reading raises into an `InputError`.
 
     Args:
         path: the file.
@@ -44,6 +45,8 @@ def reading(path: Path, otherwise: str | None = None) -> Iterator[None]:
             return decode(path.read_bytes())
         ```
     """
+    if reason := refusal(path):
+        raise InputError(reason)
     try:
         yield
     except FileNotFoundError as error:
@@ -81,10 +84,11 @@ def files_in(path: Path, suffix: str) -> list[Path]:
     Raises:
         InputError: there is no such file or folder, or no such file in the folder.
     """
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise InputError(missing_file(path, "file or folder"))
+    with reading(path):
+        if path.is_file():
+            return [path]
+        if not path.is_dir():
+            raise InputError(missing_file(path, "file or folder"))
     found = [
         file.relative_to(path)
         for file in path.rglob("*")
@@ -117,7 +121,9 @@ def read_json(path: Path, model: type[Model]) -> Model:
 
 
 def read_start(path: Path, n_bytes: int) -> bytes:
-    """Return the first bytes of a file; none if it cannot be read."""
+    """Return the first bytes of a file; none if it cannot be read, or is no regular file."""
+    if refusal(path):
+        return b""
     try:
         with path.open("rb") as file:
             return file.read(n_bytes)

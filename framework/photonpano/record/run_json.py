@@ -115,7 +115,7 @@ def read_record(run_folder: Path) -> RunRecord:
     try:
         record: RunRecord = json.loads(file.read_text(encoding="utf-8"))
         record["spec"]  # what everything else can be made from
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{file}: cannot be read as the record of a run ({error}); give the folder of a finished run"
         ) from error

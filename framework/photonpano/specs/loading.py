@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem, SpecError
+from photonpano.paths import refusal
 from photonpano.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
 from photonpano.specs.resolution import resolve
@@ -103,6 +104,8 @@ def capture_plan(
 
 
 def _read(path: Path) -> str:
+    if reason := refusal(path):
+        raise SpecError([Problem("", reason.removeprefix(f"{path} "), path)])
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)

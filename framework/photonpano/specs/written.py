@@ -162,7 +162,10 @@ def given(data: object) -> str:
 def from_python(data: object, place: Place) -> WrittenSpec:
     """Read a spec from Python data; anything but plain data becomes a problem and None."""
     spec = WrittenSpec(None, {"": place})
-    spec.data = _plain(data, "", spec)
+    try:
+        spec.data = _plain(data, "", spec)
+    except RecursionError:
+        spec.problems.append(place.problem("not a spec: nested too deeply"))
     return spec
 
 
