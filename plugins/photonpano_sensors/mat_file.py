@@ -39,8 +39,7 @@ class MatFrames:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        start = read_start(path, 10)
-        self._variable = _hdf_variable if start == b"MATLAB 7.3" or start.startswith(b"\x89HDF") else _mat5_variable
+        self._variable = _hdf_variable if is_hdf(path) else _mat5_variable
         with reading(path, _DAMAGED), self._variable(path) as variable:
             self.shape = _frame_order(path, variable.shape)
 
@@ -61,6 +60,12 @@ class MatFrames:
                     raise InputError(f"{self._path} holds values other than 0 and 1: its frames are not binary")
                 packed[start:stop] = np.packbits(lit, axis=-1)
         return packed
+
+
+def is_hdf(path: Path) -> bool:
+    """Return whether a file is one of MATLAB 7.3, by its first bytes."""
+    start = read_start(path, 10)
+    return start == b"MATLAB 7.3" or start.startswith(b"\x89HDF")
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinarySumResponse
-from photonpano.reading import Closing, missing_file, read_start, reading
+from photonpano.reading import Closing, look_first, missing_file, read_start, reading
 
 _SUFFIX = ".ubi.h5"
 _HDF = b"\x89HDF\r\n\x1a\n"
@@ -43,6 +43,7 @@ class UbiceptSource(Closing):
         import h5py
 
         self._path = config.path
+        look_first(self._path, "photonpano_sensors.looks:ubicept")
         with reading(self._path, _DAMAGED):
             self._file = h5py.File(self._path)
         try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.geometry import corners, normalised, translation
-from photonpano.reading import read_arrays
+from photonpano.reading import read_arrays, reading
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
 
@@ -125,10 +125,8 @@ def _read_tiff(path: Path) -> FluxImage:
 
     if not path.exists():
         raise InputError(f"{path} is missing, so the run folder is incomplete; run the spec again")
-    try:
+    with reading(path, "cannot be read as a TIFF image: it is damaged; run the spec again"):
         return np.asarray(tifffile.imread(path), dtype=np.float32)
-    except (tifffile.TiffFileError, ValueError, OSError) as error:
-        raise InputError(f"{path} cannot be read as a TIFF image: {error}") from error
 
 
 def _read_archive(path: Path, content: str, required: tuple[str, ...], optional: tuple[str, ...]) -> Mapping[str, NDArray[Any]]:

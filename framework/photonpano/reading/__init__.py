@@ -14,6 +14,7 @@ from photonpano.reading.files import (
     read_start,
     reading,
 )
+from photonpano.reading.first_look import look_first
 from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, unpacked_start
 from photonpano.reading.npy import NpyHeader, npy_header, require_frames, require_whole
 from photonpano.reading.packed_files import FrameFile, PackedFileSource
@@ -38,6 +39,7 @@ __all__ = [
     "frames_are_last",
     "gzipped_npy_header",
     "is_gzip",
+    "look_first",
     "missing_file",
     "natural_order",
     "npy_header",

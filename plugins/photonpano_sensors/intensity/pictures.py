@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,19 +15,21 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
-from photonpano.reading import missing_file, read_picture, reading
+from photonpano.reading import look_first, read_picture, reading
 from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import pictures_in
 from photonpano_sensors.intensity.source import IntensitySource, Levels
+from photonpano_sensors.looks import spread
 
 Image = NDArray[np.generic]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}
 """The colour types of PNG other than grey."""
-_DAMAGED = (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, struct.error)
-"""Errors that tifffile raises for damaged files."""
+_MOST_SQUEEZED = 1032
+"""A byte of a PNG file unpacks to so many at most."""
+_DAMAGED = "is damaged: it is not a TIFF file that can be read; copy it again"
 
 
 class _Form(NamedTuple):
@@ -90,6 +93,7 @@ class _Folder:
         if not self._files:
             raise InputError(f"{path} holds no .png or .tif files; name the folder that the frames are in")
         self.n_frames = len(self._files)
+        look_first(spread([file for file in self._files if not _is_png(file)]), "photonpano_sensors.looks:tiff_picture")
         self.form = _common((f"{file}", _form_of(file)) for file in self._files)
 
     def read(self, index: int) -> Image:
@@ -109,23 +113,25 @@ class _Pages:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = Lock()
+        look_first(path, "photonpano_sensors.looks:tiff")
         self._file = _tiff(path)
         try:
-            self.n_frames = len(self._file.pages)
-            self.form = _common((f"page {k} of {path}", _form_of_page(path, page)) for k, page in enumerate(self._file.pages))
-        except _DAMAGED as error:
-            self.close()
-            raise InputError(f"{path} is damaged: {error}; copy it again") from error
-        except InputError:
+            with reading(path, _DAMAGED):
+                self.n_frames = len(self._file.pages)
+                pages = enumerate(self._file.pages)
+                self.form = _common((f"page {number} of {path}", _form_of_page(path, page)) for number, page in pages)
+        except BaseException:
             self.close()
             raise
 
     def read(self, index: int) -> Image:
-        try:
-            with self._lock:
-                return np.asarray(self._file.pages[index].asarray())
-        except _DAMAGED as error:
-            raise InputError(f"page {index} of {self._path} cannot be read: {error}") from error
+        with reading(self._path, f"is damaged: page {index} cannot be read; copy it again"), self._lock:
+            levels = np.asarray(self._file.pages[index].asarray())
+        if levels.shape != self.form[:2] or 8 * levels.itemsize != self.form.bits:
+            raise InputError(
+                f"{self._path} is damaged: page {index} is not of {self.form}, as its header promises; copy it again"
+            )
+        return levels
 
     def close(self) -> None:
         self._file.close()
@@ -149,24 +155,29 @@ def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
     return first[1]
 
 
+def _is_png(file: Path) -> bool:
+    return file.suffix.lower() == ".png"
+
+
 def _form_of(file: Path) -> _Form:
     """Return the form of a picture from its header."""
-    if file.suffix.lower() != ".png":
-        with _tiff(file) as tiff:
-            try:
-                if len(tiff.pages) > 1:
-                    raise InputError(f"{file} has {len(tiff.pages)} pages; name the file itself if each is a frame")
-                return _form_of_page(file, tiff.pages[0])
-            except _DAMAGED as error:
-                raise InputError(f"{file} is damaged: {error}; copy it again") from error
+    if not _is_png(file):
+        with _tiff(file) as tiff, reading(file, _DAMAGED):
+            if len(tiff.pages) > 1:
+                raise InputError(f"{file} has {len(tiff.pages)} pages; name the file itself if each is a frame")
+            return _form_of_page(file, tiff.pages[0])
     with reading(file), file.open("rb") as opened:
         header = opened.read(26)
+        n_bytes = os.fstat(opened.fileno()).st_size
     if len(header) < 26 or not header.startswith(_PNG):
         raise InputError(f"{file} is not a PNG file, by its first bytes; remove it, or save it again")
     width, height, bits, colours = struct.unpack(">IIBB", header[16:])
     if colours:
         raise InputError(f"{file} has {_PNG_COLOURS.get(colours, 'colours')}; convert the frames to grey")
-    return _grey(file, _Form(height, width, bits))
+    form = _grey(file, _Form(height, width, bits))
+    if height * width * bits // 8 > n_bytes * _MOST_SQUEEZED:
+        raise InputError(f"{file} is damaged: it promises {form}, and has {n_bytes:,} bytes; copy it again")
+    return form
 
 
 def _form_of_page(file: Path, page: tifffile.TiffPage | tifffile.TiffFrame) -> _Form:
@@ -177,15 +188,13 @@ def _form_of_page(file: Path, page: tifffile.TiffPage | tifffile.TiffFrame) -> _
 
 
 def _grey(file: Path, form: _Form) -> _Form:
+    if min(form.height, form.width) < 1:
+        raise InputError(f"{file} has no pixels: it promises {form}; remove it, or copy it again")
     if form.bits not in (8, 16):
         raise InputError(f"{file} has {form}; convert the frames to 8 or 16 bits")
     return form
 
 
 def _tiff(path: Path) -> tifffile.TiffFile:
-    try:
+    with reading(path, "is neither a folder nor a TIFF file that can be read; copy it again"):
         return tifffile.TiffFile(path)
-    except FileNotFoundError as error:
-        raise InputError(missing_file(path)) from error
-    except _DAMAGED as error:
-        raise InputError(f"{path} is neither a folder nor a TIFF file that can be read: {error}") from error

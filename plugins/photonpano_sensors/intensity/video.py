@@ -86,7 +86,7 @@ class _Decoder:
             if self._seeks:
                 self._seek(due)
             frame = next((frame for frame in self._frames if self._place(frame) >= due), None)
-        except av.FFmpegError:
+        except (av.FFmpegError, ValueError, TypeError, AttributeError):  # PyAV does not expect all that a file can hold
             frame = None
         if frame is None or frame.is_corrupt or self._place(frame) > due:
             self.next = len(self._index.times)  # the next call has to seek

@@ -15,13 +15,14 @@ from av.video.format import VideoFormat
 from numpy.typing import NDArray
 
 from photonpano import InputError
-from photonpano.reading import missing_file
+from photonpano.reading import look_first, missing_file, reading
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import refuse_mdat
 
 _LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")
 """Pixel formats whose first plane is the luma."""
 _FULL_RANGE = re.compile(r"yuvj|gray")
+_DAMAGED = "is damaged: FFmpeg finds contradictions in it; export or copy it again"
 _JPEG_RANGE = 2
 """The colour range of FFmpeg in which all levels are used."""
 
@@ -62,7 +63,8 @@ def index_of(path: Path) -> VideoIndex:
         InputError: the file is missing, is not a video, or ends early.
     """
     refuse_mdat(path)
-    with opened(path) as container:
+    look_first(path, "photonpano_sensors.looks:video")
+    with reading(path, _DAMAGED), opened(path) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
         try:

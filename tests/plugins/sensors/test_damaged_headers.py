@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
@@ -100,6 +100,12 @@ def test_mat_parts_raises_input_error_on_random_bytes(
     try_to_read("mat-parts", parts)
 
 
+@pytest.fixture
+def no_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read files without a first look, which takes longer than all else here."""
+    monkeypatch.setattr("photonpano_sensors.ubicept.look_first", lambda *_: None)
+
+
 @pytest.fixture(scope="module")
 def hdf5(folder: Path) -> bytes:
     h5py = pytest.importorskip("h5py")
@@ -110,8 +116,9 @@ def hdf5(folder: Path) -> bytes:
     return bytes((folder / "capture.ubi.h5").read_bytes())
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(kept=st.integers(0, 20_000), start=st.binary(max_size=12))
+@pytest.mark.usefixtures("no_look")
 def test_ubicept_raises_input_error_on_truncated_file(folder: Path, hdf5: bytes, kept: int, start: bytes) -> None:
     """Or begin with something else. Other bytes are not changed: the HDF5 library ends the process for some of these."""
     path = folder / "capture.ubi.h5"
@@ -119,8 +126,9 @@ def test_ubicept_raises_input_error_on_truncated_file(folder: Path, hdf5: bytes,
     try_to_read("ubicept-h5", path)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(metadata=JSON | st.fixed_dictionaries({"num_integrated_binary_frames": JSON, "node_history": JSON}))
+@pytest.mark.usefixtures("no_look")
 def test_ubicept_raises_input_error_on_random_metadata(folder: Path, metadata: Any) -> None:
     h5py = pytest.importorskip("h5py")
     path = folder / "metadata.ubi.h5"
