@@ -37,6 +37,9 @@ _SHOWN = 3
 _SEARCHED = 1000
 """The largest number of files of a folder whose endings are compared with those of sources."""
 
+_MOST_BACKENDS = 16
+"""The largest number of locators of a chain."""
+
 
 class AutoConfig(Config):
     """A capture of any kind."""
@@ -53,6 +56,7 @@ class ChainConfig(Config):
     backends: tuple[str | dict[str, Any], ...] = Field(
         ("direct", "opencv-sift"),
         min_length=1,
+        max_length=_MOST_BACKENDS,
         description="the locators, in the order in which they are tried: each is a name, or a mapping of use and with",
     )
 
@@ -192,6 +196,7 @@ def first_with_fallbacks(section: dict[str, Any], where: str, spec: WrittenSpec)
         spec.places |= {f"{items}.{index}": spec.place(f"{where}.use") for index in range(len(backends))}
     if not isinstance(backends, list) or not backends or not all(isinstance(item, str | dict) for item in backends):
         return None
+    backends = backends[:_MOST_BACKENDS]
     first, *others = backends
     chosen = {"use": first} if isinstance(first, str) else {"use": None} | first
     if "fallback" in chosen:

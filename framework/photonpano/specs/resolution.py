@@ -45,6 +45,8 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "run": RunSettings,
 }
 """The framework's own sections."""
+MAX_LISTED = 16
+"""The largest number of components in a list, such as fallbacks."""
 SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
 _AGAIN = "would lose the same pairs again"
@@ -225,7 +227,9 @@ class _Resolver:
         if data is None:
             return [default] if default in self.catalog.names(kind.name) else []
         if isinstance(data, list):
-            return data
+            if len(data) > MAX_LISTED:
+                self.spec.wrong(where, f"expected at most {MAX_LISTED} {kind.name}s, got {given(data)}")
+            return data[:MAX_LISTED]
         self.spec.places = self.spec.places_under(where, f"{where}.0") | self.spec.places
         return [data]
 

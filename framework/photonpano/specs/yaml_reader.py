@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.reader import ReaderError
@@ -21,12 +22,32 @@ if TYPE_CHECKING:
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
-MAX_VALUES = 20_000
+MAX_VALUES = 5000
 """The largest number of values in a spec; aliases of aliases multiply."""
+MAX_DEPTH = 100
+"""How deeply values may be nested in a spec."""
 
 
 class _TooLongError(Exception):
     """More than `MAX_VALUES` values."""
+
+
+class _Composer(Composer):
+    """Stops at files that are no specs, which take a minute otherwise: a megabyte holds 500,000 values."""
+
+    n_values = 0
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.n_values += 1
+        self.depth += 1
+        if self.n_values > 2 * MAX_VALUES:  # keys count here
+            raise _TooLongError
+        if self.depth > MAX_DEPTH:
+            raise RecursionError
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
 
 def read_yaml(text: str, place: Place) -> WrittenSpec:
@@ -40,6 +61,7 @@ def read_yaml(text: str, place: Place) -> WrittenSpec:
         The document, with problems if something cannot be read; its data is None if the text is not YAML or holds no document.
     """
     yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _Composer
     yaml.composer.warn_double_anchors = False
     reader = _Reader(place)
     problems = reader.spec.problems
