@@ -161,6 +161,7 @@ def fold(
     block_count: NDArray[np.float64],
     cell_misfit: NDArray[np.float64],
     cell_count: NDArray[np.float64],
+    cell_noise: NDArray[np.float64],
 ) -> float:
     """Add up the blocks of a span: the equations of its motion and gain, and squared residual / variance.
 
@@ -177,6 +178,7 @@ def fold(
         block_count: (h, w), added to.
         cell_misfit: squares of the panorama, added to.
         cell_count: added to.
+        cell_noise: variance of the residual, relative to the squared prediction, added to.
 
     Returns:
         Mean over the blocks of squared residual / variance; 1 if no block has photons enough.
@@ -219,4 +221,5 @@ def fold(
             if 0 <= i < cell_misfit.shape[0] and 0 <= j < cell_misfit.shape[1]:
                 cell_misfit[i, j] += misfit
                 cell_count[i, j] += 1
+                cell_noise[i, j] += float(cell[V]) * variance_share / float(cell[M]) ** 2
     return total / n if n > 0 else 1.0

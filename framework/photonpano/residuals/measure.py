@@ -56,6 +56,7 @@ class Residuals:
         cell_misfit: (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was
             seen.
         cell_count: (H', W') number of blocks that fell on each square.
+        cell_noise: (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block.
         frames_seen: frames that saw a place of the panorama, the median over its pixels.
         frame_shape: (height, width) of a frame.
     """
@@ -71,6 +72,7 @@ class Residuals:
     pixel_mean: FluxImage
     cell_misfit: FloatArray
     cell_count: FloatArray
+    cell_noise: FloatArray
     frames_seen: float
     frame_shape: tuple[int, int]
 
@@ -128,6 +130,7 @@ def measure(source: Source, span: FrameSpan, prediction: Prediction, context: Co
             total.pixel_mean,
             total.cell_misfit / total.cell_count,
             total.cell_count,
+            total.cell_noise / total.cell_count,
             prediction.frames_seen,
             prediction.frame_shape,
         )
@@ -184,6 +187,7 @@ class _Batch:
     pixel_mean: FluxImage
     cell_misfit: FloatArray
     cell_count: FloatArray
+    cell_noise: FloatArray
 
     def plus(self, other: _Batch) -> _Batch:
         """Return the sums over both; `normal`, `gradient` and `misfit` are kept apart, and not used here."""
@@ -198,6 +202,7 @@ class _Batch:
             self.pixel_mean + other.pixel_mean,
             self.cell_misfit + other.cell_misfit,
             self.cell_count + other.cell_count,
+            self.cell_noise + other.cell_noise,
         )
 
 
@@ -227,6 +232,7 @@ def _measured(
         np.zeros(grid),
         np.zeros(shape, np.float32),
         np.zeros(shape, np.float32),
+        np.zeros(cells),
         np.zeros(cells),
         np.zeros(cells),
     )
@@ -260,6 +266,7 @@ def _measured(
             total.block_count,
             total.cell_misfit,
             total.cell_count,
+            total.cell_noise,
         )
     return total
 

@@ -20,8 +20,8 @@ MAX_RATIO = 2.0
 """Scatter of the shifts of short spans, in units of what noise explains."""
 MAX_MISFIT, MAX_CONTRAST = 1.1, 0.02
 """Mean squared residual / variance of blocks, and the part of the light that it stands for: both must be exceeded."""
-MAX_MOVING_SHARE = 0.03
-"""Share of the panorama whose photons change over time."""
+MAX_MOVING_SHARE, _MOVING_CONTRAST = 0.03, 0.05
+"""Share of the panorama whose photons change over time, and by how much of the light at least."""
 MAX_GAIN = 0.03
 """Root mean square of the relative brightness, over the blocks of the sensor or over the spans of the capture."""
 MAX_HOT_SHARE = 0.005
@@ -136,7 +136,8 @@ def _moving(residuals: Residuals) -> Reason | None:
     if not counted.any():
         return None
     expected = 1 + _SIGMAS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
-    changing = counted & (residuals.cell_misfit > np.maximum(expected, 1.5))
+    contrast = np.sqrt(np.maximum(residuals.cell_misfit - 1, 0) * residuals.cell_noise)
+    changing = counted & (residuals.cell_misfit > np.maximum(expected, 1.5)) & (contrast > _MOVING_CONTRAST)
     share = float(changing.sum() / counted.sum())
     if share <= MAX_MOVING_SHARE:
         return None

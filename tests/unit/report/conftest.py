@@ -75,6 +75,7 @@ def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: flo
         pixel_mean=np.full(FRAME_SHAPE, 1e4, np.float32),
         cell_misfit=rng.normal(1, 0.1, cells),
         cell_count=np.full(cells, 300.0),
+        cell_noise=np.full(cells, 0.01),
         frames_seen=4000.0,
         frame_shape=FRAME_SHAPE,
     )

@@ -40,6 +40,7 @@ def noise() -> Residuals:
         pixel_mean=np.full(SHAPE, 1000, np.float32),
         cell_misfit=rng.normal(1, 0.1, cells),
         cell_count=np.full(cells, 200.0),
+        cell_noise=np.full(cells, 0.01),
         frames_seen=1000.0,
         frame_shape=SHAPE,
     )
