@@ -82,11 +82,14 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
         decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)
-        results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged)
-        if vignette := vignette_of(plan, source, results[-1].trajectory):
+        results = estimate_motion(source, levels[:1], plan.graph, reference, context)
+        known, later = results[0].trajectory, levels[1:]
+        if vignette := vignette_of(plan, source, known):
             decisions.append(vignette.decision)
-            source, last, known = divided_by(source, vignette), results[-1].level, results[-1].trajectory
-            results[-1:] = estimate_motion(source, [last], plan.graph, reference, context, previous=known)
+            source = divided_by(source, vignette)
+            if not later:
+                results, later = [], levels
+        results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known)
         motion = motion_of_frames(results, source.info, reference)
         refiners = build_refiners(plan, source, decisions)
         explained = refine(source, motion, refiners, plan.render.tolerance_px, memory, context)

@@ -17,7 +17,7 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Prediction
-from photonpano.residuals.unexplained import residual_ratio, unexplained_px
+from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.values import Panorama, Refined
 
 MAX_ROUNDS = 6
@@ -170,7 +170,7 @@ def refine(
                 context.progress.note(f"{refiner.name}: {refined.summary}")
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(start, look.motion), kept_out))
     left_px = unexplained_px(look.residuals, len(motion.std_px))
-    motion = replace(look.motion, std_px=np.hypot(look.motion.std_px, left_px))
+    motion = replace(look.motion, std_px=np.hypot(bounded_std_px(look.motion.std_px, look.residuals), left_px))
     return Explained(motion, look.panorama, look.residuals, look.ratio, tuple(refinements))
 
 

@@ -1,9 +1,10 @@
-"""Motion that is left in the residuals beyond photon noise: its size, frame by frame, and its ratio to the noise."""
+"""Errors of the motion that the residuals show beyond photon noise, or exclude, frame by frame."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import minimum_filter1d
 
 from photonpano.geometry import corners
 from photonpano.residuals.measure import Residuals
@@ -20,6 +21,9 @@ _SIGNIFICANT = 3.0
 _STANDS_OUT = 30.0
 """A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
 200,000 spans."""
+
+_BOUND_SPANS = 3
+"""The measured steps of this many spans bound the error of a frame."""
 
 
 def residual_ratio(residuals: Residuals) -> float:
@@ -67,6 +71,28 @@ def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
     single = np.where((steps[known] ** 2 / variances[known]).sum(axis=1) > _STANDS_OUT, np.sqrt(squares), 0)
     found = np.maximum(found, sliding_window_view(np.pad(single, 1), 3).max(axis=1))
     return np.asarray(np.interp(np.arange(n_frames), residuals.instants[known], found))
+
+
+def bounded_std_px(std_px: FloatArray, residuals: Residuals) -> FloatArray:
+    """Return the expected corner errors, no larger than the residuals allow: (T,).
+
+    A frame lies within its measured shift, roll and zoom of the panorama, and so of the surest frame that sees the same place.
+    At the ends of a capture, where motion is extrapolated, this is less than what extrapolation lets expect.
+
+    Args:
+        std_px: (T,) expected corner error of each frame, infinite where it is not located.
+        residuals: of the motion.
+    """
+    steps, variances = _series(residuals)
+    known = np.isfinite(variances).all(axis=1)
+    if known.sum() < _BOUND_SPANS:
+        return std_px
+    squares = np.pad((steps[known] ** 2 + variances[known]).sum(axis=1), _BOUND_SPANS // 2, mode="edge")
+    local = sliding_window_view(squares, _BOUND_SPANS).mean(axis=1)
+    measured = np.interp(np.arange(len(std_px)), residuals.instants[known], local)
+    reach = max(1, int(residuals.frames_seen / 4))
+    surest = minimum_filter1d(std_px**2 + measured, 2 * reach + 1, mode="nearest")
+    return np.asarray(np.minimum(std_px, np.where(np.isfinite(std_px), np.sqrt(surest + measured), np.inf)))
 
 
 def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:

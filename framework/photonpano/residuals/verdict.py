@@ -231,12 +231,15 @@ def _deformation(residuals: Residuals) -> Reason | None:
     if not known.any():
         return None
     noise = np.trace(np.linalg.inv(information[known]), axis1=-2, axis2=-1)
-    # A shift, roll, zoom or shear of the whole frame is no deformation.
-    rows, columns = np.nonzero(known)
-    affine = np.stack([np.ones(len(rows)), columns, rows], axis=1) / np.sqrt(noise)[:, None]
-    fitted = np.linalg.lstsq(affine, shifts[known] / np.sqrt(noise)[:, None])[0]
-    left = shifts[known] - np.sqrt(noise)[:, None] * (affine @ fitted)
-    size = float(np.sqrt(max(float(np.mean((left**2).sum(axis=-1) - noise)), 0)))
+    # A shift, roll, zoom or shear of the whole frame is no deformation. Shifts that change from block to block are those of
+    # edges, interpolated at different fractions of a pixel.
+    rows, columns = (np.linspace(-1, 1, n)[index] for n, index in zip(known.shape, np.nonzero(known), strict=True))
+    affine = np.stack([np.ones(len(rows)), columns, rows], axis=1)
+    smooth = np.stack([columns**i * rows ** (power - i) for power in (2, 3) for i in range(power + 1)], axis=1)
+    weights = 1 / np.sqrt(noise)[:, None]
+    beyond = smooth - affine @ np.linalg.lstsq(affine * weights, smooth * weights)[0]
+    fit = beyond @ np.linalg.pinv(beyond * weights) * weights.T
+    size = float(np.sqrt(max(float(np.mean(((fit @ shifts[known]) ** 2).sum(axis=-1) - fit**2 @ noise)), 0)))
     if size <= MAX_DEFORMATION_PX:
         return None
     return Reason(
