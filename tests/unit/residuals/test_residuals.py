@@ -13,7 +13,7 @@ from photonpano.geometry import FrameTrajectory, translation
 from photonpano.merging.panorama import plan_canvas, render
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Prediction
-from photonpano.residuals.unexplained import residual_ratio, unexplained_px
+from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
 
@@ -61,6 +61,22 @@ def test_steps_are_the_tremor_that_the_motion_lacks() -> None:
     assert 0.7 < slope < 1.1
     assert residual_ratio(found) > 2
     assert unexplained_px(found, FRAMES).mean() == pytest.approx(0.4 / np.sqrt(2), rel=0.35)
+
+
+def test_bounded_std_px_at_an_extrapolated_end_is_what_the_photons_allow() -> None:
+    found = residuals_of(capture())
+    std_px = np.full(FRAMES, 0.1)
+    std_px[-40:] = np.linspace(0.1, 10, 40)
+    std_px[:5] = np.inf
+    bounded = bounded_std_px(std_px, found)
+    np.testing.assert_array_equal(bounded[:700], std_px[:700])
+    assert bounded[-40:].max() < 1
+    assert (bounded[-40:] >= 0.1).all()
+
+
+def test_bounded_std_px_keeps_the_error_that_photons_show() -> None:
+    found = residuals_of(capture(0.4))
+    assert bounded_std_px(np.full(FRAMES, 10.0), found).min() == 10
 
 
 def test_scatter_of_steps_is_their_information() -> None:
