@@ -13,6 +13,9 @@ from .api.run_check import RunCheck as RunCheck
 from .api.run_check import check_run as check_run
 from .api.runs import evaluate as evaluate
 from .api.runs import warm_up as warm_up
+from .api.verification import Verification as Verification
+from .api.verification import clean as clean
+from .api.verification import verify as verify
 from .contributions import Config as Config
 from .contributions import InterpolatorContribution as InterpolatorContribution
 from .contributions import LocatorContribution as LocatorContribution

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import shutil
-import tempfile
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from photonpano.errors import OutputError
+from photonpano.locks import claim, claimed, is_at
 from photonpano.text import byte_size
 
+_PARTIAL = re.compile("[0-9a-f]{8}")
 _unfinished: set[Path] = set()
 """Files and folders under temporary names, which are to become final."""
 
@@ -49,15 +52,9 @@ def atomic_path(final: Path) -> Iterator[Path]:
     Raises:
         OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
     """
-    temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.partial{final.suffix}")
-    _unfinished.add(temporary)
-    try:
-        with _becoming(final, temporary):
-            temporary.touch(exist_ok=False)
-            yield temporary
-    finally:
-        temporary.unlink(missing_ok=True)
-        _unfinished.discard(temporary)
+    with _becoming(final), _lent(final, f".{final.stem}.", f".partial{final.suffix}") as temporary:
+        yield temporary
+        _rename(temporary, final)
 
 
 def part_path(final: Path) -> Path:
@@ -72,44 +69,23 @@ def resumable_path(final: Path) -> Iterator[Path]:
     When the block raises, Ctrl-C included, the file stays, to be continued by a later call. So it may exist already.
 
     Raises:
-        OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
+        OutputError: the file cannot be written, or another process writes it. Every `OSError` of the block counts as one of
+            writing.
     """
-    with _becoming(final, part_path(final)):
-        yield part_path(final)
-
-
-@contextmanager
-def atomic_files(directory: Path, last: str = "") -> Iterator[Path]:
-    """Lend an empty folder whose files move into `directory` when the block ends well.
-
-    The directory is made before the block runs. When the block raises, Ctrl-C included, what was in it stays as it was, and
-    folders that were made for it are removed.
-
-    Args:
-        directory: it may exist, and hold files.
-        last: the file that is moved after all others: once it is new, so are they.
-
-    Raises:
-        OSError: the directory cannot be made or written to.
-    """
-    made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
-    directory.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=".part-", dir=directory))
-    _unfinished.add(staging)
-    try:
-        yield staging
-        files = sorted(staging.iterdir(), key=lambda file: file.name == last)
-        for file in files:
-            _flush_to_disk(file)
-        for file in files:
-            file.replace(directory / file.name)
-        made.clear()
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        _unfinished.discard(staging)
-        with suppress(OSError):  # another program has put something there
-            for folder in made:
-                folder.rmdir()
+    part = part_path(final)
+    with _becoming(final):
+        if os.path.lexists(part) and not stat.S_ISREG(part.lstat().st_mode):
+            raise OutputError(f"cannot write {final}: {part} is no regular file; remove it, or choose another name")
+        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            if claimed(descriptor) is False or not is_at(descriptor, part):
+                raise OutputError(f"cannot write {final}: another process is writing it; wait for it, or choose another name")
+            yield part
+            _rename(part, final)
+        finally:
+            if is_at(descriptor, part) and not os.fstat(descriptor).st_size:
+                part.unlink()
+            os.close(descriptor)
 
 
 @contextmanager
@@ -120,34 +96,91 @@ def atomic_folder(final: Path) -> Iterator[Path]:
         OutputError: there is something under that name, or the folder cannot be written.
     """
     place = final.absolute()
-    temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
-    _unfinished.add(temporary)
     try:
         if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
             raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
-        temporary.mkdir()
-        yield temporary
-        for file in temporary.iterdir():
-            _flush_to_disk(file)
-        temporary.replace(place)
+        with _lent(place, f".{place.name}.", ".partial", folder=True) as temporary:
+            yield temporary
+            for file in temporary.iterdir():
+                flush(file)
+            _rename(temporary, place)
     except OSError as error:
         raise OutputError(_message(final, error)) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        _unfinished.discard(temporary)
 
 
 @contextmanager
-def _becoming(final: Path, temporary: Path) -> Iterator[None]:
-    """Rename a file when the block ends well."""
+def unfinished_folder(place: Path, start: str) -> Iterator[Path]:
+    """Lend a new folder beside `place` whose name begins with `start` and ends in `.partial`, and remove it after the block."""
+    with _lent(place, start, ".partial", folder=True) as temporary:
+        yield temporary
+
+
+@contextmanager
+def _lent(place: Path, start: str, end: str, *, folder: bool = False) -> Iterator[Path]:
+    """Make a file or folder beside `place`, lock it, so that others see that it is in use, and remove it after the block."""
+    for path in partial_paths(place.parent, start, end):
+        with claim(path) as mine:
+            if mine:
+                remove(path)
+    while True:
+        temporary = place.with_name(f"{start}{secrets.token_hex(4)}{end}")
+        if folder:
+            temporary.mkdir()
+        flags = os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        descriptor = os.open(temporary, flags, 0o666)
+        # Another process may have taken it for abandoned before it was locked.
+        if claimed(descriptor) is not False and temporary.exists():
+            break
+        os.close(descriptor)
+    _unfinished.add(temporary)
     try:
+        yield temporary
+    finally:
+        os.close(descriptor)
+        with suppress(OSError):
+            remove(temporary)
+        _unfinished.discard(temporary)
+
+
+def partial_paths(folder: Path, start: str, end: str) -> list[Path]:
+    """Return what bears a temporary name: `start`, eight hexadecimal digits, and `end`."""
+    try:
+        return [path for path in sorted(folder.iterdir()) if is_partial(path.name, start, end)]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def is_partial(name: str, start: str, end: str) -> bool:
+    """Return whether a name is a temporary one: see `partial_paths`."""
+    return bool(_PARTIAL.fullmatch(name[len(start) : len(name) - len(end)])) and name.startswith(start) and name.endswith(end)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a symbolic link, or a folder with its content; a missing one is no error."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _becoming(final: Path) -> Iterator[None]:
+    """Refuse a name that no file can get, and turn what the system raises into an `OutputError`."""
+    try:
+        if final.is_symlink():
+            raise OutputError(f"cannot write {final}: it is a symbolic link; remove it, or choose another name")
         if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         yield
-        _flush_to_disk(temporary)
-        temporary.replace(final)
     except OSError as error:
         raise OutputError(_message(final, error)) from error
+
+
+def _rename(temporary: Path, final: Path) -> None:
+    """Give a file or folder its final name, once it is on the disk."""
+    flush(temporary)
+    temporary.replace(final)
+    flush(final.parent)
 
 
 def require_space(final: Path, n_bytes: int) -> None:
@@ -164,11 +197,14 @@ def require_space(final: Path, n_bytes: int) -> None:
         )
 
 
-def _flush_to_disk(path: Path) -> None:
+def flush(path: Path) -> None:
     """Wait for the disk: some file systems report only now that they are full, and a rename may overtake the data."""
-    descriptor = os.open(path, os.O_RDWR)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # some file systems flush no folders
+            raise
     finally:
         os.close(descriptor)
 

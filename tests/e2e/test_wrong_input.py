@@ -208,7 +208,14 @@ def test_full_disk_keeps_earlier_run(simulated: Callable[..., Path], tmp_path: P
     folder.mkdir(parents=True)
     for name in ("panorama.tiff", "run.json"):
         (folder / name).write_text("of an earlier run")
-    command = [sys.executable, "-c", "from photonpano.cli import main; main()", "run", str(tmp_path / "spec.yaml")]
+    command = [
+        sys.executable,
+        "-c",
+        "from photonpano.cli import main; main()",
+        "run",
+        str(tmp_path / "spec.yaml"),
+        "--overwrite",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit_files)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == (

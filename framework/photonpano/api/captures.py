@@ -39,18 +39,18 @@ def convert(
 ) -> WrittenCapture:
     """Write a capture of binary frames to a packed .npy file.
 
-    When it is interrupted, the frames written so far stay in OUTPUT.part, and the next call continues from there.
+    When it is interrupted, the frames written so far stay in OUTPUT.part. The next call compares them with the capture,
+    and continues from there.
 
     Args:
         plan: of the capture, from `capture_plan` or `load_spec`; its corrections are applied.
         output: the .npy file.
         progress: receives the stage; quiet by default.
-        resumed: called with the number of frames that OUTPUT.part holds, if there is such a file; 0 if they belong to another
-            capture and are written anew.
+        resumed: called with the number of frames that OUTPUT.part holds, if there are any.
 
     Raises:
         InputError: the frames are not binary, or a correction changes sums of frames, which bits cannot hold.
-        OutputError: the file cannot be written, or the disk is full.
+        OutputError: the file cannot be written, the disk is full, or OUTPUT.part is another file.
     """
     return _write(plan, Path(output), progress, resumed or (lambda _: None))
 

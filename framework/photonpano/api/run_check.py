@@ -18,6 +18,7 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.run import vignette_of
 from photonpano.protocols import Source
+from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
@@ -56,10 +57,12 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
         InputError: the folder is no run folder, its capture cannot be opened, or it is another capture now.
     """
     folder = Path(run_folder)
+    require_one_run(folder, ["trajectory.npz"])
     run = load_run_trajectory(folder, needs_std_px=False)
     record = read_record(folder)
     with _capture(folder, record, catalog) as (plan, source), one_thread_inside():
         _require_same_capture(folder, run, source.info)
+        require_same_frames(folder, record, source)
         motion = _motion(run)
         if _divided_by_vignette(record) and (vignette := vignette_of(plan, source, motion.trajectory)):
             source = divided_by(source, vignette)

@@ -15,9 +15,10 @@ from photonpano.merging.panorama import render
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.run import run
 from photonpano.protocols import Trajectory
+from photonpano.record.contents import finish_run_folder, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.registry import Catalog
-from photonpano.specs import Plan, parse_spec
+from photonpano.specs import parse_spec
 from photonpano.threads import thread_count
 from photonpano.values import Panorama
 
@@ -43,19 +44,18 @@ def evaluate(
     """
     if not oracle:
         return evaluate_folder(run_folder, truth)
-    plan = _recorded_plan(Path(run_folder), catalog)
+    folder = Path(run_folder)
+    finish_run_folder(folder)
+    record = read_record(folder)
+    plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog)
     with open_source(plan) as source:
+        require_same_frames(folder, record, source)
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             context = Context(thread_count(plan.run.threads), progress or Quiet())
             return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context)
 
         return evaluate_folder(run_folder, truth, along_truth)
-
-
-def _recorded_plan(run_folder: Path, catalog: Catalog | None) -> Plan:
-    """Return the plan that a run folder was made with."""
-    return parse_spec(read_record(run_folder)["spec"], name=str(run_folder / "run.json"), catalog=catalog)
 
 
 def warm_up() -> float:

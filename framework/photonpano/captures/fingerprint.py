@@ -50,12 +50,16 @@ def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
         source: the open capture, from `open_source`.
     """
     suffixes = tuple(plan.source.contribution.suffixes)  # type: ignore[attr-defined]  # those of a source
-    read = dict.fromkeys([*_paths(plan.source.config), *_paths(plan.corrections)])
     return {
-        "files": [_file(path, suffixes) for path in read],
+        "files": [_file(path, suffixes) for path in capture_files(plan)],
         "frames_sha256": frames_sha256(source),
         "pixels_sha256": _pixels_sha256(source),
     }
+
+
+def capture_files(plan: Plan) -> list[Path]:
+    """Return the files and folders that the source and the corrections of a plan name."""
+    return list(dict.fromkeys([*_paths(plan.source.config), *_paths(plan.corrections)]))
 
 
 def frames_sha256(source: Source) -> str:

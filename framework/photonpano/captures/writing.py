@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import math
 import os
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,8 +20,6 @@ from photonpano.values import FrameSpan
 
 _BLOCK_BYTES = 8 * 1024**2
 """Bytes of the frames that are read at once, packed if the source is."""
-_COMPARED_POSITIONS, _COMPARED_FRAMES = 16, 16
-"""To decide whether a partial file belongs to a source, 16 frames at each of 16 positions are compared."""
 
 
 def truth_path(path: Path) -> Path:
@@ -46,16 +42,16 @@ def write_packed(
         path: the .npy file.
         progress: called with the number of frames written since the last call.
         threads: how many threads read the source.
-        resumed: makes the file resumable: after an interruption it stays as `part_path(path)`, and the next call continues it.
-            Then this is called with the number of frames that it holds; 0 if it is of another capture, and written anew.
+        resumed: makes the file resumable: after an interruption it stays as `part_path(path)`, and the next call compares its
+            frames with the source and continues it. Then this is called with the number of frames that it holds.
 
     Returns:
         The files written, the capture first.
 
     Raises:
         InputError: the source is not binary, or corrects its sums, which bits cannot hold.
-        OutputError: the files cannot be written, or do not fit on the disk. Nothing is left under the final names then, nor
-            when the source fails.
+        OutputError: the files cannot be written, do not fit on the disk, or `part_path(path)` is something else. Nothing is
+            left under the final names then, nor when the source fails.
         PluginError: the source returns frames of another shape than it promises.
     """
     if source.info.kind != "binary":
@@ -88,13 +84,16 @@ def _write_capture(
     resumed: Callable[[int], object] | None,
 ) -> None:
     packed = PackedFrames(source)
-    there = temporary.stat().st_size if temporary.exists() else 0
+    there = temporary.stat().st_size
     require_space(final, packed.n_bytes + truth_bytes - there)
-    # Locked before it is read: another process may be writing it.
-    with temporary.open("r+b" if temporary.exists() else "x+b") as file:
-        _lock(file, final)
-        done = packed.found_in(file) if there else 0
-        if resumed is not None and there:
+    with temporary.open("r+b") as file:
+        done = packed.found_in(file, threads)
+        if done is None:
+            raise OutputError(
+                f"cannot write {final}: {temporary} is there, and holds something else than the first frames of this capture; "
+                "remove it, or choose another name"
+            )
+        if done and resumed is not None:
             resumed(done)
         if done and progress is not None:
             progress(done)
@@ -110,16 +109,6 @@ def _write_capture(
         # A full disk must be noticed before the truth gets its final name.
         file.flush()
         os.fsync(file.fileno())
-
-
-def _lock(file: BinaryIO, final: Path) -> None:
-    """Refuse to write what another process is writing; the system forgets the lock with the process."""
-    with suppress(OSError):  # a file system without locks
-        try:
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            remedy = "wait for it, or choose another name"
-            raise OutputError(f"cannot write {final}: another process is writing it; {remedy}") from error
 
 
 class PackedFrames:
@@ -144,11 +133,11 @@ class PackedFrames:
         """Return where a frame begins in the file."""
         return len(self.header) + frame * math.prod(self._frame)
 
-    def blocks(self, first: int) -> Iterator[FrameSpan]:
-        """Yield the spans in which the frames are read, from the first on."""
-        n_frames, step = self._source.info.n_frames, max(1, _BLOCK_BYTES // self._read_bytes)
-        for start in range(first, n_frames, step):
-            yield FrameSpan(start, min(start + step, n_frames))
+    def blocks(self, first: int, stop: int | None = None) -> Iterator[FrameSpan]:
+        """Yield the spans in which the frames are read, from the first on, all by default."""
+        last, step = self._source.info.n_frames if stop is None else stop, max(1, _BLOCK_BYTES // self._read_bytes)
+        for start in range(first, last, step):
+            yield FrameSpan(start, min(start + step, last))
 
     def of(self, span: FrameSpan) -> NDArray[np.uint8]:
         """Return the frames of a span: (n, H, ceil(W / 8)) uint8, contiguous.
@@ -166,20 +155,24 @@ class PackedFrames:
             )
         return np.ascontiguousarray(packed)
 
-    def found_in(self, file: BinaryIO) -> int:
-        """Return how many frames of this source a file holds: 0 if it has another header or other frames.
+    def found_in(self, file: BinaryIO, threads: int) -> int | None:
+        """Return how many frames of this source a file begins with; None if it is another file.
 
-        16 frames at each of 16 positions are compared, the last frame among them.
+        Every frame is compared. The first of them that differs ends what is found: it was damaged, or half written.
         """
         file.seek(0)
-        if file.read(len(self.header)) != self.header:
-            return 0
+        start = file.read(len(self.header))
+        if start != self.header:
+            return 0 if self.header.startswith(start) else None
         size = file.seek(0, io.SEEK_END)
         there = min((size - len(self.header)) // math.prod(self._frame), self._source.info.n_frames)
-        length = min(_COMPARED_FRAMES, there)
-        starts = np.linspace(0, there - length, _COMPARED_POSITIONS).astype(int).tolist() if there else []
-        for start in dict.fromkeys(starts):
-            file.seek(self.position(start))
-            if file.read(self.position(length) - len(self.header)) != self.of(FrameSpan(start, start + length)).tobytes():
-                return 0
-        return there
+        file.seek(len(self.header))
+        done = 0
+        for frames in in_order(self.of, self.blocks(0, there), threads):
+            found = np.frombuffer(file.read(frames.nbytes), np.uint8).reshape(frames.shape)
+            differs = (found != frames).any(axis=(1, 2))
+            if differs.any():
+                done += int(differs.argmax())
+                return done or None
+            done += len(frames)
+        return done

@@ -8,6 +8,7 @@ from typer.core import TyperGroup
 import photonpano
 from photonpano.cli.check import check
 from photonpano.cli.check_run import check_run
+from photonpano.cli.clean import clean
 from photonpano.cli.convert import convert
 from photonpano.cli.dark import dark
 from photonpano.cli.ending import end_on_signals, leave
@@ -21,6 +22,7 @@ from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
 from photonpano.cli.streams import prepare_streams
+from photonpano.cli.verify import verify
 from photonpano.cli.warm_up import warm_up
 from photonpano.errors import OutputError
 from photonpano.interrupts import interrupted_by
@@ -44,7 +46,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for command in (run, check, check_run, explain, info, preview, convert, simulate, dark, evaluate, schema, warm_up):
+_COMMANDS = (run, check, check_run, verify, explain, info, preview, convert, simulate, dark, evaluate, clean, schema, warm_up)
+for command in _COMMANDS:
     app.command()(command)
 app.add_typer(plugins, name="plugins")
 

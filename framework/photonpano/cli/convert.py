@@ -31,13 +31,13 @@ def convert(
     part = part_path(output)
 
     def resumed(n_frames: int) -> None:
-        found = f"holds {n_frames:,} frames of this capture: continuing from there"
-        typer.echo(f"{part} {found if n_frames else 'is of another capture: starting anew'}", err=True)
+        typer.echo(f"{part} holds {n_frames:,} frames of this capture: continuing from there", err=True)
 
+    before = part.stat().st_mtime_ns if part.exists() else None
     with capture_plan(path, source, keys, corrections) as plan:
         try:
             written = convert_capture(plan, output, progress_for_stderr(), resumed)
         finally:
-            if part.exists():
+            if part.exists() and part.stat().st_mtime_ns != before:
                 typer.echo(f"the frames written so far are in {part}; the same command continues from there", err=True)
     print_written(written)

@@ -21,6 +21,10 @@ def run(
         ),
     ] = None,
     overrides: Overrides = None,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Write beside other files, which stay, or replace a run of another capture."),
+    ] = False,
     strict: Strict = False,
 ) -> None:
     """Make a panorama from a spec.
@@ -36,7 +40,7 @@ def run(
     from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
 
-    result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr())
+    result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr(), overwrite=overwrite)
     record, directory = result.record, result.directory.resolve()
     print_verdict(result.verdict)
     for warning in record["warnings"]:
@@ -45,7 +49,8 @@ def run(
         if refinement["rounds"]:
             typer.echo(f"refined   {_correction(refinement)}")
     typer.echo(f"panorama  {directory / 'panorama.png'}")
-    typer.echo(f"report    {directory / 'report.html'}")
+    if "report.html" in record["files"]:
+        typer.echo(f"report    {directory / 'report.html'}")
     if strict:
         require_trust(result.verdict, "all files of the run folder are written")
 

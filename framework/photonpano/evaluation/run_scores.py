@@ -14,6 +14,7 @@ from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, lo
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory, inverse, normalised
 from photonpano.protocols import Trajectory
+from photonpano.record.contents import require_one_run
 from photonpano.values import Panorama
 
 
@@ -63,6 +64,7 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
         InputError: a file is missing or damaged, or run and truth belong to different captures.
     """
     folder, truth_path = Path(run_folder), Path(truth_path)
+    require_one_run(folder, ["trajectory.npz", "panorama.tiff", "coverage.tiff"])
     run = load_run_trajectory(folder)
     truth = load_truth(truth_path)
     _check_same_capture(folder, run, truth_path, truth)

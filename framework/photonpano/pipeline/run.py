@@ -8,24 +8,25 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from photonpano.captures.fingerprint import capture_files, fingerprint
 from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
 from photonpano.contributions import MergerContribution
 from photonpano.corrections import CorrectedSource, Vignette, divided_by, estimate_vignette
-from photonpano.errors import InputError
-from photonpano.merging.panorama import render_panorama
+from photonpano.errors import InputError, OutputError
+from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.loop import estimate_motion
 from photonpano.pipeline.components import build_levels, build_refiners, open_source
 from photonpano.pipeline.observers import Observers
-from photonpano.pipeline.run_folder import run_folder
+from photonpano.pipeline.run_folder import RunFolder, run_folder
 from photonpano.protocols import Source, Trajectory
-from photonpano.record.run_json import record_of
+from photonpano.record.run_json import peak_memory_bytes, record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
-from photonpano.residuals.refinement import refine
+from photonpano.residuals.refinement import Explained, refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
@@ -50,33 +51,34 @@ class RunResult:
     verdict: Verdict
 
 
-def run(plan: Plan, progress: Progress | None = None) -> RunResult:
+def run(plan: Plan, progress: Progress | None = None, *, overwrite: bool = False) -> RunResult:
     """Run a plan and write its run folder: panorama, coverage, trajectory, record and report.
 
     Args:
         plan: from `load_spec` or `parse_spec`.
         progress: receives stages and messages; quiet by default.
+        overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
 
     Raises:
         InputError: the capture cannot be used, shows nothing, or does not suit the plan.
         LocationError: the motion could not be estimated.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
         PluginError: a component failed in its own way, or broke its contract.
-        OutputError: the run folder cannot be written. An error before the last step, in which the files get their names,
-            leaves the folder as it was.
+        OutputError: the run folder cannot be written, or another process writes it; it is as it was.
     """
     observers = Observers(plan.observers, plan.output.directory)
     context = Context(thread_count(plan.run.threads), progress or Quiet(), observers.level_finished)
     with (
         observers.watching(plan.document) as finished,
         open_source(plan) as source,
-        run_folder(plan.output.directory) as folder,
+        run_folder(plan.output.directory, overwrite=overwrite, inputs=_read_files(plan)) as folder,
         loading_figures(),
         one_thread_inside(),
         notify_on_first_compile(partial(context.progress.note, COMPILING)),
     ):
         start, memory = time.perf_counter(), int(plan.run.memory)
         _require_photons(plan, source)
+        capture = fingerprint(plan, source)
         if warning := order_warning(source):
             logger.warning(warning)
         decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
@@ -99,9 +101,10 @@ def run(plan: Plan, progress: Progress | None = None) -> RunResult:
             source, motion.trajectory, motion.span, plan.render, memory, folder.write_tile, context, explained.panorama
         )
         observers.rendered(panorama.canvas, panorama.seconds)
-        record = record_of(plan, source.info, decisions, results, explained, verdict, panorama, time.perf_counter() - start)
-        folder.write_results(panorama, motion, record)
-        folder.write_report(render_report(record, explained, panorama))
+        folder.write_results(panorama, motion)
+        seconds = time.perf_counter() - start
+        record = folder.commit(record_of(plan, source.info, decisions, results, explained, verdict, panorama, seconds, capture))
+        record = _with_report(folder, record, explained, panorama)
         finished(record)
     return RunResult(plan.output.directory, record, verdict)
 
@@ -113,6 +116,26 @@ def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette 
     if not plan.corrects_itself or source.info.kind != "binary" or not accepted:
         return None
     return estimate_vignette(source, trajectory)
+
+
+def _read_files(plan: Plan) -> list[Path]:
+    return [*capture_files(plan), *([] if plan.file is None else [plan.file])]
+
+
+def _with_report(folder: RunFolder, record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> RunRecord:
+    """Add the report to the run folder. The results are there already: what fails now is a warning."""
+    try:
+        folder.reopen()
+        try:
+            folder.write_report(render_report(record, explained, panorama))
+        except Exception as error:
+            logger.debug("the report failed", exc_info=True)
+            warning = f"the report could not be drawn ({type(error).__name__}: {error}); all other files of the run are written"
+            record = {**record, "warnings": [*record["warnings"], warning]}
+        return folder.commit({**record, "peak_memory_bytes": peak_memory_bytes()})
+    except OutputError as error:
+        warning = f"the report could not be added ({error}); all other files of the run are written"
+        return {**record, "warnings": [*record["warnings"], warning]}
 
 
 def _require_photons(plan: Plan, source: Source) -> None:

@@ -1,40 +1,54 @@
-"""The run folder: every file is written whole, and all of them arrive together."""
+"""The run folder: it is locked, and its files change in one step."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import pwd
 import shutil
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import tifffile
 
-from photonpano.atomic import atomic_files
 from photonpano.errors import OutputError
+from photonpano.folders import (
+    finish_replacement,
+    is_ours,
+    link_or_copy,
+    lock_path,
+    remove_leftovers,
+    replace_folder,
+    staging_of,
+)
 from photonpano.geometry import Canvas
+from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import RunRecord
 from photonpano.values import FluxImage, Panorama
 
+SHOWN_FILES = 3
+"""Files that a message names."""
 
-@dataclass(frozen=True, slots=True)
+
 class RunFolder:
-    """A folder in which the files of a run are gathered before they get their final names.
+    """A folder in which the files of a run are gathered, and from which they replace those of the run before.
 
     Attributes:
-        directory: where they end up.
-        staging: where they are written.
+        directory: the run folder.
+        staging: where the files are written.
     """
 
-    directory: Path
-    staging: Path
+    def __init__(self, directory: Path, stack: ExitStack) -> None:
+        self.directory = directory
+        self._stack = stack
+        self.staging = stack.enter_context(staging_of(directory))
 
     def write_tile(self, tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
         """Write a part of panorama.tiff and coverage.tiff (float32); the parts make up the canvas."""
@@ -42,8 +56,8 @@ class RunFolder:
             _write_box(self.staging / "panorama.tiff", rendered.flux, tile, canvas)
             _write_box(self.staging / "coverage.tiff", rendered.weight, tile, canvas)
 
-    def write_results(self, panorama: RenderedPanorama, motion: FrameMotion, record: RunRecord) -> None:
-        """Write panorama.png (8 bits, sRGB), trajectory.npz and run.json."""
+    def write_results(self, panorama: RenderedPanorama, motion: FrameMotion) -> None:
+        """Write panorama.png (8 bits, sRGB) and trajectory.npz."""
         encoded, png = cv2.imencode(".png", panorama.picture)
         if not encoded:
             raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
@@ -58,37 +72,133 @@ class RunFolder:
                 located=motion.located,
                 std_px=motion.std_px,
             )
-        self._write_text("run.json", json.dumps(record, indent=2, allow_nan=False) + "\n")
 
     def write_report(self, page: str) -> None:
         """Write report.html."""
-        self._write_text("report.html", page)
+        path = self.staging / "report.html"
+        try:
+            with _writing(self.directory):
+                path.write_text(page, encoding="utf-8")
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
 
-    def _write_text(self, name: str, text: str) -> None:
+    def commit(self, record: RunRecord) -> RunRecord:
+        """Put the written files and run.json into the run folder, in one step.
+
+        Returns:
+            The content of run.json: the record, with sizes and hashes of the files.
+        """
         with _writing(self.directory):
-            (self.staging / name).write_text(text, encoding="utf-8")
+            record = {**record, "files": contents_of(self.staging)}
+            text = json.dumps(record, indent=2, allow_nan=False) + "\n"
+            (self.staging / RECORD).write_text(text, encoding="utf-8")
+            replace_folder(self.staging, self.directory, names_of_results(self.directory))
+        return record
+
+    def reopen(self) -> None:
+        """Gather the files of the next commit, which begin as those of the last one."""
+        with _writing(self.directory):
+            self.staging = self._stack.enter_context(staging_of(self.directory))
+            for name in recorded_contents(self.directory) or ():
+                link_or_copy(self.directory / name, self.staging / name)
 
 
 @contextmanager
-def run_folder(directory: Path) -> Iterator[RunFolder]:
-    """Gather the files of a run, and give them their final names when the block ends well.
+def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Path] = ()) -> Iterator[RunFolder]:
+    """Lock a run folder, and gather the files of a run beside it.
 
-    The folder is made, and proved to be writable, before the work starts. When the block raises, what was there before stays
-    as it was, and folders that were not there are gone again.
+    The place is proved to be writable before the work starts. When the block raises before `commit`, what was there stays as it
+    was, and folders that were not there are gone again.
+
+    Args:
+        directory: the run folder; it may be missing.
+        overwrite: whether it may hold files that no run has written, which stay, or a run of another capture.
+        inputs: files and folders that the run reads, which must not lie in it.
 
     Raises:
-        OutputError: the folder cannot be made or written to, or the disk is full.
+        OutputError: the folder cannot be made or written to, another process writes it, or it is none that a run may write.
     """
+    directory = _resolved(directory)
+    _require_harmless(directory, inputs)
     with ExitStack() as stack:
         try:
-            staging = stack.enter_context(atomic_files(directory, last="run.json"))
+            stack.enter_context(_made(directory.parent))
+            if directory.exists() and not directory.is_dir():
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
+            stack.enter_context(locked(lock_path(directory), f"the run folder {directory}"))
+            finish_replacement(directory)
+            if not overwrite and directory.is_dir():
+                _require_own(directory)
+                _require_same_capture(directory, inputs)
+            remove_leftovers(directory)
+            folder = RunFolder(directory, stack)
         except OSError as error:
             raise OutputError(
                 f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
             ) from error
-        yield RunFolder(directory, staging)
-        with _writing(directory):
-            stack.close()
+        yield folder
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder, and remove it after the block if it is empty."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    if made:
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # the results are in it, or those of another program
+            for each in made:
+                each.rmdir()
+
+
+def _resolved(directory: Path) -> Path:
+    """Return the path without symbolic links: what a link points to is replaced, not the link."""
+    try:
+        return directory.absolute().resolve()
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{directory}: the run folder cannot be found ({error}); choose another one with --output") from error
+
+
+def _require_harmless(directory: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a folder that holds more than a run: that of a user, of the system, or of what the run reads."""
+    homes = [Path("/")]
+    with suppress(KeyError, RuntimeError):  # containers run users that the system does not know
+        homes += [Path(pwd.getpwuid(os.getuid()).pw_dir), Path.home()]
+    elsewhere = "choose another one with --output"
+    if any(home.resolve().is_relative_to(directory) for home in homes):
+        raise OutputError(f"{directory} is the folder of a user or of the system; {elsewhere}")
+    for path in inputs:
+        if path.absolute().resolve().is_relative_to(directory):
+            raise OutputError(
+                f"{directory} cannot be the run folder, since {path} lies in it; choose another one with --output"
+            )
+
+
+def _require_own(directory: Path) -> None:
+    """Refuse a folder with files that no run has written."""
+    own = names_of_results(directory) if recorded_json(directory) else set()
+    others = sorted(path.name for path in directory.iterdir() if path.name not in own and not is_ours(path.name))
+    if others:
+        more = f" and {len(others) - SHOWN_FILES} more" if len(others) > SHOWN_FILES else ""
+        raise OutputError(
+            f"{directory} holds files that no run has written: {', '.join(others[:SHOWN_FILES])}{more}; choose another folder "
+            "with --output, or write the results among them with --overwrite"
+        )
+
+
+def _require_same_capture(directory: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a folder with a run of another capture, which still is where it was."""
+    for file in ((recorded_json(directory) or {}).get("capture") or {}).get("files") or ():
+        path = Path(file["path"])
+        if path.exists() and not any(other.exists() and path.samefile(other) for other in inputs):
+            raise OutputError(
+                f"{directory} holds a run of another capture, {path}; choose another folder with --output, or replace that run "
+                "with --overwrite"
+            )
+        return  # the others are files of corrections
 
 
 @contextmanager

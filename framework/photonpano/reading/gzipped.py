@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gzip
 import logging
+import os
 import zlib
+from functools import lru_cache
 from pathlib import Path
 
 from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError
-from photonpano.reading.files import read_start
+from photonpano.locks import hold
+from photonpano.reading.files import read_start, reading
 from photonpano.reading.npy import NpyHeader, read_npy_header
 
 logger = logging.getLogger(__name__)
@@ -52,23 +55,48 @@ def gzipped_npy_header(path: Path) -> NpyHeader:
 def unpacked(path: Path) -> Path:
     """Return the path of a .npy file with the content of a .npy.gz file.
 
-    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. If that is missing or older, it is written, and a warning logged.
+    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it is there with the
+    checksum that the archive ends with. Until the process ends, it is locked for others who would remove it.
 
     Raises:
         InputError: the file is damaged, or holds something else.
         OutputError: the unpacked file cannot be written, or does not fit on its disk.
     """
     promised = gzipped_npy_header(path).file_bytes
-    target = path.with_name(f"{path.name}.unpacked.npy")
-    if target.is_file():
-        made = target.stat()
-        if made.st_mtime >= path.stat().st_mtime and made.st_size == promised:
-            return target
-    require_space(target, promised)
-    logger.warning("%s is unpacked to %s, once", path, target.name)
-    with atomic_path(target) as temporary:
-        _unpack(path, temporary, promised)
+    target = unpacked_path(path)
+    if not _is_content(target, path, promised):
+        require_space(target, promised)
+        logger.warning("%s is unpacked to %s, once", path, target.name)
+        with atomic_path(target) as temporary:
+            _unpack(path, temporary, promised)
+    hold(target)
     return target
+
+
+def unpacked_path(path: Path) -> Path:
+    """Return where a .npy.gz file is unpacked to."""
+    return path.with_name(f"{path.name}.unpacked.npy")
+
+
+def _is_content(target: Path, path: Path, promised: int) -> bool:
+    """Return whether a file has the checksum that an archive ends with; one of several parts is always unpacked again."""
+    if target.is_symlink() or not target.is_file() or target.stat().st_size != promised:
+        return False
+    with reading(path), path.open("rb") as archive:
+        archive.seek(-8, os.SEEK_END)
+        recorded = int.from_bytes(archive.read(4), "little")
+    return _crc32(target, target.stat().st_ctime_ns) == recorded
+
+
+@lru_cache(16)
+def _crc32(path: Path, changed_ns: int) -> int:
+    """Return the checksum of a file, which is read again if it has changed."""
+    del changed_ns
+    checksum = 0
+    with reading(path), path.open("rb") as file:
+        while block := file.read(_BLOCK_BYTES):
+            checksum = zlib.crc32(block, checksum)
+    return checksum
 
 
 def _unpack(path: Path, target: Path, promised: int) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from photonpano.captures.fingerprint import CaptureRecord
 from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
@@ -51,6 +52,7 @@ def record_of(
     verdict: Verdict,
     panorama: RenderedPanorama,
     seconds: float,
+    capture: CaptureRecord,
 ) -> RunRecord:
     """Return the record of a finished run.
 
@@ -63,6 +65,7 @@ def record_of(
         verdict: whether it is trusted.
         panorama: the panorama.
         seconds: time that the run took.
+        capture: its fingerprint.
     """
     motion = explained.motion
     if plan.until_converged:
@@ -100,6 +103,7 @@ def record_of(
         "warnings": [*level_warnings(levels), *motion_warnings(motion), *refinement_warnings(explained.refinements)],
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
+        "capture": capture,
     }
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
+
+from photonpano.captures.fingerprint import CaptureRecord
 
 
 class SourceRecord(TypedDict):
@@ -143,11 +145,18 @@ class VerdictRecord(TypedDict):
     residual_ratio: float | None
 
 
+class FileContent(TypedDict):
+    """The size of a file, and its SHA-256 in hexadecimal digits."""
+
+    bytes: int
+    sha256: str
+
+
 class RunRecord(TypedDict):
     """The content of `run.json`.
 
     `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none; `peak_memory_bytes` is None where the
-    system does not report it.
+    system does not report it. `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
     """
 
     photonpano: str
@@ -168,3 +177,5 @@ class RunRecord(TypedDict):
     warnings: Sequence[str]
     seconds: float
     peak_memory_bytes: int | None
+    capture: CaptureRecord
+    files: NotRequired[Mapping[str, FileContent]]

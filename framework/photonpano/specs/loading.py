@@ -33,7 +33,8 @@ def load_spec(
 
     Args:
         path: the file; relative paths in it count from its folder.
-        overrides: values to change, such as `run.seed=1` or `levels.0.scale=0.5`; list indices count from 0.
+        overrides: values to change, such as `run.seed=1` or `levels.0.scale=0.5`; list indices count from 0. If they name
+            another capture, its name is added to that of the default run folder.
         output: the run folder, relative to the current folder, in place of the spec's `output.directory`.
         catalog: what can be chosen; by default what the installed plugins offer.
 
@@ -64,7 +65,8 @@ def parse_spec(
     Args:
         spec: the spec; a `Plan.document` is one.
         directory: what relative paths in it count from.
-        name: the name of the run folder, `runs/NAME`, unless the spec has an `output.directory`.
+        name: the name of the run folder, `runs/NAME`, unless the spec has an `output.directory`. If `overrides` name another
+            capture than the spec, it is `runs/NAME-CAPTURE`.
         overrides: values to change, such as `run.seed=1`.
         output: the run folder, relative to the current folder, in place of the spec's `output.directory`.
         catalog: what can be chosen; by default what the installed plugins offer.
@@ -141,11 +143,27 @@ def _load(
     if written.data is None:
         empty = written.place("").problem("the spec is empty; it needs at least `version` and `source`")
         raise SpecError(written.problems or [empty])
+    own = _capture(written)
     for override in overrides:
         _apply_override(written, override)
-    _set_output(written, None if output is None else Path(output).absolute(), Path("runs", name))
+    other = _capture(written)
+    named = name if other in (own, None) else f"{name}-{other}"
+    _set_output(written, None if output is None else Path(output).absolute(), Path("runs", named))
     written.directory, written.catalog = directory, catalog
     return resolve(written)
+
+
+def _capture(spec: WrittenSpec) -> str | None:
+    """Return the names of the capture and its folder, such as `night-cube` for `captures/night/cube.npy`; None without one."""
+    node = spec.data
+    for key in ("source", "with", "path"):
+        node = node.get(key) if isinstance(node, dict) else None
+    if not isinstance(node, str):
+        return None
+    path = Path(node)
+    return (
+        "-".join(part for part in (*path.parts[:-1][-1:], path.name.split(".")[0]) if part not in ("", "/", ".", "..")) or None
+    )
 
 
 def _apply_override(spec: WrittenSpec, text: str) -> None:

@@ -59,7 +59,10 @@ class RenderSettings(Config):
 class OutputSettings(Config):
     """The run folder."""
 
-    directory: SpecPath = Field(description="the run folder; by default `runs/` and the name of the spec, beside the spec")
+    directory: SpecPath = Field(
+        description="the run folder; by default `runs/` and the name of the spec, beside the spec; the name of the capture "
+        "follows if `--set` chooses one"
+    )
 
 
 class RunSettings(Config):

@@ -58,6 +58,8 @@ def test_check_run_judges_as_the_run_did_and_writes_nothing(finished: Path, smal
 def test_check_run_doubts_other_photons_of_the_same_size(finished: Path) -> None:
     cube = finished.parent / "cube.npy"
     np.save(cube, np.load(cube)[:, ::-1])
+    assert error_of(finished) == f"{finished}: the capture has other frames than when it was run; it is another capture"
+    change(finished, lambda record: record.pop("capture"))  # as in older versions
     verdict = check_run(finished).verdict
     assert verdict.status == "doubtful"
     assert verdict.reasons[0].what.startswith("the panorama does not explain the photons")
@@ -83,7 +85,7 @@ def test_check_run_refuses_capture_of_another_size(finished: Path, part: Any, si
 
 def test_check_run_of_older_version_says_what_it_cannot_judge(finished: Path, small_run: RunResult) -> None:
     def age(record: dict[str, Any]) -> None:
-        del record["verdict"], record["refinements"]
+        del record["verdict"], record["refinements"], record["files"], record["capture"]
         for level in record["levels"]:
             del level["contradictions"]
 
@@ -126,5 +128,14 @@ def test_check_run_refuses_folder_that_is_no_run(finished: Path, tmp_path: Path)
 
 
 def test_check_run_refuses_run_without_located_frames(finished: Path) -> None:
+    change(finished, lambda record: record.pop("files"))
     change_trajectory(finished, located=np.zeros(300, np.bool_))
     assert error_of(finished) == f"{finished}: the run located no frame, so that there is nothing to judge"
+
+
+def test_check_run_refuses_files_of_two_runs(finished: Path) -> None:
+    change_trajectory(finished, std_px=np.zeros(300))
+    assert error_of(finished) == (
+        f"{finished}: trajectory.npz is not the file that its run.json lists; the folder mixes several runs, or a file was "
+        "changed: run the spec again"
+    )

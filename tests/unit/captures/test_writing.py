@@ -220,22 +220,48 @@ def test_interrupted_file_is_continued(tmp_path: Path, kind: type[RandomSource],
 
 
 @pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("other", ["another shape", "another last frame", "another first frame", "no header"])
-def test_partial_file_of_another_capture_is_replaced(tmp_path: Path, other: str) -> None:
+@pytest.mark.parametrize("other", ["another shape", "another first frame", "no header"])
+def test_partial_file_of_something_else_is_refused_and_kept(tmp_path: Path, other: str) -> None:
     path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
     interrupted_after(30, path, RandomSource(100, 7 if other == "another shape" else 6, 19))
-    frame_bytes = 6 * 3
-    place = {"another last frame": -frame_bytes, "another first frame": 128, "no header": 0}.get(other)
-    if place is not None:
-        data = bytearray(part.read_bytes())
-        data[place] ^= 1
-        part.write_bytes(data)
+    data = bytearray(part.read_bytes())
+    data[{"another shape": 200, "another first frame": 128, "no header": 0}[other]] ^= 1
+    part.write_bytes(data)
+    with pytest.raises(OutputError) as caught:
+        write_packed(RandomSource(100, 6, 19), path, resumed=lambda _: None)
+    assert str(caught.value) == (
+        f"cannot write {path}: {part} is there, and holds something else than the first frames of this capture; "
+        "remove it, or choose another name"
+    )
+    assert part.read_bytes() == data
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize(("first", "last"), [(1, 2), (17, 24), (29, 30)])
+def test_partial_file_is_continued_from_its_first_damaged_frame(tmp_path: Path, first: int, last: int) -> None:
+    path, part = tmp_path / "cube.npy", tmp_path / "cube.npy.part"
+    interrupted_after(30, path, RandomSource(100, 6, 19))
+    data, frame_bytes = bytearray(part.read_bytes()), 6 * 3
+    data[128 + first * frame_bytes : 128 + last * frame_bytes] = bytes((last - first) * frame_bytes)
+    part.write_bytes(data)
     found: list[int] = []
     write_packed(RandomSource(100, 6, 19), path, resumed=found.append)
-    assert found == [0]
+    assert found == [first]
     np.testing.assert_array_equal(
         np.unpackbits(np.load(path), axis=-1, count=19), RandomSource(100, 6, 19).frames(FrameSpan(0, 100))
     )
+
+
+@pytest.mark.parametrize("planted", ["cube.npy.part", "cube.npy"])
+def test_symbolic_links_are_neither_followed_nor_replaced(tmp_path: Path, planted: str) -> None:
+    (tmp_path / "precious").write_text("content")
+    (tmp_path / planted).symlink_to("precious")
+    with pytest.raises(OutputError) as caught:
+        write_packed(RandomSource(20, 6, 19), tmp_path / "cube.npy", resumed=lambda _: None)
+    what = {"cube.npy.part": f"{tmp_path}/cube.npy.part is no regular file", "cube.npy": "it is a symbolic link"}[planted]
+    assert str(caught.value) == f"cannot write {tmp_path}/cube.npy: {what}; remove it, or choose another name"
+    assert (tmp_path / "precious").read_text() == "content"
+    assert (tmp_path / planted).is_symlink()
 
 
 def test_partial_file_longer_than_the_capture_is_cut(tmp_path: Path) -> None:

@@ -126,11 +126,15 @@ def test_convert_continues_after_interrupt(cube: Path, invoke: Callable[..., Any
     assert not part.exists()
 
 
-def test_convert_starts_anew_on_part_of_another_capture(cube: Path, invoke: Callable[..., Any]) -> None:
+def test_convert_keeps_part_of_something_else(cube: Path, invoke: Callable[..., Any]) -> None:
     (cube.parent / "out.npy.part").write_bytes(b"something else")
     result = invoke("convert", "cube.npy", "out.npy")
-    assert result.stderr == "out.npy.part is of another capture: starting anew\n"
-    assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
+    assert result.exit_code == 1
+    assert result.stderr == (
+        "error: cannot write out.npy: out.npy.part is there, and holds something else than the first frames of this capture; "
+        "remove it, or choose another name\n"
+    )
+    assert (cube.parent / "out.npy.part").read_bytes() == b"something else"
 
 
 def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:

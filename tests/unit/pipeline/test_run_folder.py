@@ -1,10 +1,18 @@
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
+import os
 import resource
+import signal
+import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +24,7 @@ from photonpano.geometry import Canvas, translation
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.run_folder import RunFolder, run_folder
+from photonpano.record.contents import changed_files, finish_run_folder
 from photonpano.testing import KnownMotion
 
 FLUX = np.random.default_rng(0).random((60, 90), np.float32)
@@ -38,75 +47,125 @@ MOTION = FrameMotion(
 RENDERED = RenderedPanorama(CANVAS, PANORAMA, 1, PICTURE, 1.0, 0.9, 2.0)
 
 
+RECORD: Any = {"photonpano": "0", "spec": {}, "warnings": ["a line"] * 2000}
+
+
 def write_panorama(folder: RunFolder) -> None:
     folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, CANVAS)
 
 
 def write_results(folder: RunFolder) -> None:
-    folder.write_results(RENDERED, MOTION, {"warnings": ["a line"] * 2000})
+    folder.write_results(RENDERED, MOTION)
 
 
-def write_report(folder: RunFolder) -> None:
-    folder.write_report("<html>µ</html>" * 2000)
+def write_record(folder: RunFolder) -> None:
+    folder.commit(RECORD)
 
 
-WRITERS = (write_panorama, write_results, write_report)
+WRITERS = (write_panorama, write_results, write_record)
 
 
 def write_all(folder: RunFolder) -> None:
+    """Write a run as `run` does: the results, and then the report."""
     for write in WRITERS:
         write(folder)
+    folder.reopen()
+    folder.write_report("<html>µ</html>" * 2000)
+    folder.commit(RECORD)
+
+
+def run_into(directory: Path, **options: Any) -> None:
+    with run_folder(directory, **options) as folder:
+        write_all(folder)
+
+
+def files_in(directory: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
     """A run folder of an earlier run, and a note of its owner."""
-    for name in [*FILES, "notes.txt"]:
-        (tmp_path / "runs").mkdir(exist_ok=True)
-        (tmp_path / "runs" / name).write_text(f"old {name}")
+    run_into(tmp_path / "runs")
+    (tmp_path / "runs" / "run.json").write_text(json.dumps(RECORD | {"seed": "old"}))
+    (tmp_path / "runs" / "notes").mkdir()
+    (tmp_path / "runs" / "notes" / "a.txt").write_text("a note")
     return tmp_path / "runs"
 
 
-def require_old(directory: Path) -> None:
-    assert {file.name for file in directory.iterdir()} == {*FILES, "notes.txt"}
-    assert all(file.read_text() == f"old {file.name}" for file in directory.iterdir())
+@pytest.fixture(params=["exchange", "pending"])
+def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A system that exchanges folders in one step, and one that cannot."""
+    if request.param == "pending":
+        monkeypatch.setattr("photonpano.folders._exchange", lambda *_: False)
+    return str(request.param)
 
 
 def test_run_folder_holds_the_written_files(tmp_path: Path) -> None:
-    with run_folder(tmp_path / "runs" / "scan") as folder:
-        write_all(folder)
+    run_into(tmp_path / "runs" / "scan")
     directory = tmp_path / "runs" / "scan"
-    assert {file.name for file in directory.iterdir()} == FILES
+    assert set(files_in(directory)) == FILES
     np.testing.assert_array_equal(tifffile.imread(directory / "panorama.tiff"), FLUX)
     np.testing.assert_array_equal(tifffile.imread(directory / "coverage.tiff"), PANORAMA.weight)
     np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), PICTURE)
     with np.load(directory / "trajectory.npz") as archive:
         assert set(archive.files) == {"homographies", "canvas", "frame_shape", "reference", "located", "std_px"}
         assert tuple(archive["frame_shape"]) == (48, 64)
-    assert json.loads((directory / "run.json").read_text()) == {"warnings": ["a line"] * 2000}
+    record = json.loads((directory / "run.json").read_text())
+    assert record["warnings"] == ["a line"] * 2000
+    assert set(record["files"]) == FILES - {"run.json"}
+    assert record["files"]["panorama.png"] == {
+        "bytes": (directory / "panorama.png").stat().st_size,
+        "sha256": hashlib.sha256((directory / "panorama.png").read_bytes()).hexdigest(),
+    }
+    assert changed_files(directory) == []
     assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")
+    assert list((tmp_path / "runs").iterdir()) == [directory]
 
 
-def test_run_folder_renames_no_file_before_the_block_ends(old: Path) -> None:
-    with run_folder(old) as folder:
-        write_all(folder)
-        assert all(file.read_text() == f"old {file.name}" for file in old.iterdir() if file.is_file())
-    assert (old / "notes.txt").read_text() == "old notes.txt"
-    assert json.loads((old / "run.json").read_text())["warnings"]
-    assert {file.name for file in old.iterdir()} == {*FILES, "notes.txt"}
+def test_run_folder_changes_in_one_step_and_keeps_other_files(old: Path, system: str) -> None:
+    before = files_in(old)
+    with run_folder(old, overwrite=True) as folder:
+        for write in WRITERS[:-1]:
+            write(folder)
+        assert files_in(old) == before
+        folder.commit(RECORD)
+        after = files_in(old)
+        assert set(after) == (FILES - {"report.html"}) | {"notes/a.txt"}
+        assert after["notes/a.txt"] == b"a note"
+        assert "seed" not in json.loads(after["run.json"])
+    assert files_in(old) == after
+    assert list(old.parent.iterdir()) == [old]
+
+
+def test_run_folder_that_is_the_current_one_stays_the_same_folder(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(old)
+    run_into(Path(), overwrite=True)
+    assert changed_files(Path()) == []
+    assert set(files_in(Path.cwd())) == {*FILES, "notes/a.txt"}
+
+
+def test_run_folder_behind_a_link_replaces_what_the_link_names(old: Path) -> None:
+    link = old.parent / "latest"
+    link.symlink_to(old)
+    run_into(link, overwrite=True)
+    assert link.is_symlink()
+    assert "seed" not in json.loads((old / "run.json").read_text())
 
 
 def write_and_fail(directory: Path, error: BaseException) -> None:
-    with run_folder(directory) as folder:
-        write_all(folder)
+    with run_folder(directory, overwrite=True) as folder:
+        for write in WRITERS[:-1]:
+            write(folder)
         raise error
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_run_folder_keeps_old_files_when_the_block_raises(old: Path, error: type[BaseException]) -> None:
+    before = files_in(old.parent)
     with pytest.raises(error):
         write_and_fail(old, error())
-    require_old(old)
+    assert files_in(old.parent) == before
 
 
 def test_run_folder_removes_new_folders_when_the_block_raises(tmp_path: Path) -> None:
@@ -115,15 +174,13 @@ def test_run_folder_removes_new_folders_when_the_block_raises(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_folder_keeps_files_of_other_programs(tmp_path: Path) -> None:
-    def meet_another() -> None:
-        with run_folder(tmp_path / "runs" / "scan"):
-            (tmp_path / "runs" / "notes.txt").write_text("a note")
-            raise ValueError("half-way")
-
-    with pytest.raises(ValueError, match="half-way"):
-        meet_another()
-    assert list(tmp_path.rglob("*")) == [tmp_path / "runs", tmp_path / "runs" / "notes.txt"]
+def test_run_folder_keeps_files_of_other_programs_that_come_meanwhile(tmp_path: Path, system: str) -> None:
+    directory = tmp_path / "runs" / "scan"
+    with run_folder(directory) as folder:
+        directory.mkdir()
+        (directory / "notes.txt").write_text("a note")
+        write_all(folder)
+    assert set(files_in(directory)) == {*FILES, "notes.txt"}
 
 
 @contextmanager
@@ -139,13 +196,49 @@ def files_of_at_most(n_bytes: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("write", WRITERS)
 def test_run_folder_keeps_old_files_when_the_disk_is_full(old: Path, write: Callable[[RunFolder], None]) -> None:
-    with pytest.raises(OutputError) as caught, run_folder(old) as folder, files_of_at_most(4096):
+    before = files_in(old.parent)
+    with pytest.raises(OutputError) as caught, run_folder(old, overwrite=True) as folder, files_of_at_most(4096):
         write(folder)
     assert str(caught.value) == (
         f"{old}: the results could not be written (File too large); what was there before is unchanged. "
         "Make room, or choose another folder with --output"
     )
-    require_old(old)
+    assert files_in(old.parent) == before
+
+
+@pytest.mark.parametrize("number", range(20))
+def test_run_folder_is_old_or_new_when_any_step_fails_once(
+    old: Path, system: str, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, steps = files_in(old), []
+
+    def failing(name: str) -> Callable[..., Any]:
+        step = getattr(os, name)
+
+        def maybe(*args: Any, **options: Any) -> Any:
+            steps.append(name)
+            if len(steps) - 1 == number:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return step(*args, **options)
+
+        return maybe
+
+    with suppress(OutputError), run_folder(old, overwrite=True) as folder:
+        for write in WRITERS[:-1]:
+            write(folder)
+        with monkeypatch.context() as patch:
+            for name in ("rename", "replace", "fsync", "link"):
+                patch.setattr(os, name, failing(name))
+            folder.commit(RECORD)
+    finish_run_folder(old)
+    after = files_in(old)
+    if after != before:
+        assert changed_files(old) == []
+        assert "seed" not in json.loads(after["run.json"])
+        assert set(after) == (FILES - {"report.html"}) | {"notes/a.txt"}
+    run_into(old, overwrite=True)
+    assert list(old.parent.iterdir()) == [old]
+    assert set(files_in(old)) == {*FILES, "notes/a.txt"}
 
 
 def test_run_folder_refuses_a_file_in_the_way_before_the_block(tmp_path: Path) -> None:
@@ -159,3 +252,90 @@ def test_run_folder_refuses_a_file_in_the_way_before_the_block(tmp_path: Path) -
             f"{directory}: the run folder cannot be written to ({reason}); choose another one with --output"
         )
     assert way.read_text() == "a file"
+
+
+def test_run_folder_refuses_files_that_no_run_wrote(old: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for name in ("report.html", "run.json", "a.png", "b.png", "c.png"):
+        (mine / name).write_text("mine")
+    for directory, names in ((old, "notes"), (mine, "a.png, b.png, c.png and 2 more")):
+        before = files_in(directory)
+        with pytest.raises(OutputError) as caught, run_folder(directory):
+            raise AssertionError("the block must not run")
+        assert str(caught.value) == (
+            f"{directory} holds files that no run has written: {names}; choose another folder with --output, "
+            "or write the results among them with --overwrite"
+        )
+        assert files_in(directory) == before
+
+
+def test_run_folder_refuses_what_must_not_be_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home" / "me"))
+    (tmp_path / "home" / "me").mkdir(parents=True)
+    capture = tmp_path / "captures" / "night" / "cube.npy"
+    reasons = {
+        Path("/"): "is the folder of a user or of the system",
+        tmp_path / "home": "is the folder of a user or of the system",
+        tmp_path / "home" / "me": "is the folder of a user or of the system",
+        tmp_path / "captures": f"cannot be the run folder, since {capture} lies in it",
+        capture: f"cannot be the run folder, since {capture} lies in it",
+    }
+    for directory, reason in reasons.items():
+        with pytest.raises(OutputError) as caught, run_folder(directory, overwrite=True, inputs=[capture]):
+            raise AssertionError("the block must not run")
+        assert str(caught.value) == f"{directory} {reason}; choose another one with --output"
+
+
+def test_second_run_into_a_folder_is_refused_with_the_first(tmp_path: Path) -> None:
+    directory = tmp_path / "scan"
+    with run_folder(directory):
+        holder = json.loads((tmp_path / ".scan.lock").read_text())
+        with pytest.raises(OutputError) as caught, run_folder(directory):
+            raise AssertionError("the block must not run")
+    assert (holder["pid"], holder["host"]) == (os.getpid(), socket.gethostname())
+    assert str(caught.value) == (
+        f"the run folder {directory} is in use: process {os.getpid()} on {socket.gethostname()} has been writing it since "
+        f"{holder['since']}; wait for it, or choose another folder with --output"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+_STOPS = """
+import os, signal, sys
+from pathlib import Path
+from photonpano import folders
+from photonpano.pipeline.run_folder import run_folder
+
+def stop(*args):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+directory, where = Path(sys.argv[1]), sys.argv[2]
+with run_folder(directory, overwrite=True) as folder:
+    (folder.staging / "panorama.tiff").write_bytes(b"new")
+    if where == "before":
+        stop()
+    if where == "exchanged":
+        folders._remove_old = stop
+    else:
+        folders._exchange = lambda one, other: False
+        folders._put_in_place = stop
+    folder.commit({"photonpano": "0", "spec": {}})
+"""
+
+
+@pytest.mark.parametrize("where", ["before", "exchanged", "pending"])
+def test_run_folder_recovers_from_a_killed_run(old: Path, where: str) -> None:
+    before = files_in(old)
+    done = subprocess.run([sys.executable, "-c", _STOPS, old, where], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert len(list(old.parent.iterdir())) > 1 or where == "pending"
+    finish_run_folder(old)
+    if where == "before":
+        assert files_in(old) == before
+    else:
+        assert changed_files(old) == []
+        assert set(files_in(old)) == {"panorama.tiff", "run.json", "notes/a.txt"}
+    run_into(old, overwrite=True)
+    assert list(old.parent.iterdir()) == [old]
+    assert set(files_in(old)) == {*FILES, "notes/a.txt"}

@@ -1,0 +1,130 @@
+"""The files of a run folder: what they are called, their sizes and hashes, and whether they belong to one run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import stat
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from photonpano.captures.fingerprint import frames_sha256
+from photonpano.errors import InputError, OutputError
+from photonpano.folders import PENDING, finish_replacement, lock_path
+from photonpano.locks import locked
+from photonpano.protocols import Source
+from photonpano.record.schema import FileContent
+
+logger = logging.getLogger(__name__)
+
+RECORD = "run.json"
+RESULTS = frozenset({"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "report.html", RECORD})
+"""The files of a run. Runs of older versions do not list theirs."""
+
+
+def contents_of(folder: Path) -> dict[str, FileContent]:
+    """Return size and SHA-256 of the files in a folder, without run.json."""
+    return {path.name: _content(path) for path in sorted(folder.iterdir()) if path.name != RECORD}
+
+
+def recorded_json(folder: Path) -> Mapping[str, Any] | None:
+    """Return the content of run.json if a run wrote it, else None."""
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) and "photonpano" in record and isinstance(record.get("spec"), dict) else None
+
+
+def recorded_contents(folder: Path) -> Mapping[str, FileContent] | None:
+    """Return size and SHA-256 of each file as run.json lists them; None if it lists none."""
+    listed = (recorded_json(folder) or {}).get("files")
+    if not isinstance(listed, dict) or not all(isinstance(each, dict) for each in listed.values()):
+        return None
+    return listed
+
+
+def names_of_results(folder: Path) -> set[str]:
+    """Return the names in a folder that belong to its run."""
+    return {*RESULTS, *(recorded_contents(folder) or ())}
+
+
+def finish_run_folder(folder: Path) -> None:
+    """Put the files of a run in place that was killed while it did so; while another process does that, let it.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    if not (folder / PENDING).is_dir():
+        return
+    try:
+        with suppress(OutputError), locked(lock_path(folder.absolute()), f"the run folder {folder}"):
+            finish_replacement(folder)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: a run was stopped while it put its files in place, and they cannot be put there ({error.strerror}); "
+            f"the files in {folder / PENDING} are the new ones"
+        ) from error
+
+
+def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str] | None:
+    """Return the files that are there, and are not what run.json lists; None if it lists none.
+
+    Args:
+        folder: the run folder.
+        names: the files to compare; all by default.
+    """
+    recorded = recorded_contents(folder)
+    if recorded is None:
+        return None
+    there = [name for name in (recorded if names is None else names) if name in recorded and (folder / name).exists()]
+    return [name for name in there if _differs(folder / name, recorded[name])]
+
+
+def require_one_run(folder: Path, names: Iterable[str]) -> None:
+    """Refuse files that do not belong to the run.json beside them; warn if it lists no hashes.
+
+    Raises:
+        InputError: a file is another one than the run wrote.
+    """
+    if not folder.is_dir():
+        return
+    finish_run_folder(folder)
+    changed = changed_files(folder, names)
+    if changed is None:
+        logger.warning("%s: run.json lists no hashes, as in older versions, so the files may be of several runs", folder)
+    elif changed:
+        was = "is not the file" if len(changed) == 1 else "are not the files"
+        raise InputError(
+            f"{folder}: {' and '.join(changed)} {was} that its run.json lists; the folder mixes several runs, or a file was "
+            "changed: run the spec again"
+        )
+
+
+def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source) -> None:
+    """Refuse a capture whose sampled frames are not those that a run has read; runs of older versions did not record them.
+
+    Raises:
+        InputError: the frames are others.
+    """
+    recorded = record.get("capture")
+    if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):
+        raise InputError(f"{folder}: the capture has other frames than when it was run; it is another capture")
+
+
+def _differs(path: Path, recorded: FileContent) -> bool:
+    try:
+        return path.lstat().st_size != recorded.get("bytes") or _content(path) != recorded
+    except OSError:
+        return True
+
+
+def _content(path: Path) -> FileContent:
+    if not stat.S_ISREG(path.lstat().st_mode):
+        return {"bytes": 0, "sha256": ""}
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+        return {"bytes": file.tell(), "sha256": digest.hexdigest()}

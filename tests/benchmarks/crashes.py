@@ -1,0 +1,290 @@
+"""Kill runs, fill disks, and race runs for one folder; count what is neither wholly old nor wholly new.
+
+    python tests/benchmarks/crashes.py kills --number 100 --seed 0
+    python tests/benchmarks/crashes.py disks --number 20
+    python tests/benchmarks/crashes.py races --number 50 --at-once 2
+    python tests/benchmarks/crashes.py cost
+
+Every trial works on a simulated capture of 64x96 px in a temporary folder. The exit code is 1 if a trial fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+SPEC = """version: 1
+source: {{use: packed-npy, with: {{path: cube.npy, frame_rate_hz: 96800}}}}
+resample: {{use: midpoint, with: {{group_size: 50}}}}
+levels: 1
+run: {{seed: {seed}, threads: 1}}
+output: {{directory: runs/scan}}
+"""
+_CHANGES = ("os.rename", "os.mkdir", "os.rmdir", "os.remove", "os.link", "shutil.rmtree", "ctypes.dlsym")
+"""What a process tells its audit hooks before the system changes names of files; `ctypes.dlsym` comes before the exchange."""
+
+
+class Run:
+    """A run in a process of its own, which is forked so that it need not import anything.
+
+    Args:
+        folder: the current folder of the process.
+        options: of `photonpano run`.
+        killed_at: the number of the change of a file at which the process kills itself; 0 for none.
+    """
+
+    def __init__(self, folder: Path, *options: str, killed_at: int = 0) -> None:
+        self._printed = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the object
+        self._pid = os.fork()
+        self.code: int | None = None
+        if not self._pid:
+            self._work(folder, options, killed_at)
+
+    def _work(self, folder: Path, options: tuple[str, ...], killed_at: int) -> None:
+        os.chdir(folder)
+        for stream in (1, 2):
+            os.dup2(self._printed.fileno(), stream)
+        sys.argv = ["photonpano", "run", "scan.yaml", *options]
+        if killed_at:
+            sys.addaudithook(_killer(killed_at))
+        code = 1
+        try:
+            main_program()
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else 1
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+
+    def kill(self) -> None:
+        """Kill the process; nothing if it has ended."""
+        if self.code is None:
+            os.kill(self._pid, signal.SIGKILL)
+
+    def wait(self) -> str:
+        """Wait for the end, and return what was printed; `code` is the exit code then."""
+        _, status = os.waitpid(self._pid, 0)
+        self.code = os.waitstatus_to_exitcode(status)
+        self._printed.seek(0)
+        return self._printed.read()
+
+
+def _killer(number: int) -> Callable[[str, tuple[Any, ...]], None]:
+    left = number
+
+    def count(event: str, args: tuple[Any, ...]) -> None:
+        nonlocal left
+        written = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+") and "runs" in str(args[0])
+        if event in _CHANGES or written:
+            left -= 1
+            if not left:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    return count
+
+
+def main_program() -> None:
+    """Run the command line."""
+    from photonpano.cli import main
+
+    main()
+
+
+def preload() -> None:
+    """Import what a run needs."""
+    for name in (
+        "photonpano.cli.run", "photonpano.pipeline.run", "photonpano.specs", "photonpano.residuals.verdict",
+        "matplotlib.figure", "matplotlib.backends.backend_svg", "scipy.sparse.linalg", "jinja2", "rich.progress", "numba",
+    ):  # fmt: skip
+        importlib.import_module(name)
+    from photonpano import discover
+
+    discover()
+
+
+def prepare(folder: Path, seed: int = 0) -> None:
+    """Simulate the capture, and write the spec."""
+    from photonpano import parse_spec, simulate
+
+    settings = {"n_frames": 400, "frame_shape": [64, 96], "path": {"kind": "pan", "length_px": 30}, "flux": 0.5}
+    simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": settings}}), folder / "cube.npy")
+    write_spec(folder, seed)
+
+
+def write_spec(folder: Path, seed: int) -> None:
+    """Write the spec; its seed distinguishes the runs."""
+    (folder / "scan.yaml").write_text(SPEC.format(seed=seed))
+
+
+def state(folder: Path) -> tuple[int | None, list[str]]:
+    """Return the seed of the run that the folder holds, None if there is none; and what is wrong with it."""
+    from photonpano.record.contents import RESULTS, changed_files, finish_run_folder
+
+    directory = folder / "runs" / "scan"
+    if not directory.exists():
+        return None, []
+    finish_run_folder(directory)
+    changed = changed_files(directory)
+    if changed is None:
+        return None, ["run.json is missing or lists nothing"]
+    record = json.loads((directory / "run.json").read_text())
+    missing = [name for name in record["files"] if not (directory / name).exists()]
+    other = sorted({path.name for path in directory.iterdir()} - {*record["files"], "run.json"})
+    lacking = sorted(RESULTS - {"report.html", "run.json", *record["files"]})
+    return record["seed"], [*changed, *missing, *(f"more: {name}" for name in other), *(f"lacks {name}" for name in lacking)]
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Return what is in the folder beside capture, spec and run."""
+    beside = {path.name for path in folder.iterdir()} - {"cube.npy", "cube.truth.npz", "scan.yaml", "runs"}
+    inside = {path.name for path in (folder / "runs").iterdir()} - {"scan"} if (folder / "runs").exists() else set()
+    return sorted(beside | inside)
+
+
+def kills(folder: Path, number: int, seed: int) -> list[str]:
+    """Kill runs at random moments, a third of them while they write, and run again after each tenth."""
+    rng, wrong, writing, counts = random.Random(seed), [], 0, {"old": 0, "new": 0}
+    start = time.perf_counter()
+    Run(folder).wait()
+    whole_s, old = time.perf_counter() - start, 0
+    for index in range(1, number + 1):
+        write_spec(folder, index)
+        if index % 3 == 0:
+            process = Run(folder, killed_at=rng.randint(1, 60))
+        else:
+            process = Run(folder)
+            time.sleep(rng.uniform(0, 1.05 * whole_s))
+            process.kill()
+        process.wait()
+        writing += index % 3 == 0 and process.code == -signal.SIGKILL
+        found, problems = state(folder)
+        counts["new" if found == index else "old"] += 1
+        if problems or found not in (old, index):
+            wrong.append(f"kill {index}: seed {found} after {old}; {problems}")
+        old = found
+        if index % 10 == 0:
+            printed = Run(folder).wait()
+            found, problems = state(folder)
+            if found != index or problems or leftovers(folder):
+                wrong.append(f"run after kill {index}: seed {found}, {problems}, left {leftovers(folder)}: {printed}")
+            old = found
+    states = f"{counts['old']} left the old run, {counts['new']} the new one"
+    print(f"{number} kills, {writing} of them while writing: {states}, {len(wrong)} failed")
+    return wrong
+
+
+def disks(folder: Path, number: int, seed: int) -> list[str]:
+    """Run on full disks: file sizes are limited, or a small file system is mounted if that is allowed."""
+    del seed
+    disk, wrong, counts = folder / "disk", [], {0: 0, 1: 0}
+    disk.mkdir()
+    for index in range(number):
+        size = 4096 * (8 + 8 * index)
+        write_spec(folder, index + 1)
+        mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], capture_output=True, check=False)
+        if mounted.returncode:
+            return [f"a file system cannot be mounted: {mounted.stderr.decode().strip()}"]
+        try:
+            process = Run(folder, "--output", "disk/scan")
+            printed = process.wait()
+            counts[process.code] = counts.get(process.code, 0) + 1
+            there = sorted(path.name for path in disk.rglob("*"))
+            if process.code not in (0, 1) or "Traceback" in printed:
+                wrong.append(f"{size} bytes: exit {process.code}: {printed}")
+            elif process.code == 1 and there:
+                wrong.append(f"{size} bytes: left {there}")
+            elif process.code == 0 and not {"run.json", "trajectory.npz", "panorama.tiff"} <= {*there}:
+                wrong.append(f"{size} bytes: exit 0 with {there}")
+        finally:
+            subprocess.run(["umount", disk], check=True)
+    print(f"{number} disks: {counts[0]} runs fitted, {counts[1]} were refused with a sentence, {len(wrong)} failed")
+    return wrong
+
+
+def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
+    """Start runs into one folder at once."""
+    del seed
+    wrong = []
+    for index in range(number):
+        processes = [Run(folder, "--set", f"run.seed={each}") for each in range(at_once)]
+        errors = [process.wait() for process in processes]
+        done = [each for each, process in enumerate(processes) if process.code == 0]
+        refused = [error for process, error in zip(processes, errors, strict=True) if process.code == 1]
+        found, problems = state(folder)
+        if problems or found not in done or not done or not all("is in use: process" in error for error in refused):
+            wrong.append(f"race {index}: seed {found} of {done}, {problems}, {refused}")
+        if leftovers(folder):
+            wrong.append(f"race {index}: left {leftovers(folder)}")
+    print(f"{number} races of {at_once}: {len(wrong)} failed")
+    return wrong
+
+
+def cost(folder: Path, number: int, seed: int) -> list[str]:
+    """Measure what hashes, flushes and the step take: of a run folder of a panorama of 1,000 x 4,000 px."""
+    del seed
+    import numpy as np
+
+    from photonpano.captures.fingerprint import fingerprint
+    from photonpano.pipeline.components import open_source
+    from photonpano.pipeline.run_folder import run_folder
+    from photonpano.specs import load_spec
+
+    content = np.random.default_rng(0).bytes(4 * 1000 * 4000)
+    times = []
+    for _ in range(min(number, 10)):
+        start = time.perf_counter()
+        with run_folder(folder / "runs" / "cost") as results:
+            for name in ("panorama.tiff", "coverage.tiff", "trajectory.npz"):
+                (results.staging / name).write_bytes(content[: 80 * 100_000] if name == "trajectory.npz" else content)
+            written = time.perf_counter()
+            results.commit({"photonpano": "0", "spec": {}})  # type: ignore[typeddict-item]
+            results.reopen()
+            results.commit({"photonpano": "0", "spec": {}})  # type: ignore[typeddict-item]
+        times.append((written - start, time.perf_counter() - written))
+    plan = load_spec(folder / "scan.yaml")
+    with open_source(plan) as source:
+        start = time.perf_counter()
+        fingerprint(plan, source)
+        sampled = time.perf_counter() - start
+    commit = sorted(each for _, each in times)[len(times) // 2]
+    print(f"hashes, flushes and two commits of 40 MB: {commit:.3f} s (median of {len(times)}); fingerprint {sampled:.3f} s")
+    return []
+
+
+def main() -> int:
+    """Run one trial."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trial", choices=["kills", "disks", "races", "cost"])
+    parser.add_argument("--number", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--at-once", type=int, default=2)
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        preload()
+        simulation = multiprocessing.get_context("spawn").Process(target=prepare, args=(folder,))
+        simulation.start()  # in a process of its own: a forked process keeps the locks of threads that it has not got
+        simulation.join()
+        more = {"at_once": options.at_once} if options.trial == "races" else {}
+        wrong: list[str] = globals()[options.trial](folder, options.number, options.seed, **more)
+    print(*wrong, sep="\n")
+    return bool(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
