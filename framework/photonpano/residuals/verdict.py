@@ -35,8 +35,8 @@ MAX_STD_PX = 1.0
 """Mean expected error of the motion."""
 MAX_CONTRADICTIONS = 0.1
 """Share of the pairs of the last level that were dropped because they contradict the others."""
-MAX_AMBIGUOUS = 0.05
-"""Share of the pairs of a level that fit the scene at another place as well."""
+MAX_AMBIGUOUS, _FEWEST_AMBIGUOUS = 0.05, 3
+"""Share of the pairs of a level that fit the scene at another place as well. One or two pairs may do so by their noise."""
 MAX_STANDING = 0.5
 """Share of the frame that stands still while the rest moves."""
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
@@ -312,13 +312,14 @@ def _ambiguous(levels: Sequence[LevelResult]) -> Reason | None:
         located = result.located
         if located.ambiguity is None:
             continue
-        share = len(located.ambiguity.pairs) / max(len(located.edges), 1)
-        if share > MAX_AMBIGUOUS:
+        n_pairs = len(located.ambiguity.pairs)
+        share = n_pairs / max(len(located.edges), 1)
+        if share > MAX_AMBIGUOUS and n_pairs >= _FEWEST_AMBIGUOUS:
             return Reason(
                 REPEATS,
                 share,
                 MAX_AMBIGUOUS,
-                f"{len(located.ambiguity.pairs)} of {len(located.edges)} pairs of level {result.level.number}, "
+                f"{n_pairs} of {len(located.edges)} pairs of level {result.level.number}, "
                 f"{located.ambiguity.alternative_px:.0f} px away",
                 "look at the path in the report; a slower motion tells the places apart",
             )

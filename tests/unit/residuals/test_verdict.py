@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.verdict import Reason, contradictions, judge
+from photonpano.values import Ambiguity
 
 
 def with_residuals(explained: Explained, **changes: Any) -> Explained:
@@ -157,6 +159,14 @@ def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
     reason = contradictions(11, 100)
     assert reason is not None
     assert reason.where == "11 of 100 pairs of the last level"
+
+
+@pytest.mark.parametrize(("n_pairs", "status"), [(2, "trusted"), (3, "doubtful")])
+def test_level_is_ambiguous_from_three_pairs_on(explained: Explained, n_pairs: int, status: str) -> None:
+    pairs = tuple((index + 1, index) for index in range(n_pairs))
+    located = SimpleNamespace(ambiguity=Ambiguity(1, pairs, 40.0), edges=(None,) * 30, solution=SimpleNamespace(outliers=()))
+    levels: Any = [SimpleNamespace(level=SimpleNamespace(number=1), located=located)]
+    assert judge(explained, levels).status == status
 
 
 def test_several_reasons_are_listed_together(explained: Explained) -> None:
