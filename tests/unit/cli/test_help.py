@@ -97,3 +97,8 @@ def test_wrong_command_line_exits_2(arguments: list[str], message: str, invoke: 
     result = invoke(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")
     assert message in result.stderr
+
+
+def test_module_is_the_program() -> None:
+    done = subprocess.run([sys.executable, "-m", "photonpano", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"photonpano {photonpano.__version__}\n"

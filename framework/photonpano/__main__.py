@@ -1,0 +1,5 @@
+"""`python -m photonpano`: the command line, where its script is not on the path."""
+
+from photonpano.cli import main
+
+main()
