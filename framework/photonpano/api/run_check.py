@@ -22,7 +22,7 @@ from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
-from photonpano.residuals.refinement import refine
+from photonpano.residuals.refinement import Look, refine
 from photonpano.residuals.verdict import REPEATS, Reason, Verdict, contradictions, judge
 from photonpano.specs import Plan, parse_spec
 from photonpano.threads import one_thread_inside, thread_count
@@ -67,7 +67,8 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
         if _divided_by_vignette(record) and (vignette := vignette_of(plan, source, motion.trajectory)):
             source = divided_by(source, vignette)
         context = Context(thread_count(plan.run.threads), progress or Quiet())
-        explained = refine(source, motion, (), plan.render.tolerance_px, int(plan.run.memory), context)
+        rendering = plan.render.tolerance_px, int(plan.run.memory), context
+        explained = refine(source, Look(source, motion, *rendering), (), *rendering)
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
     unknown = []
     if np.isnan(run.std_px).any():

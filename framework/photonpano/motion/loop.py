@@ -15,6 +15,7 @@ from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import merge
+from photonpano.motion.timeline import Timeline
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
@@ -60,6 +61,7 @@ def estimate_motion(
     context: Context,
     until_converged: bool = False,
     previous: Trajectory | None = None,
+    timeline: Timeline | None = None,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -75,19 +77,21 @@ def estimate_motion(
         context: threads, progress, and `on_level`, which is called with each result.
         until_converged: stop as soon as a level changes the motion by no more than its expected error.
         previous: the motion that is known so far; None at level 1.
+        timeline: repeated frames, and where the motion is cut; None for a capture without gaps.
 
     Raises:
         LocationError: too few exposures could be located.
         PluginError: a component failed, or broke its contract.
     """
     results: list[LevelResult] = []
+    timeline = timeline or Timeline.regular(source.info.n_frames)
     for level in levels:
         clock = Stopwatch(context.threads)
-        groups = resample(level, source.info.n_frames, clock)
-        exposures = merge(level, source, groups, previous, clock)
+        groups = timeline.parts(resample(level, source.info.n_frames, clock))
+        exposures = merge(level, source, groups, previous, clock, timeline)
         located = locate(exposures, graph, context)
-        trajectory = interpolate(level, located, reference, clock)
-        uncertainty = Uncertainty(located, trajectory, previous, source.info.n_frames)
+        trajectory = interpolate(level, located, timeline, reference, clock)
+        uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds))
         context.progress.note(_summary(results[-1]))
         context.on_level(results[-1])
@@ -108,18 +112,23 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
         return require_groups(level.resampler.groups(n_frames, level.number), n_frames)
 
 
-def interpolate(level: Level, located: LocatedLevel, reference: int, clock: Stopwatch) -> Trajectory:
-    """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate").
+def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, reference: int, clock: Stopwatch) -> Trajectory:
+    """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
 
     Raises:
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
+
+    def fitted(knots: slice, times: FloatArray) -> Trajectory:
+        homographies = located.homographies[knots]
+        information = None if located.information is None else located.information[knots].copy()
+        found = level.interpolator.fit(times, homographies, information)
+        free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
+        require_knots_kept(free, times, homographies, located.std_px[knots], located.frame_shape)
+        return free
+
     with clock("interpolate"), level.attributing("interpolator"):
-        information = None if located.information is None else located.information.copy()
-        fitted = level.interpolator.fit(located.instants, located.homographies, information)
-        free = AttributedTrajectory(fitted, level.origins["interpolator"], level.number)
-        require_knots_kept(free, located.instants, located.homographies, located.std_px, located.frame_shape)
-        return ReferencedTrajectory(free, reference)
+        return ReferencedTrajectory(timeline.fit(fitted, located.instants), reference)
 
 
 class ReferencedTrajectory:

@@ -9,6 +9,7 @@ import numpy as np
 
 from photonpano.motion.checks import require_exposure
 from photonpano.motion.level import Level
+from photonpano.motion.timeline import Timeline
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
 from photonpano.values import FloatArray, Group, VirtualExposure
@@ -24,6 +25,7 @@ class VirtualExposures:
         groups: the frames of each exposure.
         previous: the motion known so far; None at the first level.
         clock: adds up the time that merging takes.
+        timeline: where the image jumps; None if it is not known to.
     """
 
     level: Level
@@ -31,6 +33,7 @@ class VirtualExposures:
     groups: Sequence[Group]
     previous: Trajectory | None
     clock: Stopwatch
+    timeline: Timeline | None = None
 
     @property
     def frame_shape(self) -> tuple[int, int]:
@@ -54,7 +57,12 @@ class VirtualExposures:
 
 
 def merge(
-    level: Level, source: Source, groups: Sequence[Group], previous: Trajectory | None, clock: Stopwatch
+    level: Level,
+    source: Source,
+    groups: Sequence[Group],
+    previous: Trajectory | None,
+    clock: Stopwatch,
+    timeline: Timeline | None = None,
 ) -> VirtualExposures:
     """Plan the virtual exposures of a level: its groups, merged along the motion known so far (paper, section 4, "Merge")."""
-    return VirtualExposures(level, source, groups, previous, clock)
+    return VirtualExposures(level, source, groups, previous, clock, timeline)

@@ -281,7 +281,8 @@ class Registrar:
             return None
         with self._clock("locate"):
             complete = len(self._log.found) == len(groups)
-            start = None if complete else starting_motion(self._exposures.source, groups, pool)
+            exposures = self._exposures
+            start = None if complete else starting_motion(exposures.source, groups, pool, exposures.timeline)
         return Track(start, instants_of(groups), self._exposures.frame_shape)
 
     def _hypotheses(self, moving: int, fixed: int) -> list[Homography]:

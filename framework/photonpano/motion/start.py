@@ -17,6 +17,7 @@ from photonpano.geometry import translation
 from photonpano.locating import correlation_peaks, correlation_surface
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.pairs import lengths_of
+from photonpano.motion.timeline import Timeline
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FrameSpan, Group
 
@@ -68,19 +69,24 @@ class StartingMotion:
         velocities: (N, 2) of the image there, in px of a frame per frame period.
         alternatives: (N, 2) velocities that are as likely; NaN where there is none.
         reach: frames from the nearest of these instants within which the motion is known.
+        timeline: where the image jumps; None if it is not known to.
     """
 
     instants: FloatArray
     velocities: FloatArray
     alternatives: FloatArray
     reach: float
+    timeline: Timeline | None = None
 
     def between(self, moving: float, fixed: float) -> FloatArray | None:
         """Return the homography from the frame at one instant to that at another: (3, 3); None where it is not known."""
         points = self._points(moving, fixed)
         if np.abs(points[:, None] - self.instants).min(axis=1).max() > self.reach:
             return None
-        return translation(*-self._integral(self.velocities, points))
+        shift = self._integral(self.velocities, points)
+        if self.timeline is not None:
+            shift += self.timeline.shift_between(fixed, moving)
+        return translation(*-shift)
 
     def alternative_px(self, moving: float, fixed: float) -> float:
         """Return how far from that motion an equally likely one is, in px; 0 if there is none."""
@@ -96,7 +102,9 @@ class StartingMotion:
         return np.asarray(np.trapezoid(at, points, axis=0))
 
 
-def starting_motion(source: Source, groups: Sequence[Group], pool: ThreadPoolExecutor) -> StartingMotion | None:
+def starting_motion(
+    source: Source, groups: Sequence[Group], pool: ThreadPoolExecutor, timeline: Timeline | None = None
+) -> StartingMotion | None:
     """Measure the velocity of the image all over a capture, before any motion is known.
 
     The capture is divided into windows of the length of a group, and each of them into short spans of frames. The phase
@@ -114,7 +122,7 @@ def starting_motion(source: Source, groups: Sequence[Group], pool: ThreadPoolExe
     if not known:
         return None
     velocities, alternatives = _continuous([each for _, each in known])
-    return StartingMotion(np.array([instant for instant, _ in known]), velocities, alternatives, 1.5 * length)
+    return StartingMotion(np.array([instant for instant, _ in known]), velocities, alternatives, 1.5 * length, timeline)
 
 
 def _hypotheses(source: Source, length: int, start: int) -> Hypotheses | None:

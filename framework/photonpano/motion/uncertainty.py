@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from photonpano.geometry import align_planes, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
+from photonpano.motion.timeline import Timeline
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray
 
@@ -30,18 +31,19 @@ class Uncertainty:
 
     change_px: float | None
 
-    def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, n_frames: int) -> None:
+    def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
         """Compare a level with the one before.
 
         Args:
             located: the exposures of the level.
             trajectory: the motion after the level.
             previous: the motion after the level before; None at the first level.
-            n_frames: length of the capture.
+            timeline: of the capture. Beyond a cut, nothing is known from the other side.
         """
         self._instants = located.instants
         self._std_px = located.std_px
-        self._frames = np.unique(np.linspace(0, n_frames - 1, _COMPARED).round())
+        self._timeline = timeline
+        self._frames = np.unique(np.linspace(0, len(timeline.taken) - 1, _COMPARED).round())
         shape, current = located.frame_shape, trajectory.at(self._frames)
         if previous is None:
             half = np.median([len(group.span) for group in located.groups]) / 2
@@ -66,9 +68,14 @@ class Uncertainty:
         return np.asarray(np.hypot(self._noise_px(frames), np.interp(frames, self._frames, self._remaining_px)))
 
     def _noise_px(self, frames: FloatArray) -> FloatArray:
-        if len(self._instants) < 2:
-            return np.full(frames.shape, np.inf)
-        inside = np.interp(frames, self._instants, self._std_px)
-        first, last = np.diff(self._instants)[[0, -1]]
-        beyond = np.maximum((self._instants[0] - frames) / first, (frames - self._instants[-1]) / last)
-        return np.asarray(inside * (1 + 2 * np.maximum(beyond, 0)))
+        noise_px = np.full(frames.shape, np.inf)
+        knots, pieces = self._timeline.knot_pieces(self._instants), self._timeline.piece_of(frames)
+        for number, piece in enumerate(knots):
+            instants, here = self._instants[piece], pieces == number
+            if len(instants) < 2 or not here.any():
+                continue
+            inside = np.interp(frames[here], instants, self._std_px[piece])
+            first, last = np.diff(instants)[[0, -1]]
+            beyond = np.maximum((instants[0] - frames[here]) / first, (frames[here] - instants[-1]) / last)
+            noise_px[here] = inside * (1 + 2 * np.maximum(beyond, 0))
+        return np.asarray(np.hypot(noise_px, self._timeline.unknown_px(frames)))

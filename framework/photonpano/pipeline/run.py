@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from photonpano.captures.fingerprint import capture_files, fingerprint
 from photonpano.captures.order import order_warning
+from photonpano.captures.repeats import timeline_of
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
 from photonpano.contributions import MergerContribution
 from photonpano.corrections import CorrectedSource, Vignette, divided_by, estimate_vignette
-from photonpano.errors import InputError, OutputError
+from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.motion.frame_motion import motion_of_frames
-from photonpano.motion.loop import estimate_motion
+from photonpano.motion.loop import LevelResult, estimate_motion
+from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.components import build_levels, build_refiners, open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
@@ -26,7 +29,8 @@ from photonpano.protocols import Source, Trajectory
 from photonpano.record.run_json import peak_memory_bytes, record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
-from photonpano.residuals.refinement import Explained, refine
+from photonpano.residuals.cuts import find_cuts
+from photonpano.residuals.refinement import Explained, Look, refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
@@ -84,17 +88,22 @@ def run(plan: Plan, progress: Progress | None = None, *, overwrite: bool = False
         decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)
-        results = estimate_motion(source, levels[:1], plan.graph, reference, context)
+        timeline = timeline_of(source, context)
+        results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline)
         known, later = results[0].trajectory, levels[1:]
         if vignette := vignette_of(plan, source, known):
             decisions.append(vignette.decision)
             source = divided_by(source, vignette)
             if not later:
                 results, later = [], levels
-        results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known)
-        motion = motion_of_frames(results, source.info, reference)
+        results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
+        rendering = plan.render.tolerance_px, memory, context
+        look = Look(source, motion_of_frames(results, source.info, reference), *rendering)
+        if cuts := find_cuts(source, look, context):
+            timeline, results, look = _cut_at(cuts, plan, source, context, timeline, results, look)
+        decisions += timeline.decisions
         refiners = build_refiners(plan, source, decisions)
-        explained = refine(source, motion, refiners, plan.render.tolerance_px, memory, context)
+        explained = refine(source, look, refiners, *rendering)
         verdict = judge(explained, results, decisions)
         motion = explained.motion
         panorama = render_panorama(
@@ -136,6 +145,35 @@ def _with_report(folder: RunFolder, record: RunRecord, explained: Explained, pan
     except OutputError as error:
         warning = f"the report could not be added ({error}); all other files of the run are written"
         return {**record, "warnings": [*record["warnings"], warning]}
+
+
+def _cut_at(
+    cuts: Sequence[Cut],
+    plan: Plan,
+    source: Source,
+    context: Context,
+    timeline: Timeline,
+    results: list[LevelResult],
+    look: Look,
+) -> tuple[Timeline, list[LevelResult], Look]:
+    """Estimate the motion again, cut where the image jumps; keep what was known if that explains the photons better.
+
+    All levels run again: with exposures across a jump, the first went astray, too.
+    """
+    cut, reference = timeline.cut_at(cuts), look.motion.reference
+    try:
+        levels = build_levels(plan, source, [])
+        again = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged, timeline=cut)
+        motion = motion_of_frames(again, source.info, reference)
+        seen = Look(source, motion, plan.render.tolerance_px, int(plan.run.memory), context)
+        worse = seen.worse_than(look)
+    except (LocationError, CanvasTooLargeError) as error:
+        worse = str(error)
+    if worse:
+        places = ", ".join(f"frame {each.frame}" for each in cuts)
+        logger.warning(f"the image seems to jump before {places}, but the motion is not cut there: {worse}")
+        return timeline, results, look
+    return cut, again, seen
 
 
 def _require_photons(plan: Plan, source: Source) -> None:

@@ -25,6 +25,8 @@ _SHORTEST, _LONGEST = 12, 64
 """Fewest and most frames of a span, if the motion is slow."""
 _MAX_MOTION_PX = 2.0
 """A span is short enough that the image moves by no more than this."""
+_JUMP_PX, _JUMP_RATIO = 1.0, 5.0
+"""Spans are divided where the motion jumps from one frame to the next: by this much, and this many times the usual step."""
 _FEWEST_SPANS = 64
 """A capture is divided into at least this many spans, if it has the frames."""
 _BATCH = 64
@@ -104,7 +106,10 @@ def measure(source: Source, span: FrameSpan, prediction: Prediction, context: Co
         context: threads and progress; the result does not depend on the number of threads.
     """
     spans = spans_of(span, prediction)
-    homographies = prediction.trajectory.at([each.centre for each in spans])
+    # The mean over the frames, which is not the motion at the centre where frames are repeated, or tremble.
+    starts = [each.start - span.start for each in spans]
+    of_frames = prediction.trajectory.at(np.arange(span.start, span.stop))
+    homographies = np.add.reduceat(of_frames, starts) / np.array([len(each) for each in spans])[:, None, None]
     batches = [slice(first, first + _BATCH) for first in range(0, len(spans), _BATCH)]
     work = partial(_measured, source, prediction, spans, homographies)
     total: _Batch | None = None
@@ -145,17 +150,22 @@ def spans_of(span: FrameSpan, prediction: Prediction) -> tuple[FrameSpan, ...]:
     """
     frames = np.arange(span.start, span.stop)
     homographies = prediction.trajectory.at(frames)
-    speed = 0.0
+    speed, jumps = 0.0, np.empty(0, int)
     if len(frames) > 1:
-        moved = corner_displacements(inverse(homographies[:-1]) @ homographies[1:], np.eye(3), prediction.frame_shape)
-        speed = float(np.quantile(moved.mean(axis=-1), 0.95))
+        steps = inverse(homographies[:-1]) @ homographies[1:]
+        moved = corner_displacements(steps, np.eye(3), prediction.frame_shape).mean(axis=-1)
+        speed = float(np.quantile(moved, 0.95))
+        jumps = span.start + 1 + np.flatnonzero(moved > max(_JUMP_PX, _JUMP_RATIO * speed))
     probes = np.linspace(0, len(frames) - 1, _PROBES).astype(int)
     noise_px = _shift_noise_px(prediction, homographies[probes])
     wanted = np.clip(np.ceil((noise_px / _NOISE_PX) ** 2), _SHORTEST, _LONGEST)
     size = int(min(wanted, _MAX_MOTION_PX / max(speed, 1e-9), len(frames) / _FEWEST_SPANS))
     size = max(1, size)
-    bounds = [*range(span.start, span.stop - size + 1, size), span.stop]
-    return tuple(FrameSpan(start, stop) for start, stop in pairwise(bounds))
+    spans = []
+    for piece in pairwise([span.start, *jumps.tolist(), span.stop]):
+        bounds = [*range(piece[0], max(piece[1] - size, piece[0]) + 1, size), piece[1]]
+        spans += [FrameSpan(start, stop) for start, stop in pairwise(bounds)]
+    return tuple(spans)
 
 
 def _shift_noise_px(prediction: Prediction, homographies: FloatArray) -> float:

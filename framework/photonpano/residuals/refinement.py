@@ -124,13 +124,13 @@ class Look:
 
 
 def refine(
-    source: Source, motion: FrameMotion, refiners: Sequence[NamedRefiner], tolerance_px: float, memory: int, context: Context
+    source: Source, look: Look, refiners: Sequence[NamedRefiner], tolerance_px: float, memory: int, context: Context
 ) -> Explained:
     """Correct the motion by what short spans of frames show beyond it, and measure what is left.
 
     Args:
         source: the capture.
-        motion: the result of the loop.
+        look: the result of the loop, and what it does not explain.
         refiners: applied in order, each until it finds nothing, `MAX_ROUNDS` times at most.
         tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
         memory: bytes that rendering may take.
@@ -141,7 +141,6 @@ def refine(
         LocationError: frames reach the horizon of the reference plane.
         PluginError: a refiner failed, or broke its contract.
     """
-    look = Look(source, motion, tolerance_px, memory, context)
     refinements = []
     for place, refiner in enumerate(refiners):
         start, kept_out = look.motion, ""
@@ -169,7 +168,7 @@ def refine(
                 rounds.append(refined.summary)
                 context.progress.note(f"{refiner.name}: {refined.summary}")
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(start, look.motion), kept_out))
-    left_px = unexplained_px(look.residuals, len(motion.std_px))
+    left_px = unexplained_px(look.residuals, len(look.motion.std_px))
     motion = replace(look.motion, std_px=np.hypot(bounded_std_px(look.motion.std_px, look.residuals), left_px))
     return Explained(motion, look.panorama, look.residuals, look.ratio, tuple(refinements))
 

@@ -8,7 +8,7 @@ from scipy.ndimage import minimum_filter1d
 
 from photonpano.geometry import corners
 from photonpano.residuals.measure import Residuals
-from photonpano.values import FloatArray
+from photonpano.values import BoolArray, FloatArray
 
 SYSTEMATIC_PX = 0.015
 """Error of measured shifts where frames and panorama are interpolated at different fractions of a pixel."""
@@ -18,6 +18,8 @@ _LOCAL_SPANS = 33
 """The size is averaged over this many spans."""
 _SIGNIFICANT = 3.0
 """Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations."""
+_MISFIT = 3.0
+"""A span also stands out if the mean squared residual / variance of its blocks exceeds this."""
 _STANDS_OUT = 30.0
 """A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
 200,000 spans."""
@@ -93,6 +95,14 @@ def bounded_std_px(std_px: FloatArray, residuals: Residuals) -> FloatArray:
     reach = max(1, int(residuals.frames_seen / 4))
     surest = minimum_filter1d(std_px**2 + measured, 2 * reach + 1, mode="nearest")
     return np.asarray(np.minimum(std_px, np.where(np.isfinite(std_px), np.sqrt(surest + measured), np.inf)))
+
+
+def standing_out(residuals: Residuals) -> BoolArray:
+    """Return which spans show a step, or a misfit, that noise does not explain: (S,)."""
+    steps, variances = _series(residuals)
+    with np.errstate(invalid="ignore"):
+        excess = np.nansum(np.where(np.isfinite(variances), steps**2 / variances, 0), axis=1)
+    return np.asarray((excess > _STANDS_OUT) | (residuals.misfit > _MISFIT))
 
 
 def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:

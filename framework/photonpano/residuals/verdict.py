@@ -10,6 +10,7 @@ import numpy as np
 
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
+from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX, GXY, GY_R, GYY, M, R, V
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals
@@ -107,6 +108,7 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
         lambda: _contradictions(levels),
         lambda: _ambiguous(levels),
         lambda: _standing(decisions),
+        lambda: _jump_in_the_dark(decisions),
     ]
     reasons = tuple(reason for test in tests if (reason := test()) is not None)
     ratio = explained.ratio if np.isfinite(explained.ratio) else None
@@ -336,6 +338,19 @@ def _standing(decisions: Sequence[Decision]) -> Reason | None:
         MAX_STANDING,
         "share of the parts that show motion or rest",
         "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+    )
+
+
+def _jump_in_the_dark(decisions: Sequence[Decision]) -> Reason | None:
+    found = [str(each.value) for each in decisions if each.what == DARK_JUMP]
+    if not found:
+        return None
+    return Reason(
+        "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
+        len(found),
+        0,
+        ", ".join(found),
+        "leave these frames out, or keep the light on",
     )
 
 

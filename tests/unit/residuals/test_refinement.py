@@ -14,7 +14,7 @@ from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, inverse, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.run_json import refinement_record, refinement_warnings
-from photonpano.residuals.refinement import Explained, NamedRefiner, refine
+from photonpano.residuals.refinement import Explained, Look, NamedRefiner, refine
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
 
@@ -57,7 +57,8 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
         )
         component = answer if isinstance(answer, Answering) else Answering(answer)
         named = NamedRefiner("odd", component, "refiner 'odd' of toys 1.0")
-        return refine(source, motion, [named], 0.25, 2**30, Context())
+        rendering = 0.25, 2**30, Context()
+        return refine(source, Look(source, motion, *rendering), [named], *rendering)
 
     return run
 

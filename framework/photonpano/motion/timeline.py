@@ -1,0 +1,177 @@
+"""When the frames of a capture were taken: repeated frames, and places where the motion is cut because frames are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photonpano.protocols import Trajectory
+from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
+
+CUT, DARK_JUMP, REPEATED = "cut", "jump_in_the_dark", "repeated_frames"
+"""What a record names the decisions to cut the motion, at a frame or among dark ones, and not to move in repeated frames."""
+_SHORTEST_PART = 4
+"""Frames of the shortest part of a group that is kept beside a cut."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cut:
+    """A place where the image jumps from one frame to the next.
+
+    Attributes:
+        frame: the first frame after the jump.
+        shift_px: (2,) by how much more than before and after it the image moves there, x and y in px of a frame.
+        sigmas: its size in standard deviations of what the image does nearby.
+        dark: frames around it that show nothing, so that the jump may lie anywhere among them; None where all have light.
+    """
+
+    frame: int
+    shift_px: FloatArray
+    sigmas: float
+    dark: FrameSpan | None = None
+
+    @property
+    def size_px(self) -> float:
+        """Length of the shift, in px."""
+        return float(np.linalg.norm(self.shift_px))
+
+    @property
+    def decision(self) -> Decision:
+        """What was found, for the record."""
+        jump = f"the image jumps by {self.size_px:.2g} px ({self.sigmas:.0f} standard deviations)"
+        if self.dark is not None:
+            reason = f"{jump} while they show nothing; the interpolation is cut in the middle, at frame {self.frame}"
+            return Decision(DARK_JUMP, str(self.dark), reason)
+        reason = f"{jump} from the frame before to this one, as where frames are missing or doubled"
+        return Decision(CUT, self.frame, f"{reason}; the interpolation is cut there")
+
+    @property
+    def bounds(self) -> tuple[int, ...]:
+        """Frames at which groups are divided."""
+        return (self.frame,) if self.dark is None else (self.dark.start, self.frame, self.dark.stop)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timeline:
+    """What the numbers of the frames do not tell of time.
+
+    Attributes:
+        taken: (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated.
+        cuts: where the image jumps, in order.
+    """
+
+    taken: FloatArray
+    cuts: tuple[Cut, ...] = ()
+
+    @classmethod
+    def regular(cls, n_frames: int) -> Timeline:
+        """Return that of a capture without missing or repeated frames."""
+        return cls(np.arange(n_frames, dtype=np.float64))
+
+    @classmethod
+    def with_repeats(cls, repeated: BoolArray) -> Timeline:
+        """Return that of a capture without missing frames.
+
+        Args:
+            repeated: (T,), True for frames that are copies of the frame before.
+        """
+        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0)
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """What is known of missing and repeated frames, for the record."""
+        repeated = int(len(self.taken) - 1 - self.taken[-1])
+        found = [Decision(REPEATED, repeated, "copies of the frame before; the motion stands still there")]
+        return (found if repeated else []) + [cut.decision for cut in self.cuts]
+
+    def cut_at(self, cuts: Sequence[Cut]) -> Timeline:
+        """Return this timeline with other cuts."""
+        return replace(self, cuts=tuple(cuts))
+
+    def parts(self, groups: Sequence[Group]) -> tuple[Group, ...]:
+        """Divide groups at the cuts and the frames without light; leave out those that consist mostly of repeated frames.
+
+        Parts shorter than 4 frames are left out, and those that were taken at the same time as another one.
+        """
+        found: dict[float, Group] = {}
+        for group in groups:
+            for span in self._divided(group.span):
+                whole = span == group.span
+                if not whole and (len(span) < _SHORTEST_PART or self._is_dark(span)):
+                    continue
+                if 2 * (self.taken[span.stop - 1] - self.taken[span.start] + 1) < len(span):
+                    continue
+                part = group if whole else Group(span, span.centre)
+                found.setdefault(float(self.times(part.reference)), part)
+        return tuple(found[time] for time in sorted(found)) or tuple(groups)
+
+    def fit(self, interpolate: Callable[[slice, FloatArray], Trajectory], instants: FloatArray) -> Trajectory:
+        """Interpolate each piece between two cuts by itself.
+
+        Args:
+            interpolate: fits some of the knots, given their times.
+            instants: (N,) of the knots, in frames.
+        """
+        pieces, times = self.knot_pieces(instants), self.times(instants)
+        # A piece without a knot goes on as the nearest one.
+        known = [number for number, piece in enumerate(pieces) if piece.start < piece.stop]
+        fitted = {number: interpolate(pieces[number], times[pieces[number]]) for number in known}
+        nearest = [min(known, key=lambda each: abs(each - number)) for number in range(len(pieces))]
+        return PiecewiseTrajectory(self, [fitted[number] for number in nearest])
+
+    def shift_between(self, earlier: float, later: float) -> FloatArray:
+        """Return how far the image jumps between two instants: (2,) in px."""
+        shifts = [cut.shift_px for cut in self.cuts if earlier < cut.frame - 0.5 <= later]
+        return np.sum(shifts, axis=0) if shifts else np.zeros(2)
+
+    def unknown_px(self, instants: FloatArray) -> FloatArray:
+        """Return by how far N instants may lie on the other side of a jump in the dark, in px: (N,)."""
+        unknown = np.zeros(len(instants))
+        for cut in self.cuts:
+            if cut.dark is not None:
+                unknown[(cut.dark.start <= instants) & (instants < cut.dark.stop)] = cut.size_px
+        return unknown
+
+    def piece_of(self, instants: ArrayLike) -> NDArray[np.integer]:
+        """Return the number of the piece that each of N instants, in frames, lies in: (N,), 0 before the first cut."""
+        return np.searchsorted([cut.frame - 0.5 for cut in self.cuts], instants, side="right")
+
+    def knot_pieces(self, instants: FloatArray) -> list[slice]:
+        """Return which of N knots lie in each piece; their instants are in order."""
+        bounds = np.searchsorted(self.piece_of(instants), np.arange(len(self.cuts) + 2))
+        return [slice(start, stop) for start, stop in pairwise(bounds.tolist())]
+
+    def times(self, instants: ArrayLike) -> FloatArray:
+        """Return when N instants, in frames, were taken, in frame periods: (N,). Beyond the capture, time goes on."""
+        at = np.asarray(instants, dtype=np.float64)
+        last = len(self.taken) - 1
+        return np.asarray(np.interp(at, np.arange(last + 1), self.taken) + np.minimum(at, 0) + np.maximum(at - last, 0))
+
+    def _divided(self, span: FrameSpan) -> list[FrameSpan]:
+        bounds = {bound for cut in self.cuts for bound in cut.bounds if span.start < bound < span.stop}
+        return [FrameSpan(start, stop) for start, stop in pairwise([span.start, *sorted(bounds), span.stop])]
+
+    def _is_dark(self, span: FrameSpan) -> bool:
+        return any(cut.dark is not None and cut.dark.start <= span.start and span.stop <= cut.dark.stop for cut in self.cuts)
+
+
+class PiecewiseTrajectory:
+    """A trajectory that jumps at the cuts of a timeline, and stands still where frames are repeated."""
+
+    def __init__(self, timeline: Timeline, pieces: Sequence[Trajectory]) -> None:
+        """Take a trajectory for each piece of the timeline."""
+        self._timeline, self._pieces = timeline, pieces
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants: (N, 3, 3)."""
+        instants = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
+        piece_of, times = self._timeline.piece_of(instants), self._timeline.times(instants)
+        found = np.empty((len(instants), 3, 3))
+        for number in np.unique(piece_of):
+            here = piece_of == number
+            found[here] = self._pieces[number].at(times[here])
+        return found

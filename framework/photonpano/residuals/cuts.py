@@ -1,0 +1,301 @@
+"""Find where the image jumps from one frame to the next, as it does where frames are missing or sent twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+
+from photonpano.context import Context
+from photonpano.geometry import corner_displacements, inverse
+from photonpano.locating import shift_by_phase
+from photonpano.merging import binned_mean, binning_of
+from photonpano.motion.timeline import Cut
+from photonpano.protocols import Source
+from photonpano.residuals.refinement import Look
+from photonpano.residuals.unexplained import standing_out
+from photonpano.threads import in_order
+from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
+
+_MARGIN = 20
+"""Sums on both sides of spans that stand out, in which a jump is searched for."""
+_TRACK_NOISE_PX, _TRACK_RATIO = 0.25, 10.0
+"""Short sums of frames are so long that their shifts have about this noise. It is about 10 times that of a shift against the
+panorama, which has less noise than a sum."""
+_SHORTEST, _LONGEST, _MOTION_PX = 4, 64, 4.0
+"""Fewest and most frames of a sum, and how far the image may move in it."""
+_PEAK_PX = 1.5
+"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_SMALLEST_PX, _OUTLIER = 1.0, 4.5
+"""A shift is an outlier beyond this size, and this many times the median of the others around it."""
+_LOCAL = 24
+"""Sums on either side whose shifts it is compared with."""
+_FEWEST = 6
+"""Fewer sums are not tracked."""
+_DARK = 0.2
+"""Sums, and frames, with less than this share of the usual light show nothing."""
+_TEMPLATE = 4
+"""Sums before and after a jump that make the templates, with which the frames between are compared."""
+_STEPS = 8
+"""A jump is divided into eighths, to compare it with a fast motion."""
+_SHORT_RAMP, _RAMPS = 4, (8, 16, 32, 64, 128)
+"""Lengths, in frames, of the fast motions that a jump is compared with."""
+_SURE = 5.0
+"""Standard deviations by which a jump must be likelier than motions of 8 frames and more. One of 4 must not be likelier."""
+_NOISE_FLOOR = 1e-4
+"""Least variance of a binned pixel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Track:
+    """Sums of successive frames with light, and the shifts of the image between them.
+
+    Attributes:
+        spans: (N,) of the sums, in order.
+        images: (N,) mean counts, binned.
+        next_px: (N - 1, 2) shifts from each to the next, in binned px.
+        second_px: (N - 2, 2) shifts from each to the second next.
+    """
+
+    spans: Sequence[FrameSpan]
+    images: Sequence[FluxImage]
+    next_px: FloatArray
+    second_px: FloatArray
+
+    @property
+    def centres(self) -> FloatArray:
+        """(N,) instants, in frames."""
+        return np.array([span.centre for span in self.spans])
+
+    def velocity(self, first: int, last: int) -> FloatArray:
+        """Return the mean velocity of the image from one sum to another: (2,) in binned px per frame."""
+        frames = self.spans[last].centre - self.spans[first].centre
+        return np.asarray(self.next_px[first:last].sum(axis=0) / frames)
+
+
+@dataclass(frozen=True, slots=True)
+class _Outlier:
+    """A shift between two sums that the motion before and after does not explain.
+
+    Attributes:
+        before: number of the sum before.
+        after: number of the sum after.
+        shift_px: (2,) what is not explained, in binned px.
+        sigmas: its size in standard deviations.
+    """
+
+    before: int
+    after: int
+    shift_px: FloatArray
+    sigmas: float
+
+
+def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
+    """Find the places where the image jumps.
+
+    Places come into question where spans stand out from the motion. There, sums of a few frames are tracked by phase
+    correlation, from frames alone. Where a shift is an outlier, each frame is compared with templates from before and after,
+    and a jump at each frame with fast motions: see `_located`.
+
+    Args:
+        source: the capture.
+        look: the result of the loop, and what it does not explain.
+        context: threads and progress.
+    """
+    size = _size_of_sums(look)
+    suspect = _suspect(look, _MARGIN * size)
+    if not suspect:
+        return ()
+    found: list[Cut] = []
+    with context.progress.stage("cuts", sum(map(len, suspect)), "frames") as advance:
+        for span in suspect:
+            found += _cuts_in(source, span, size, context.threads)
+            advance(len(span))
+    return tuple(found)
+
+
+def _suspect(look: Look, margin: int) -> list[FrameSpan]:
+    """Return the frames up to `margin` frames from spans that stand out."""
+    spans, flags = look.residuals.spans, np.zeros(len(look.motion.located), dtype=bool)
+    for index in np.flatnonzero(standing_out(look.residuals)):
+        flags[max(0, spans[index].start - margin) : spans[index].stop + margin] = True
+    return true_spans(flags & look.motion.located)
+
+
+def _size_of_sums(look: Look) -> int:
+    residuals, homographies = look.residuals, look.motion.homographies[look.motion.located]
+    moved = corner_displacements(inverse(homographies[:-1]) @ homographies[1:], np.eye(3), residuals.frame_shape)
+    per_frame = residuals.normal[:, [0, 1], [0, 1]].mean(axis=1) / [len(span) for span in residuals.spans]
+    noise_px = _TRACK_RATIO / np.sqrt(max(float(np.median(per_frame)), 1e-9))
+    wanted = min((noise_px / _TRACK_NOISE_PX) ** 2, _MOTION_PX / max(float(np.median(moved)), 1e-9))
+    return int(np.clip(np.ceil(wanted), _SHORTEST, _LONGEST))
+
+
+def _cuts_in(source: Source, span: FrameSpan, size: int, threads: int) -> Iterator[Cut]:
+    """Yield the cuts in some frames, tracked by sums of `size` frames."""
+    sums = [each for each in span.blocks(size) if len(each) == size]
+    track = _tracked(sums, list(in_order(partial(binned_mean, source), sums, threads)))
+    if track is None:
+        return
+    for outlier in _outliers(track, size, _SMALLEST_PX / binning_of(source)):
+        between = FrameSpan(track.spans[outlier.before].start, track.spans[outlier.after].stop)
+        dark = _dark_frames(source, between) if len(between) > 3.5 * size else None
+        if dark is not None:
+            shift_px = outlier.shift_px * binning_of(source)
+            yield Cut((dark.start + dark.stop) // 2, shift_px, outlier.sigmas, dark)
+        elif (cut := _located(source, track, outlier)) is not None:
+            yield cut
+
+
+def _tracked(spans: Sequence[FrameSpan], images: Sequence[FluxImage]) -> _Track | None:
+    """Track the sums that show something; None if they are too few."""
+    light = np.array([float(np.nanmean(image)) for image in images])
+    lit = [index for index, each in enumerate(light) if each > _DARK * np.median(light)]
+    if len(lit) < _FEWEST:
+        return None
+    spans, images = [spans[index] for index in lit], [np.nan_to_num(images[index], nan=light[index]) for index in lit]
+    window = cv2.createHanningWindow(images[0].shape[::-1], cv2.CV_32F)
+    flat = [window * (image - image.mean()) for image in images]
+
+    def shifts(skip: int) -> FloatArray:
+        # An image without texture does not shift.
+        found = [
+            shift_by_phase(before, after, _PEAK_PX, gaussian_peak=False)
+            for before, after in zip(flat[:-skip], flat[skip:], strict=True)
+        ]
+        return np.array([np.zeros(2) if shift is None else shift for shift in found])
+
+    return _Track(spans, images, shifts(1), shifts(2))
+
+
+def _outliers(track: _Track, size: int, smallest: float) -> list[_Outlier]:
+    """Return the shifts that are outliers, each the largest around it.
+
+    The frame of a jump lies in some sum, so that the shift from the sum before to that after is compared with the motion before
+    and after. A shift between the two is that of a turn. Where sums without light lie between, the next sum is the one after.
+    """
+    pairs, unexplained, sizes = [], [], []
+    centres = track.centres
+    for before in range(1, len(centres) - 3):
+        gap = centres[before + 1] - centres[before] > 1.5 * size
+        after = before + 1 if gap else before + 2
+        if after + 1 >= len(centres) or (not gap and centres[after] - centres[before] > 2.5 * size):
+            continue
+        frames = centres[after] - centres[before]
+        found = track.next_px[before] if gap else track.second_px[before]
+        left, right = track.velocity(before - 1, before) * frames, track.velocity(after, after + 1) * frames
+        pairs.append((before, after))
+        unexplained.append(_beyond(found, left, right))
+        # Over a longer time, the motion may change by more.
+        sizes.append(float(np.linalg.norm(unexplained[-1])) * min(1.0, 2 * size / frames))
+    outliers = []
+    for index, (before, after) in enumerate(pairs):
+        around = np.r_[sizes[max(0, index - _LOCAL) : max(0, index - 3)], sizes[index + 4 : index + _LOCAL + 1]]
+        near = sizes[max(0, index - 3) : index + 4]
+        usual = max(float(np.median(around)), smallest / _OUTLIER) if len(around) >= _FEWEST else np.inf
+        if sizes[index] == max(near) and sizes[index] > _OUTLIER * usual:
+            outliers.append(_Outlier(before, after, unexplained[index], float(sizes[index] / usual)))
+    return outliers
+
+
+def _beyond(found: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
+    """Return the vector to a point from the nearest one between two others: (2,)."""
+    way = last - first
+    share = np.clip((found - first) @ way / max(float(way @ way), 1e-12), 0, 1)
+    return np.asarray(found - (first + share * way))
+
+
+def _dark_frames(source: Source, span: FrameSpan) -> FrameSpan | None:
+    """Return the frames without light in a span; None if there are none."""
+    light = np.array(
+        [float(np.nanmean(binned_mean(source, FrameSpan(frame, frame + 1)))) for frame in range(span.start, span.stop)]
+    )
+    runs = true_spans(light <= _DARK * np.quantile(light, 0.9))
+    if not runs:
+        return None
+    longest = max(runs, key=len)
+    return FrameSpan(span.start + longest.start, span.start + longest.stop)
+
+
+def _located(source: Source, track: _Track, outlier: _Outlier) -> Cut | None:
+    """Find the first frame after a jump; None if a fast motion explains the frames as well.
+
+    The log likelihood of each frame is that of its residual from the template before the jump, moved on, or from that after,
+    moved back; and of positions between. A jump takes the image from the one to the other at once, a fast motion in some
+    frames.
+    """
+    first, last = track.spans[outlier.before].start, track.spans[outlier.after].stop
+    before = range(max(0, outlier.before - _TEMPLATE), outlier.before)
+    after = range(outlier.after + 1, min(len(track.spans), outlier.after + 1 + _TEMPLATE))
+    onwards, back = track.velocity(before[0], outlier.before), track.velocity(outlier.after, after[-1])
+    sides = [_template(track, before, onwards, first - 0.5), _template(track, after, back, last - 0.5)]
+    whole = shift_by_phase(_windowed(sides[0]), _windowed(sides[1]), _PEAK_PX, gaussian_peak=False)
+    if whole is None:
+        return None
+    frames = np.arange(first, last)
+    # Where the image is, relative to the template before: moved on by the old motion, or back by the new one.
+    old, new = (frames - (first - 0.5))[:, None] * onwards, whole - ((last - 0.5) - frames)[:, None] * back
+    likelihood = np.empty((len(frames), _STEPS + 1))
+    for row, frame in enumerate(frames):
+        image = binned_mean(source, FrameSpan(int(frame), int(frame) + 1))
+        expected = []
+        for share in np.linspace(0, 1, _STEPS + 1):
+            place = (1 - share) * old[row] + share * new[row]
+            expected.append(_moved(sides[0], place) if share < 0.5 else _moved(sides[1], place - whole))
+        likelihood[row] = _log_likelihoods(image, np.array(expected), binning_of(source) ** 2)
+    jumps = _likelihoods_of(likelihood, 0)
+    at = min(int(np.argmax(jumps)), len(frames) - 1)
+    short, *motions = (float(_likelihoods_of(likelihood, ramp).max()) for ramp in (_SHORT_RAMP, *_RAMPS))
+    sigmas = np.sqrt(2 * max(float(jumps[at]) - max(motions), 0.0))
+    cut = Cut(int(first + at), (new[at] - old[at]) * binning_of(source), float(sigmas))
+    return None if sigmas < _SURE or short > jumps[at] or cut.size_px < _SMALLEST_PX else cut
+
+
+def _template(track: _Track, numbers: Sequence[int], velocity: FloatArray, instant: float) -> FluxImage:
+    """Average sums of a track, moved to an instant: (h, w); NaN beyond their borders."""
+    moved = [_moved(track.images[number], velocity * (instant - track.spans[number].centre)) for number in numbers]
+    mean = np.mean(moved, axis=0)
+    return np.asarray(cv2.GaussianBlur(mean, (0, 0), 0.7), np.float32)
+
+
+def _moved(image: FluxImage, shift: FloatArray) -> FluxImage:
+    """Return an image moved by (x, y) binned px; NaN where nothing is known."""
+    matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
+    border = cv2.BORDER_CONSTANT
+    size, nothing = image.shape[::-1], float("nan")
+    return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=border, borderValue=nothing))
+
+
+def _windowed(image: FluxImage) -> FluxImage:
+    filled = np.nan_to_num(image, nan=float(np.nanmean(image)))
+    return np.asarray(cv2.createHanningWindow(image.shape[::-1], cv2.CV_32F) * (filled - filled.mean()), np.float32)
+
+
+def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> FloatArray:
+    """Return the log likelihoods of a frame, up to a constant, for each of P expectations: (P,).
+
+    Args:
+        image: (h, w) mean counts, binned.
+        expected: (P, h, w), NaN where nothing is known.
+        n_pixels: pixels of a binned one.
+    """
+    seen = np.isfinite(expected).all(axis=0) & np.isfinite(image)
+    variance = np.maximum(expected[:, seen].mean(axis=0), _NOISE_FLOOR) / n_pixels
+    return np.asarray(-0.5 * ((image[seen] - expected[:, seen]) ** 2 / variance).sum(axis=1))
+
+
+def _likelihoods_of(likelihood: FloatArray, ramp: int) -> FloatArray:
+    """Return the log likelihood of motions that take `ramp` frames from the old path to the new one, for each middle: (M,).
+
+    Args:
+        likelihood: (T, steps + 1) log likelihood of each frame, from the old path to the new one.
+        ramp: 0 for a jump, whose middle m is its first frame.
+    """
+    n_frames, steps = likelihood.shape[0], likelihood.shape[1] - 1
+    frames, middles = np.arange(n_frames), np.arange(n_frames + 1)
+    passed = frames + 0.5 - middles[:, None]
+    share = (passed > 0).astype(float) if ramp == 0 else np.clip(passed / ramp + 0.5, 0, 1)
+    return np.asarray(likelihood[frames, np.rint(share * steps).astype(int)].sum(axis=1))

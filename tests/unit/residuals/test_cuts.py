@@ -1,0 +1,93 @@
+"""Jumps of the image are found to the frame; tremor, turns and noise are not taken for jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan
+from photonpano.context import Context
+from photonpano.geometry import FrameTrajectory, translation
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.timeline import Cut
+from photonpano.residuals.cuts import find_cuts
+from photonpano.residuals.refinement import Look
+from photonpano.testing import MemorySource
+
+SHAPE, N_FRAMES, JUMP = (96, 128), 600, 330
+
+
+@pytest.fixture
+def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
+    """Look for cuts in frames of a street, given the true motion along x, in px by frame, and what the loop made of it."""
+
+    def cuts_of(true_px: np.ndarray, found_px: np.ndarray, flux: float = 1.0, dark: FrameSpan | None = None) -> tuple[Cut, ...]:
+        rng, size = np.random.default_rng(3), SHAPE[::-1]
+        lit = np.full(N_FRAMES, flux)
+        if dark is not None:
+            lit[dark.start : dark.stop] = 0
+        views = [cv2.warpAffine(street, np.float64([[1, 0, -250 - x], [0, 1, -300]]), size) for x in true_px]
+        source = MemorySource([rng.random(SHAPE) < -np.expm1(-light * view) for light, view in zip(lit, views, strict=True)])
+        homographies = np.array([translation(x, 0) for x in found_px])
+        everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
+        trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
+        motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
+        return find_cuts(source, Look(source, motion, 0.25, 2**30, Context()), Context(2))
+
+    return cuts_of
+
+
+FRAMES = np.arange(N_FRAMES)
+PAN_PX = 0.15 * FRAMES
+AFTER = (FRAMES >= JUMP).astype(float)
+
+
+def smoothed(motion_px: np.ndarray) -> np.ndarray:
+    """Return what interpolation makes of a jump: half of a group of 60 frames on both sides is wrong."""
+    kernel = np.hanning(60)
+    return np.convolve(np.pad(motion_px, 60, mode="reflect", reflect_type="odd"), kernel / kernel.sum(), "same")[60:-60]
+
+
+@pytest.mark.parametrize("jump_px", [-7.0, 3.0, 30.0])
+def test_jump_is_found_to_the_frame_with_its_size(cuts_of: Callable[..., tuple[Cut, ...]], jump_px: float) -> None:
+    true_px = PAN_PX + jump_px * AFTER
+    [cut] = cuts_of(true_px, smoothed(true_px))
+    assert cut.frame == JUMP
+    # The camera moves on, so the image moves back.
+    np.testing.assert_allclose(cut.shift_px, [-jump_px, 0], atol=0.5)
+    assert cut.sigmas > 10
+    assert cut.dark is None
+
+
+def test_jump_is_found_in_dim_light(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    true_px = PAN_PX + 6 * AFTER
+    [cut] = cuts_of(true_px, smoothed(true_px), flux=0.1)
+    assert abs(cut.frame - JUMP) <= 1
+
+
+@pytest.mark.parametrize("period", [40, 76, 160])
+def test_tremor_that_the_loop_missed_is_no_jump(cuts_of: Callable[..., tuple[Cut, ...]], period: int) -> None:
+    assert cuts_of(PAN_PX + 1.5 * np.sin(2 * np.pi * FRAMES / period), PAN_PX) == ()
+
+
+def test_sudden_turn_is_no_jump(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    true_px = 0.4 * np.abs(FRAMES - JUMP)
+    assert cuts_of(true_px, smoothed(true_px)) == ()
+
+
+def test_motion_that_explains_the_photons_is_not_searched(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    assert cuts_of(PAN_PX, PAN_PX) == ()
+
+
+def test_jump_behind_dark_frames_is_cut_in_their_middle(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    true_px, dark = PAN_PX + 40 * AFTER, FrameSpan(300, 350)
+    [cut] = cuts_of(true_px, smoothed(true_px), dark=dark)
+    assert (cut.frame, cut.dark) == (325, dark)
+    np.testing.assert_allclose(cut.shift_px, [-40, 0], atol=1.5)
+
+
+def test_dark_frames_without_jump_are_not_cut(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    assert cuts_of(PAN_PX, PAN_PX, dark=FrameSpan(300, 350)) == ()
