@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from photonpano.geometry import (
     apply,
@@ -36,6 +36,8 @@ OUTLIER = 8.0
 """An edge whose residual exceeds this many scales is an outlier."""
 MEDIAN_NORM = 0.958
 """The median of the root mean square of eight Gaussian numbers of unit variance."""
+_DAMPING, _TINY = 1e-10, 1e-200
+"""Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by."""
 SAMPLES = 64
 """Solutions drawn to estimate the expected error of each node, to a few per cent."""
 
@@ -124,7 +126,7 @@ class Adjustment:
         blocks = np.stack([normal[8 * node : 8 * node + 8, 8 * node : 8 * node + 8].toarray() for node in nodes])
         draws = np.random.default_rng(0).normal(size=(jacobians.shape[0], SAMPLES))
         changes = np.zeros((8 * self._n_nodes, SAMPLES))
-        changes[free] = _solved(normal[free][:, free], (jacobians.T @ draws)[free])
+        changes[free] = _solved(normal[free][:, free], (jacobians.T @ draws)[free], draws=True)
         return self._in_parameters(homographies, blocks), self._corner_std_px(homographies, changes)
 
     def _stepped(
@@ -213,12 +215,46 @@ class Adjustment:
         return sparse.csr_array((entries.ravel(), columns.ravel(), starts), shape=shape), residuals.ravel()
 
 
-def _solved(normal: sparse.csr_array, right: FloatArray) -> FloatArray:
-    """Solve a positive definite system; the symmetric ordering keeps the factors of a graph with loop closures sparse."""
-    factors = splu(
+def _solved(normal: sparse.csr_array, right: FloatArray, draws: bool = False) -> FloatArray:
+    """Solve a positive semidefinite system; the symmetric ordering keeps the factors of a graph with loop closures sparse.
+
+    Unknowns that nothing determines stay where they are: a singular system is damped.
+
+    Args:
+        normal: (N, N).
+        right: (N,) or (N, S).
+        draws: whether the right sides are drawn with `normal` as their covariance; unknowns that nothing determines then get
+            draws as wide as the damping.
+    """
+    with suppress(RuntimeError), np.errstate(all="ignore"):
+        solution = _factorised(normal).solve(right)
+        if np.isfinite(solution).all():
+            return np.asarray(solution)
+    diagonal = normal.diagonal()
+    damping = _DAMPING * np.maximum(diagonal, _DAMPING * diagonal.max(initial=_TINY))
+    if draws:
+        right = right + np.sqrt(damping)[:, None] * np.random.default_rng(1).normal(size=right.shape)
+    return np.asarray(_factorised(normal + sparse.diags_array(damping)).solve(right))
+
+
+def _factorised(normal: sparse.csr_array) -> SuperLU:
+    return splu(
         normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
     )
-    return np.asarray(factors.solve(right))
+
+
+def _roots(information: FloatArray) -> FloatArray:
+    """Return maps from errors of p1..p8 to errors of unit variance, (E, 8, 8): roots R of the information R' R.
+
+    In units of the standard deviations of each parameter, rounding errors are small; nearly singular information, which still
+    is not positive definite, has its smallest eigenvalues raised.
+    """
+    try:
+        return np.asarray(np.linalg.cholesky(information).transpose(0, 2, 1))
+    except np.linalg.LinAlgError:
+        units = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), _TINY))
+        values, vectors = np.linalg.eigh(information / (units[:, :, None] * units[:, None, :]))
+        return np.asarray(np.sqrt(np.maximum(values, _DAMPING))[..., None] * vectors.transpose(0, 2, 1) * units[:, None, :])
 
 
 def _whitening(motions: Sequence[Located], rows: FloatArray) -> FloatArray:
@@ -235,5 +271,5 @@ def _whitening(motions: Sequence[Located], rows: FloatArray) -> FloatArray:
         mapped = np.array([motions[index].homography for index in informed]) @ rows
         changes = (from_parameters(np.eye(8)) - np.eye(3)) @ rows
         to_corners = slopes(mapped, np.broadcast_to(changes, (len(informed), *changes.shape)))
-        whitening[informed] = np.linalg.cholesky(information).transpose(0, 2, 1) @ np.linalg.inv(to_corners)
+        whitening[informed] = _roots(information) @ np.linalg.inv(to_corners)
     return whitening

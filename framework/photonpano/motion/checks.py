@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import islice, pairwise
 from numbers import Real
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photonpano.errors import PluginError
-from photonpano.geometry import apply, corner_displacements, corners
+from photonpano.geometry import apply, corner_displacements, corners, jacobian
 from photonpano.motion.attribution import BrokenContract, shown
 from photonpano.motion.level import FrameHomography, Level
 from photonpano.protocols import Trajectory
@@ -22,10 +23,16 @@ STILL_SHARE = 0.1
 For less it may be right: the motion of the first level is off by a few pixels, and some locators return whole pixels."""
 STILL_PX, MOVING_PX = 1e-3, 2.0
 """Pairs that move the corners by less are nearly the identity; an image that moves by this much between exposures moves."""
+UNDETERMINED = 10.0
+"""A pair whose motion has an expected error of this many sides of a frame ties nothing."""
 KNOT_PX, KNOT_STDS = 1.0, 10.0
 """A trajectory may miss its knots by this many pixels, or this many of their expected errors."""
 _LARGEST = 1e9
 """Numbers of a homography from this on are no motion of a camera, and overflow in later steps."""
+_SAFE = 0.01
+"""A margin of the bound on errors that the smallest pivot gives."""
+_SMALLEST = 1e-100
+"""A floor on eigenvalues."""
 _ASYMMETRY = 1e-3
 """Information may be asymmetric by this share, because of rounding."""
 
@@ -84,6 +91,33 @@ def require_valid(motion: object) -> Located | NotLocated:
     return motion
 
 
+def why_undetermined(motion: Located, frame_shape: tuple[int, int]) -> str | None:
+    """Return why the images of a pair do not determine its motion, as those of stripes that move along themselves.
+
+    Args:
+        motion: in px of a frame.
+        frame_shape: (height, width) of a frame.
+
+    Returns:
+        A clause if the expected error of a corner exceeds `UNDETERMINED` times the longer side of a frame.
+    """
+    worst_px, limit_px = motion.residual_px or 0.0, UNDETERMINED * max(frame_shape)
+    if motion.information is not None:
+        units, scaled = _scaled(motion.information)
+        with suppress(np.linalg.LinAlgError):
+            # The smallest pivot bounds the errors well enough for all but a few pairs.
+            side, pivot = max(frame_shape), np.diagonal(np.linalg.cholesky(scaled)).min()
+            if (np.array([*4 * [side], 1, 1, side**2, side**2]) / units).sum() < _SAFE * pivot * limit_px:
+                return None
+        to_corners = jacobian(motion.homography, corners(frame_shape)).reshape(8, 8)
+        values, vectors = np.linalg.eigh(scaled)
+        errors = (to_corners / units) @ (vectors / np.sqrt(np.maximum(values, _SMALLEST)))
+        worst_px = float(np.sqrt((errors**2).sum(axis=1).max()))
+    if worst_px <= limit_px:
+        return None
+    return f"the images do not determine the motion: its expected error is {worst_px:.2g} px at a corner"
+
+
 def require_no_standstill(motion: Located, expected: FrameHomography | None, frame_shape: tuple[int, int]) -> None:
     """Refuse the identity, or nearly the identity, as the motion of a pair if the motion known so far is far from it.
 
@@ -95,7 +129,7 @@ def require_no_standstill(motion: Located, expected: FrameHomography | None, fra
     Raises:
         BrokenContract: the locator returned the identity instead of a failure.
     """
-    if expected is None or corner_displacements(motion.homography, np.eye(3), frame_shape).mean() > STILL_PX:
+    if expected is None or np.abs(motion.homography - np.eye(3)).max() > STILL_PX:
         return
     expected_px = corner_displacements(expected, np.eye(3), frame_shape).mean()
     if expected_px >= STILL_SHARE * min(frame_shape):
@@ -248,13 +282,17 @@ def _is_identity(homography: Homography) -> bool:
 def _is_inverse_covariance(matrix: object) -> bool:
     if not isinstance(matrix, np.ndarray) or matrix.dtype.kind not in "fiu" or matrix.shape != (8, 8):
         return False
-    diagonal = np.diagonal(matrix)
-    if not np.isfinite(matrix).all() or diagonal.min() <= 0:
+    if not np.isfinite(matrix).all() or np.diagonal(matrix).min() <= 0:
         return False
-    # The parameters have units of their own: in those of their standard deviations, asymmetry is a share.
-    scaled = matrix / np.sqrt(np.outer(diagonal, diagonal))
+    _, scaled = _scaled(matrix)
     try:
         np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
         return False
     return bool(np.abs(scaled - scaled.T).max() < _ASYMMETRY)
+
+
+def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the square roots of the diagonal, (8,), and the information in units of them: (8, 8) with ones on its diagonal."""
+    units = np.sqrt(np.diagonal(information))
+    return units, information / (units[:, None] * units)

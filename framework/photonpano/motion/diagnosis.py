@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import LocationError
+from photonpano.geometry import corners
+from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import signal_to_noise
 from photonpano.text import listed
 from photonpano.values import BoolArray, Edge, FrameSpan, Group, NotLocated, VirtualExposure, true_spans
@@ -19,6 +22,8 @@ TOLERATED_RUN = 2
 _NOISY, _CLEAR = 0.25, 2.0
 """Below the first signal-to-noise ratio the likely cause is darkness, above the second it is blur, in between either. Lack of
 texture may be the cause at any ratio."""
+_FAR = 1e9
+"""Numbers of a homography from this on map a frame to infinity."""
 _SHOWN = 6
 """Most pairs, spans or parts that a message lists."""
 
@@ -102,6 +107,52 @@ def require_tied(
             "To go on with the largest part alone, set graph.disconnected to largest.",
         ]
     raise LocationError("\n".join(lines))
+
+
+@contextmanager
+def solving(level: int) -> Iterator[None]:
+    """Solve the motion graph in the block; what cannot be computed there is an error of the pairs.
+
+    Args:
+        level: from 1.
+
+    Raises:
+        LocationError: a homography cannot be inverted, or is not finite.
+    """
+    try:
+        yield
+    except (np.linalg.LinAlgError, ValueError, RuntimeError) as error:
+        raise LocationError(
+            f"level {level}: the located pairs contradict each other so much that no homographies fit them ({error}); try "
+            "other groups, or another locator"
+        ) from error
+
+
+def require_in_front(
+    level: int, groups: Sequence[Group], solution: GraphSolution, frame_shape: tuple[int, int], cause: BaseException
+) -> None:
+    """Refuse a level where exposures reach the horizon of the plane that they are located in.
+
+    Args:
+        level: from 1.
+        groups: the groups of the level.
+        solution: the homography of each exposure.
+        frame_shape: (height, width) of a frame.
+        cause: what went wrong because of it.
+
+    Raises:
+        LocationError: names the frames.
+    """
+    points = corners(frame_shape)
+    with np.errstate(all="ignore"):
+        depths = solution.homographies[:, 2:, :2] @ points.T + solution.homographies[:, 2:, 2:]
+        beyond = solution.located & ~((depths > 0).all(axis=(1, 2)) & (np.abs(solution.homographies) < _FAR).all(axis=(1, 2)))
+    if runs := _runs(groups, beyond):
+        lost = [_frames(run) for run in runs[:_SHOWN]]
+        raise LocationError(
+            f"level {level}: {listed(lost)} reach the horizon of the plane that all exposures are located in: pairs are wrong "
+            "(try other groups or another locator), or the camera turns too far for one plane"
+        ) from cause
 
 
 def _tied_together(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from photonpano.context import Context
 from photonpano.motion.checks import require_motion
 from photonpano.motion.closures import closure_candidates
-from photonpano.motion.diagnosis import require_tied
+from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import instants_of, pairs_of
@@ -95,7 +95,7 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
         require_motion(level, edges, shape, partial(_seen_px, exposures, edges, pool))
-        with exposures.clock("locate"):
+        with exposures.clock("locate"), solving(level.number):
             labels = components(len(groups), edges)
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
             largest = np.flatnonzero(labels == 0)
@@ -106,7 +106,7 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
         revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
         closures = tuple(registrar.closures(candidates, solution.homographies, pool, revisits))
     log.finish()
-    with exposures.clock("locate"):
+    with exposures.clock("locate"), solving(level.number):
         if closures:
             alone, solution = solution, solve(len(groups), edges + closures, anchor, shape, start)
             fair = _not_outvoting(closures, edges, alone, solution)

@@ -11,6 +11,7 @@ from photonpano.context import Context
 from photonpano.geometry import inverse, normalised
 from photonpano.motion.attribution import AttributedTrajectory
 from photonpano.motion.checks import require_groups, require_knots_kept
+from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
@@ -116,13 +117,18 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
 
     Raises:
+        LocationError: the interpolator failed because exposures reach the horizon of the plane.
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
 
     def fitted(knots: slice, times: FloatArray) -> Trajectory:
         homographies = located.homographies[knots]
         information = None if located.information is None else located.information[knots].copy()
-        found = level.interpolator.fit(times, homographies, information)
+        try:
+            found = level.interpolator.fit(times, homographies, information)
+        except Exception as error:
+            require_in_front(level.number, located.groups, located.solution, located.frame_shape, error)
+            raise
         free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
         require_knots_kept(free, times, homographies, located.std_px[knots], located.frame_shape)
         return free

@@ -12,7 +12,7 @@ from typing import Any
 
 from photonpano.context import Log
 from photonpano.geometry import inverse, why_implausible
-from photonpano.motion.checks import require_no_standstill, require_valid
+from photonpano.motion.checks import require_no_standstill, require_valid, why_undetermined
 from photonpano.motion.closures import MIN_SIMILARITY, exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import FrameHomography, NamedLocator
@@ -335,7 +335,7 @@ class Registrar:
                     return motion
                 require_no_standstill(motion, expected, shape)
             motion = level.in_frame_px(motion)
-            if reason := why_implausible(motion.homography, shape):
+            if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
                 return NotLocated(reason, motion.evidence)
             if motion.information is None:
                 return motion

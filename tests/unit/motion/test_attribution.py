@@ -112,3 +112,48 @@ def test_attributed_trajectory_names_interpolator_on_exception_or_broken_contrac
     with pytest.raises(PluginError) as caught:
         AttributedTrajectory(Odd(), "interpolator 'toy' of toys 1.0", 2).at([3, 7.5])
     assert str(caught.value) == f"interpolator 'toy' of toys 1.0 {problem}"
+
+
+@pytest.mark.parametrize("method", ["counts", "frames", "packed"])
+def test_array_that_changes_after_it_was_returned_is_refused(source: Any, method: str) -> None:
+    source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
+    buffer, read = np.zeros(10_000, np.uint8), getattr(source, method)
+
+    def reusing(span: FrameSpan) -> np.ndarray:
+        found = read(span).astype(np.uint8)
+        buffer[: found.size] = found.ravel()
+        return buffer[: found.size].reshape(found.shape)
+
+    setattr(source, method, reusing)
+    with pytest.raises(PluginError) as caught:
+        getattr(attributed(source, ORIGIN), method)(SPAN)
+    assert str(caught.value) == (
+        f"{ORIGIN} broke its contract at frames 2 to 4: the array that {method}() returned changed when other frames were read; "
+        "return a new array"
+    )
+
+
+def test_corrected_sums_and_truth_are_checked(source: Any) -> None:
+    source.corrected = lambda counts, n_frames: counts
+    source.truth = lambda: [1]
+    named = attributed(source, ORIGIN)
+    with pytest.raises(PluginError) as caught:
+        named.corrected(source.counts(SPAN), 3)
+    assert str(caught.value) == (
+        f"{ORIGIN} broke its contract at correcting: corrected() returns (4, 6) of float32, got (4, 6) of uint32"
+    )
+    with pytest.raises(PluginError) as caught:
+        named.truth()
+    assert (
+        str(caught.value) == f"{ORIGIN} broke its contract at truth(): truth() returns a mapping of arrays by name, got a list"
+    )
+
+
+def test_values_of_later_reads_are_checked_now_and_then(source: Any) -> None:
+    named, good = attributed(source, ORIGIN), source.counts(SPAN)
+    for _ in range(20):
+        named.counts(SPAN)
+    source.counts = lambda _: good + np.uint32(9)
+    with pytest.raises(PluginError, match=r"counts\(\) returns numbers from 0 to 3 for these frames, got 1"):
+        for _ in range(32):
+            named.counts(SPAN)

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photonpano import FrameSpan, Group, Located, LocationError, NotLocated, VirtualExposure
-from photonpano.motion.diagnosis import Contrast, contrast_of, require_tied
+from photonpano.motion.diagnosis import Contrast, contrast_of, require_in_front, require_tied, solving
+from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import BinaryResponse
 from photonpano.values import Edge
 
@@ -173,3 +174,28 @@ def test_refusal_offers_no_largest_part_if_no_pair_is_located() -> None:
         lines = refusal(tuple(range(1, N)), disconnected=disconnected).splitlines()
         assert lines[0] == "level 2: none of the 9 pairs of exposures could be located"
         assert lines[-1].endswith("or the scene has no texture there.")
+
+
+def test_exposures_beyond_the_horizon_are_named() -> None:
+    groups = [Group(FrameSpan(10 * index, 10 * index + 10), 10 * index) for index in range(6)]
+    homographies = np.array([np.eye(3)] * 6)
+    homographies[3:5, 2, 0] = -0.1
+    homographies[0] = np.nan
+    solution = GraphSolution(homographies, np.arange(6) > 0, (), 0.0, lambda: (np.empty(0), np.empty(0)))
+    with pytest.raises(LocationError) as caught:
+        require_in_front(2, groups, solution, (40, 60), ValueError("no root"))
+    assert str(caught.value) == (
+        "level 2: frames 30 to 49 reach the horizon of the plane that all exposures are located in: pairs are wrong (try other "
+        "groups or another locator), or the camera turns too far for one plane"
+    )
+    homographies[3:5] = np.eye(3)
+    require_in_front(2, groups, solution, (40, 60), ValueError("no root"))
+
+
+def test_graph_that_cannot_be_solved_is_a_location_error() -> None:
+    with pytest.raises(LocationError) as caught, solving(1):
+        np.linalg.inv(np.zeros((3, 3)))
+    assert str(caught.value) == (
+        "level 1: the located pairs contradict each other so much that no homographies fit them (Singular matrix); try other "
+        "groups, or another locator"
+    )

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import Group, Located, NotLocated, PluginError
-from photonpano.geometry import rescaled, translation
-from photonpano.motion.checks import require_valid
+from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
+from photonpano.geometry import jacobian, rescaled, translation
+from photonpano.motion.attribution import BrokenContract
+from photonpano.motion.checks import require_knots_kept, require_valid, why_undetermined
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -115,3 +116,81 @@ def test_identity_is_refused_if_the_motion_known_so_far_is_large(
         "locator 'toy' of toys 1.0 broke its contract at level 1: got the identity where the motion known so far moves the "
         "corners by 6 px; a failure is NotLocated"
     )
+
+
+def informed(along_px: float, across_px: float) -> Located:
+    """A shift whose expected errors along x and y differ."""
+    std = np.array([1e-3, 1e-3, 1e-3, 1e-3, along_px, across_px, 1e-6, 1e-6])
+    return Located(translation(3, 1), np.diag(std**-2.0))
+
+
+def test_motion_that_the_images_do_not_determine_is_told() -> None:
+    """The limit is ten times the longer side of a frame."""
+    assert why_undetermined(informed(0.1, 100.0), (40, 60)) is None
+    assert why_undetermined(informed(0.1, 590.0), (40, 60)) is None
+    assert why_undetermined(informed(0.1, 1e4), (40, 60)) == (
+        "the images do not determine the motion: its expected error is 1e+04 px at a corner"
+    )
+    assert why_undetermined(Located(translation(3, 1), residual_px=5e6), (40, 60)) == (
+        "the images do not determine the motion: its expected error is 5e+06 px at a corner"
+    )
+    assert why_undetermined(Located(translation(3, 1)), (40, 60)) is None
+
+
+def test_correlated_errors_of_small_size_are_determined() -> None:
+    """In pixels from the corner, the parameters of a motion of the middle are strongly correlated."""
+    points = np.array([[0, 0], [1e4, 0], [1e4, 1e4], [0, 1e4]], dtype=float)
+    to_points = jacobian(np.eye(3), points).reshape(8, 8)
+    assert why_undetermined(Located(np.eye(3), to_points.T @ to_points / 0.1**2), (40, 60)) is None
+
+
+def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make_level: Callable, pan: Callable) -> None:
+    """Along the stripes, every shift fits."""
+
+    def along_stripes(moving: Group, fixed: Group, found: Located) -> Located:
+        return replace(found, information=informed(0.1, 1e7).information)
+
+    with pytest.raises(LocationError) as caught:
+        run(make_level(pan(0.3), along_stripes))
+    assert str(caught.value).startswith(
+        "level 1: none of the 30 pairs of exposures could be located\n"
+        "  frames 10 to 19 onto frames 0 to 9: the images do not determine the motion: its expected error is 1e+07 px at a "
+        "corner\n"
+    )
+
+
+KNOTS = np.array([translation(5.0 * index, 0) for index in range(9)])
+
+
+def knots_kept(trajectory: Trajectory, std_px: float = 0.05) -> None:
+    require_knots_kept(trajectory, np.arange(0, 90, 10.0), KNOTS, np.full(9, std_px), (40, 60))
+
+
+def test_trajectory_may_smooth_its_knots_and_miss_outliers(known_motion: type) -> None:
+    def smoothed(frame: float) -> np.ndarray:
+        return translation(0.5 * frame + 0.9 * np.sin(frame) + 300 * (frame > 55), 0)
+
+    knots_kept(known_motion(smoothed))
+    knots_kept(known_motion(lambda frame: translation(0.5 * frame + 15, 0)), std_px=2.0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "problem"),
+    [
+        (
+            lambda frame: translation(0.5 * frame + 15, 0),
+            "the trajectory misses half of its knots by 15 px or more, where their expected error is 0.05 px",
+        ),
+        (
+            lambda frame: translation(0.5 * frame, 40 * (frame % 10 > 0)),
+            "the trajectory passes its knots, but half-way between them it is typically 35 px further away than the next knot",
+        ),
+    ],
+    ids=["beside", "between"],
+)
+def test_trajectory_that_has_nothing_to_do_with_its_knots_is_refused(
+    known_motion: type, motion: Callable[[float], np.ndarray], problem: str
+) -> None:
+    with pytest.raises(BrokenContract) as caught:
+        knots_kept(known_motion(motion))
+    assert str(caught.value) == problem

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import Homography, Located, NotLocated
+from photonpano import Homography, Located, NotLocated, PluginError
 from photonpano.geometry import translation
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.specs.settings import GraphSettings
@@ -98,3 +99,12 @@ def test_pair_that_does_not_overlap_by_the_motion_known_so_far_is_not_registered
     assert len(made.locators[0].component.initials) == 11
     reasons = {edge.motion.reason for edge in found.failures}
     assert reasons == {"by the motion known so far, the images overlap by 0% (at least 10% is needed)"}
+
+
+@pytest.mark.parametrize("hypothesis", ["left", np.eye(2), translation(np.nan, 0)], ids=["text", "shape", "NaN"])
+def test_hypotheses_that_are_no_homographies_are_refused(run: Callable, level: Callable, hypothesis: Any) -> None:
+    """Also if they have no end."""
+    made = level(2.0)
+    made.locators[0].component.hypotheses = lambda *_: repeat(hypothesis)
+    with pytest.raises(PluginError, match=r"^locator 'toy' of toys 1\.0 broke its contract at level 1: a homography is a "):
+        run(made, graph=GraphSettings())
