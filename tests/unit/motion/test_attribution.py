@@ -128,13 +128,13 @@ def test_array_that_changes_after_it_was_returned_is_refused(source: Any, method
     with pytest.raises(PluginError) as caught:
         getattr(attributed(source, ORIGIN), method)(SPAN)
     assert str(caught.value) == (
-        f"{ORIGIN} broke its contract at frames 2 to 4: the array that {method}() returned changed when other frames were read; "
-        "return a new array"
+        f"{ORIGIN} broke its contract at frames 2 to 4: "
+        f"the array that {method}() returned changed when other frames were read; return a new array"
     )
 
 
 def test_corrected_sums_and_truth_are_checked(source: Any) -> None:
-    source.corrected = lambda counts, n_frames: counts
+    source.corrected = lambda counts, _: counts
     source.truth = lambda: [1]
     named = attributed(source, ORIGIN)
     with pytest.raises(PluginError) as caught:
@@ -155,5 +155,4 @@ def test_values_of_later_reads_are_checked_now_and_then(source: Any) -> None:
         named.counts(SPAN)
     source.counts = lambda _: good + np.uint32(9)
     with pytest.raises(PluginError, match=r"counts\(\) returns numbers from 0 to 3 for these frames, got 1"):
-        for _ in range(32):
-            named.counts(SPAN)
+        [named.counts(SPAN) for _ in range(32)]
