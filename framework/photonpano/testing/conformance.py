@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import subprocess
 import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, ClassVar
 
@@ -15,7 +17,10 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from photonpano.contributions import Contribution, install_command
+from photonpano.errors import PluginError
+from photonpano.motion.attribution import BrokenContract
 from photonpano.registry import KINDS
+from photonpano.registry.plugins import contributions_of
 
 HEAVY = frozenset(
     {
@@ -72,7 +77,7 @@ class Conformance:
     """
 
     kind: ClassVar[str]
-    methods: ClassVar[tuple[str, ...]]
+    attributes: ClassVar[tuple[str, ...]] = ()
 
     contribution: Contribution
     config: Mapping[str, Any] = {}
@@ -158,9 +163,16 @@ class Conformance:
             "that `build` imports"
         )
 
+    def test_hooks_of_module_can_be_called(self) -> None:
+        """A plugin whose hooks raise, or do not end, offers nothing."""
+        name = self.hook_module or self.contribution.build.__module__
+        module = sys.modules.get(name) or importlib.import_module(name)
+        with passing(f"the hooks of {name}"):
+            contributions_of(module)
+
     def require_methods(self, component: object) -> None:
         """Require the methods of the kind."""
-        missing = [name for name in self.methods if not hasattr(component, name)]
+        missing = [name for name in (*KINDS[self.kind].methods, *self.attributes) if not hasattr(component, name)]
         assert not missing, f"build() must return a {self.kind}; {type(component).__name__} has no {' and no '.join(missing)}"
 
 
@@ -170,6 +182,15 @@ def must_not_raise(what: str, work: Callable[..., Any], *arguments: Any) -> Any:
         return work(*arguments)
     except Exception as error:
         raise AssertionError(f"{what} must not raise; it raised {type(error).__name__}: {error}") from error
+
+
+@contextmanager
+def passing(what: str) -> Iterator[None]:
+    """Fail with a message if a check of a run, called in the block, refuses what a component returned."""
+    try:
+        yield
+    except (BrokenContract, PluginError) as error:
+        raise AssertionError(f"a run refuses {what}: {error}") from error
 
 
 def models_in(config: type[BaseModel]) -> list[type[BaseModel]]:

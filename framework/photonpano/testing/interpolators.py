@@ -9,9 +9,10 @@ import pytest
 
 from photonpano.contributions import InterpolatorContribution
 from photonpano.geometry import corner_displacements, from_parameters, translation
+from photonpano.motion.checks import require_knots_kept
 from photonpano.protocols import Trajectory
 from photonpano.testing.captures import read_only
-from photonpano.testing.conformance import must_not_raise
+from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, in_threads
 from photonpano.testing.stages import STREAM, StageConformance, accepts_read_only
 from photonpano.values import FloatArray
@@ -42,7 +43,6 @@ class InterpolatorConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "interpolator"
-    methods: ClassVar[tuple[str, ...]] = ("fit",)
 
     contribution: InterpolatorContribution
     tolerance_px: float = 1e-3
@@ -123,6 +123,13 @@ class InterpolatorConformance(StageConformance):
             f"a camera that moves evenly must be followed within tolerance_px = {self.tolerance_px:g}; with {n_knots} knots, "
             f"at instant {frames[errors.argmax()]:g} the trajectory is {worst:.3g} px off"
         )
+
+    @pytest.mark.parametrize("n_knots", [1, 2, 3, len(INSTANTS)])
+    def test_trajectory_passes_the_checks_of_a_run(self, n_knots: int) -> None:
+        """A run refuses a trajectory that has nothing to do with its knots, whatever it smooths."""
+        with passing(f"the trajectory of {n_knots} knots"):
+            std_px = np.full(n_knots, 0.2)
+            require_knots_kept(self.fitted(n_knots), INSTANTS[:n_knots], shaken_knots()[:n_knots], std_px, STREAM.frame_shape)
 
     def test_fit_leaves_inputs_unchanged(self) -> None:
         """The framework uses the knots again, for the report."""

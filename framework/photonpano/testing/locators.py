@@ -13,8 +13,9 @@ import pytest
 
 from photonpano.contributions import LocatorContribution
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.motion.checks import require_valid
 from photonpano.testing.captures import photographed, read_only
-from photonpano.testing.conformance import must_not_raise
+from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, accepts_read_only
@@ -60,7 +61,6 @@ class LocatorConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "locator"
-    methods: ClassVar[tuple[str, ...]] = ("describe", "register")
 
     contribution: LocatorContribution
     tolerance_px: float = 0.5
@@ -215,6 +215,14 @@ class LocatorConformance(StageConformance):
             f"{_PAIRS} pairs the corner error is {actual_px:.3g} px, and it predicts {expected_px:.3g} px "
             f"(they may differ by a factor of {self.information_factor:g})"
         )
+
+    def test_answers_pass_the_checks_of_a_run(self) -> None:
+        """A run refuses matrices, residuals, information and evidence that are no finite real numbers."""
+        found: dict[str, Any] = {f"the {motion}": self.located(motion, self._start(motion)) for motion in self.motions}
+        found["flat images"] = self.registered(_blank("flat", self.shape, 1), _blank("flat", self.shape, 2))
+        for what, answer in found.items():
+            with passing(f"the answer for {what}"):
+                require_valid(answer)
 
     def test_residual_and_evidence_are_finite(self) -> None:
         """They are written to `run.json` and to messages."""

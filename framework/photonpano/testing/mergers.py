@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from photonpano.contributions import MergerContribution
 from photonpano.errors import InputError
 from photonpano.geometry import translation
+from photonpano.motion.checks import require_exposure
 from photonpano.protocols import Merger, Source, Trajectory
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
+from photonpano.testing.conformance import passing
 from photonpano.testing.sameness import fingerprint, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, accepts_read_only
@@ -48,7 +50,6 @@ class MergerConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "merger"
-    methods: ClassVar[tuple[str, ...]] = ("merge",)
 
     contribution: MergerContribution
     tolerance_px: float = 0.1
@@ -97,6 +98,12 @@ class MergerConformance(StageConformance):
             assert named == (GROUP, scale, source.response), (
                 f"an exposure must have the given group and scale, and the response of the source; got {named}"
             )
+
+    def test_exposures_pass_the_checks_of_a_run(self) -> None:
+        """A run refuses an exposure of another group, scale or shape, and one whose flux and weight do not go together."""
+        for where, exposure, scale in self._cases():
+            with passing(f"the exposure with {where}"):
+                require_exposure(exposure, GROUP, scale, SHAPE)
 
     def test_flux_is_nan_exactly_where_weight_is_0(self) -> None:
         """Unknown pixels are NaN with weight 0; all others are finite and not negative."""

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from photonpano.contributions import RefinerContribution
 from photonpano.geometry import corner_displacements, translation
 from photonpano.protocols import Source, Trajectory
+from photonpano.residuals.refinement import require_refined
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, read_only, recorded
-from photonpano.testing.conformance import must_not_raise
+from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import fingerprint
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, accepts_read_only
@@ -111,7 +112,6 @@ class RefinerConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "refiner"
-    methods: ClassVar[tuple[str, ...]] = ("refine",)
 
     contribution: RefinerContribution
 
@@ -139,6 +139,14 @@ class RefinerConformance(StageConformance):
         h33 = homographies[:, 2, 2]
         worst = h33[np.abs(h33 - 1).argmax()]
         assert abs(worst - 1) < 1e-9, f"homographies must have h33 = 1; one has {worst:.6g}: divide by it"
+
+    @pytest.mark.parametrize("tremor_px", [0.0, TREMOR_PX])
+    def test_refined_motion_passes_the_checks_of_a_run(self, tremor_px: float) -> None:
+        """A run refuses arrays of other types, and homographies that cannot be inverted."""
+        given = case(tremor_px)
+        if (found := self.refined(given)) is not None:
+            with passing("the refined motion"):
+                require_refined(found, given.std_px)
 
     @pytest.mark.parametrize("tremor_px", [0.0, TREMOR_PX])
     def test_expected_errors_are_kept_infinite_where_nothing_was_located(self, tremor_px: float) -> None:

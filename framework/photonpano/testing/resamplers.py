@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 
 from photonpano.contributions import ResamplerContribution
 from photonpano.errors import InputError
+from photonpano.motion.checks import require_groups
+from photonpano.testing.conformance import passing
 from photonpano.testing.stages import STREAM, StageConformance
 from photonpano.values import Group
 
@@ -27,7 +29,6 @@ class ResamplerConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "resampler"
-    methods: ClassVar[tuple[str, ...]] = ("groups",)
 
     contribution: ResamplerContribution
 
@@ -49,6 +50,13 @@ class ResamplerConformance(StageConformance):
             assert groups, f"groups() returned no group at {where}; raise an InputError if a capture is too short"
             strangers = {type(group).__name__ for group in groups if not isinstance(group, Group)}
             assert not strangers, f"groups() must return Group objects; at {where} it returned {', '.join(strangers)}"
+
+    def test_groups_pass_the_checks_of_a_run(self) -> None:
+        """A run refuses groups without end, without order, or outside of the capture."""
+        for n_frames in LONG:
+            for level in LEVELS:
+                with passing(f"the groups of level {level} of {n_frames} frames"):
+                    require_groups(self.groups(n_frames, level), n_frames)
 
     def test_groups_are_ordered_by_reference(self) -> None:
         """Interpolators need increasing instants."""

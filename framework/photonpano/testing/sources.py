@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from photonpano.contributions import SourceContext, SourceContribution
 from photonpano.errors import InputError
+from photonpano.motion.attributed_source import attributed
 from photonpano.protocols import PackedSource, Source
-from photonpano.testing.conformance import Conformance, must_not_raise
+from photonpano.testing.conformance import Conformance, must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
 from photonpano.values import FrameSpan, StreamInfo
 
@@ -34,7 +35,7 @@ class SourceConformance(Conformance):
     """
 
     kind: ClassVar[str] = "source"
-    methods: ClassVar[tuple[str, ...]] = ("info", "response", "valid", "counts", "frames", "close", "__enter__", "__exit__")
+    attributes: ClassVar[tuple[str, ...]] = ("info", "response", "valid", "__enter__", "__exit__")
 
     contribution: SourceContribution
     frame_shape: tuple[int, int] = (18, 27)
@@ -101,6 +102,14 @@ class SourceConformance(Conformance):
             assert mask.dtype == np.bool_, f"valid must be bool, got {mask.dtype}"
             some = bool(mask.any())
             assert some, "valid is false everywhere; it must be true for usable pixels"
+
+    def test_source_passes_the_checks_of_a_run(self) -> None:
+        """A run refuses properties of other types, numbers that frames cannot have, and arrays that change later."""
+        with self.opened() as source, passing("the source"):
+            named = attributed(source, "it")
+            for span in _spans(source):
+                named.counts(span)
+                named.frames(span)
 
     def test_counts_are_uint32_of_frame_shape(self) -> None:
         """Sums of many frames fit and can be added without a cast."""

@@ -110,6 +110,18 @@ BROKEN = [
         "'3 frames'.* must not raise; it raised Valid",
     ),
     (
+        "test_hooks_of_module_can_be_called",
+        All,
+        {"hook_module": "hooks_without_end"},
+        "a run refuses the hooks of hooks_without_end: photonpano_sources offers more than 1000 components; does it end?",
+    ),
+    (
+        "test_hooks_of_module_can_be_called",
+        All,
+        {"hook_module": "hooks_that_exit"},
+        "a run refuses the hooks of hooks_that_exit: photonpano_sources raised SystemExit: 0",
+    ),
+    (
         "test_hook_module_imports_no_heavy_library",
         All,
         {"hook_module": "hooks_with_scipy"},
@@ -153,6 +165,9 @@ BROKEN = [
 @pytest.fixture(autouse=True)
 def hook_modules(tmp_path, monkeypatch):
     (tmp_path / "hooks_with_scipy.py").write_text("import scipy\n")
+    for name, work in (("without_end", "return repeat(None)"), ("that_exit", "raise SystemExit(0)")):
+        code = f"from itertools import repeat\nfrom photonpano import hookimpl\n@hookimpl\ndef photonpano_sources(): {work}\n"
+        (tmp_path / f"hooks_{name}.py").write_text(code)
     (tmp_path / "hooks_with_wave.py").write_text("import wave\n")
     monkeypatch.syspath_prepend(tmp_path)
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photonpano.geometry import from_parameters, inverse, parameters
+from photonpano.geometry import from_parameters, inverse, parameters, translation
 from photonpano.testing import InterpolatorConformance
 from photonpano.testing.conformance import Conformance
 from photonpano.testing.stages import StageConformance
@@ -86,6 +86,19 @@ class Nearest(Straight):
         return from_parameters(self.p[distances.argmin(axis=1)])
 
 
+class LosesItsKnots(Straight):
+    """Stands still."""
+
+    def at(self, frame_indices):
+        return super().at(np.asarray(frame_indices, dtype=float) * 0)
+
+
+class StraysBetween(Straight):
+    def at(self, frame_indices):
+        off = ~np.isin(np.asarray(frame_indices), self.instants)
+        return super().at(frame_indices) @ [translation(90 * each, 0) for each in off]
+
+
 class WritesToKnots(Honest):
     def fit(self, instants, homographies, information):
         instants -= 1e-6
@@ -110,6 +123,16 @@ def along(trajectory):
 
 
 BROKEN = [
+    (
+        "test_trajectory_passes_the_checks_of_a_run",
+        along(LosesItsKnots),
+        "a run refuses the trajectory of 2 knots: the trajectory misses half of its knots by .* px or more",
+    ),
+    (
+        "test_trajectory_passes_the_checks_of_a_run",
+        along(StraysBetween),
+        "a run refuses the trajectory of 2 knots: the trajectory passes its knots, but half-way between them",
+    ),
     ("test_trajectory_passes_its_knots", NeedsTwoKnots, r"fit\(\) with 1 knots must not raise"),
     (
         "test_trajectory_passes_its_knots",

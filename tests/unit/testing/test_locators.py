@@ -224,6 +224,22 @@ BROKEN = [
         InDoubt,
         "must be positive definite; its smallest eigenvalue is -",
     ),
+    *(
+        (
+            "test_answers_pass_the_checks_of_a_run",
+            type("Broken", (Honest,), {"changed": lambda _, found, wrong=wrong: replace(found, **wrong(found))}),
+            f"a run refuses the answer for the sub-pixel shift: {words}",
+        )
+        for wrong, words in (
+            (lambda _: {"residual_px": -5.0}, "residual_px is a finite number of at least 0"),
+            (lambda _: {"residual_px": "small"}, "residual_px is a finite number of at least 0"),
+            (
+                lambda found: {"homography": found.homography.tolist()},
+                r"a homography is a \(3, 3\) array of float64, got a list",
+            ),
+            (lambda found: {"homography": found.homography + 0j}, r"a homography is a .* got \(3, 3\) of complex128"),
+        )
+    ),
     ("test_residual_and_evidence_are_finite", CountsNothing, "evidence must be finite numbers by name; got {'share': nan}"),
     ("test_description_does_not_hold_exposure", KeepsTheExposure, "VirtualExposure.*, which it returned, refers to its flux"),
     ("test_register_leaves_inputs_unchanged", FillsInPlace, "the locator modifies an exposure"),

@@ -129,6 +129,16 @@ BROKEN = [
         with_homographies(lambda all_: all_[100] @ all_),
         "the reference frame, here 256, must stay the identity; it differs by 8",
     ),
+    (
+        "test_refined_motion_passes_the_checks_of_a_run",
+        with_homographies(lambda all_: all_ + 0j),
+        r"a run refuses the refined motion: homographies are arrays of float64, got \(512, 3, 3\) of complex128",
+    ),
+    (
+        "test_refined_motion_passes_the_checks_of_a_run",
+        with_homographies(lambda all_: all_ * [[1], [0], [1]]),
+        "a run refuses the refined motion: a homography is invertible and has h33 = 1, that of frame 0 is",
+    ),
     ("test_summary_is_one_line", changed(lambda found: replace(found, summary="two\nlines")), "one line .* got 'two.nlines'"),
     ("test_summary_is_one_line", changed(lambda found: replace(found, summary="")), "one line .* got ''"),
     ("test_summary_is_one_line", changed(lambda found: replace(found, summary=None)), "must be text, got a NoneType"),

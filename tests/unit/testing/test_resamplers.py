@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+from itertools import count
 
 import numpy as np
 import pytest
@@ -27,6 +28,11 @@ class Honest:
 class AGenerator(Honest):
     def groups(self, n_frames, level):
         return (group for group in super().groups(n_frames, level))
+
+
+class WithoutEnd(Honest):
+    def groups(self, n_frames, level):
+        return (Group(FrameSpan(start, start + 1), start) for start in count())
 
 
 class Backwards(Honest):
@@ -75,6 +81,11 @@ class NothingForShort(Honest):
 
 
 BROKEN = [
+    (
+        "test_groups_pass_the_checks_of_a_run",
+        WithoutEnd,
+        "a run refuses the groups of level 1 of 2000 frames: the capture has 2000 frames, got 4000 groups or more",
+    ),
     (
         "test_groups_returns_non_empty_tuple",
         AGenerator,

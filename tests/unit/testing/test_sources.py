@@ -44,6 +44,22 @@ class BadPixels(Honest):
         self.valid = ~self.valid
 
 
+class CountsInFloat(Honest):
+    def counts(self, span):
+        return super().counts(span).astype(np.float32)
+
+
+class CountsTooMuch(Honest):
+    def counts(self, span):
+        return super().counts(span) * 2
+
+
+class RateOfText(Honest):
+    def __init__(self, context):
+        super().__init__(context)
+        self.info = replace(self.info, frame_rate_hz="fast")
+
+
 class NarrowCounts(Honest):
     def counts(self, span):
         return super().counts(span).astype(np.uint16)
@@ -159,6 +175,14 @@ def written(self, frames, folder):
 
 
 BROKEN = [
+    ("test_source_passes_the_checks_of_a_run", RateOfText, "a run refuses the source: .*info.frame_rate_hz is a finite", {}),
+    (
+        "test_source_passes_the_checks_of_a_run",
+        CountsInFloat,
+        r"a run refuses the source: it broke its contract at frames 0 to 0: counts\(\) returns an array of whole numbers",
+        {},
+    ),
+    ("test_source_passes_the_checks_of_a_run", CountsTooMuch, r"counts\(\) returns numbers from 0 to 1 for these frames", {}),
     ("test_source_has_required_attributes", HasNoMask, "HasNoMask has no valid", {}),
     ("test_info_agrees_with_frames", PromisesMore, r"gives the shape \(5, 18, 32\) .* returns \(5, 18, 27\)", {}),
     ("test_info_agrees_with_frames", NotBinary, "gives binary frames of 1 bits, so at most 1; frames.. returns a 3", {}),
