@@ -10,12 +10,19 @@ import numpy as np
 
 from photonpano import Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import translation
-from photonpano.locating import ALL_PARAMETERS, NOTHING_SEEN, correlation_peaks, correlation_surface, free_parameters
+from photonpano.locating import (
+    ALL_PARAMETERS,
+    NOTHING_SEEN,
+    Follows,
+    correlation_peaks,
+    correlation_surface,
+    free_parameters,
+)
 from photonpano.photometry import Similarity
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.layers import Layer
-from photonpano_direct.majority import JUDGED, Follows, follows, masked, shifts_between
+from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
 from photonpano_direct.pyramid import Pyramid, pyramid_of
 from photonpano_direct.similarity import similarity_under
 from photonpano_direct.small_matrices import rescaled
@@ -30,6 +37,8 @@ _RIVAL = 0.7
 """Peaks of at least this share of the highest one are hypotheses, too."""
 _RESTRICTED = 2
 """A motion that is tried is aligned twice, each time where the last one fits."""
+_TRUST = 3.0
+"""The part that follows the motion known so far counts three times: many pairs have gone into that motion."""
 _BLUR_DIFFERENCE = 0.1
 """Largest residual that different motion blur explains, as a fraction of the contrast. In much light this is many times the
 photon noise."""
@@ -85,7 +94,7 @@ class DirectLocator:
         start = np.array(initial, dtype=np.float64)
         judged = min(JUDGED, n_layers - 1)
         coarse = self._descend(moving, fixed, start, start, range(judged, n_layers))
-        moving, coarse = self._of_majority(moving, fixed, coarse, judged, searches)
+        moving, coarse = self._of_majority(moving, fixed, coarse, start, judged, searches)
         fine = self._descend(moving, fixed, coarse.homography, start, range(judged))
         found = [*coarse.found, *fine.found]
         # The failure of a coarse layer does not count: the next one starts where it started.
@@ -128,7 +137,7 @@ class DirectLocator:
         return _Descent(homography, found, failure)
 
     def _of_majority(
-        self, moving: Pyramid, fixed: Pyramid, first: _Descent, judged: int, searches: bool
+        self, moving: Pyramid, fixed: Pyramid, first: _Descent, start: Homography, judged: int, searches: bool
     ) -> tuple[Pyramid, _Descent]:
         """Restrict an alignment to the larger part that follows one motion, if the images do not follow it as a whole.
 
@@ -138,13 +147,14 @@ class DirectLocator:
             moving: the template.
             fixed: the other image.
             first: the alignment of the coarse layers, down to the layer `judged`.
+            start: where it started; an object that stands out may have drawn it away from there.
             judged: number of the layer on which parts are compared.
             searches: whether other motions are tried.
         """
         n_layers = len(moving.layers)
 
         def part_of(homography: Homography) -> Follows:
-            return follows(moving.layers[judged], fixed.layers[judged], rescaled(homography, 0.5**judged))
+            return part_following(moving.layers[judged], fixed.layers[judged], rescaled(homography, 0.5**judged))
 
         def aligned(kept: Pyramid, motion: Homography) -> _Descent:
             return self._descend(kept, fixed, motion, motion, range(judged, n_layers))
@@ -152,14 +162,24 @@ class DirectLocator:
         part, motion = part_of(first.homography), first.homography
         if not part.suspect:
             return moving, first
-        for shift in shifts_between(moving.layers[-1], fixed.layers[-1]) if searches else ():
-            other = rescaled(shift, 2.0 ** (n_layers - 1))
+        if searches:
+            shifts = shifts_between(moving.layers[-1], fixed.layers[-1])
+            others = [(rescaled(shift, 2.0 ** (n_layers - 1)), 1.0) for shift in shifts]
+        else:
+            others = [(start, _TRUST)]
+        for other, trust in others:
             for _ in range(_RESTRICTED):
-                other = aligned(masked(moving, part_of(other).rather_than(part)), other).homography
-            if (larger := part_of(other)).more_than(part):
+                follower = part_of(other)
+                mask = (follower.part | follower.rather_than(part)) & ~part.rather_than(follower)
+                other = aligned(masked(moving, mask), other).homography
+            if (larger := part_of(other)).more_than(part, trust):
                 part, motion = larger, other
-        moving = masked(moving, part.part)
-        return moving, aligned(moving, motion)
+        for _ in range(_RESTRICTED):
+            restricted = masked(moving, part.inner)
+            found = aligned(restricted, motion)
+            motion = found.homography
+            part = part_of(motion)
+        return restricted, found
 
     def _judged(
         self, homography: Homography, quality: Quality, scale: float, similarity: Similarity, contrast: float

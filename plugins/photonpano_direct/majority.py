@@ -1,13 +1,14 @@
-"""Find the part of an image that follows a motion; objects that move by themselves do not follow that of the camera."""
+"""Restrict an alignment to the part of an image that follows one motion: that of the camera, and not that of an object."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from photonpano.geometry import translation
+from photonpano.locating import Follows, follows
 from photonpano_direct.alignment import buffers_of
 from photonpano_direct.moments import residuals_and_moments
 
@@ -20,19 +21,8 @@ if TYPE_CHECKING:
 
 JUDGED = 1
 """Number of the layer on which parts are compared: coarse, so that neither noise nor a small error of the motion matters."""
-_SIDE_PX = 7
-"""Side of the square in which both images are compared, px of that layer."""
 _DIFFERENT = 0.5
-"""Least variance of the difference of two aligned images, relative to the sum of their variances, where they show different
-things; it is 0 for the same thing and 1 for unrelated ones."""
-_SURE = 4.0
-"""Standard errors by which the variances must exceed those of noise."""
-_ALIKE = 0.25
-"""Largest such difference of a part that is aligned by itself."""
-_SUSPECT = 0.12
-"""Mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less."""
-_CLEARLY = 0.5
-"""A pixel clearly follows the motion that leaves less than half of the difference of another one."""
+"""Largest misfit of a pixel in a search for shifts, relative to its usual one."""
 _SEARCH_PX, _NEAR_PX = 5, 2
 """Side of the squares that are compared in a search for shifts, and the distance of two shifts that are tried, px."""
 _LEAST_SEEN = 0.3
@@ -41,46 +31,7 @@ _TRIED = 3
 """Number of shifts that a search returns."""
 
 
-class Follows(NamedTuple):
-    """What follows a motion.
-
-    Attributes:
-        difference: (H, W) float32, local variance of the difference of the aligned images relative to the sum of their
-            variances, from 0 to 1; NaN where there is too little texture to tell.
-    """
-
-    difference: NDArray[np.float32]
-
-    @property
-    def part(self) -> BoolArray:
-        """(H, W), True where the image follows, and where it has too little texture to tell."""
-        return ~(self.difference > _ALIKE)
-
-    def rather_than(self, other: Follows) -> BoolArray:
-        """(H, W), True where the image clearly follows this motion and not another one."""
-        return np.asarray(self.difference < _CLEARLY * other.difference)
-
-    @property
-    def suspect(self) -> bool:
-        """Whether a part of the image may move otherwise."""
-        textured = self.difference[np.isfinite(self.difference)]
-        return bool(textured.size) and float(np.minimum(textured, _DIFFERENT).mean()) > _SUSPECT
-
-    def more_than(self, other: Follows) -> bool:
-        """Whether the part that clearly follows this motion is larger, and spreads further, than that of another motion.
-
-        The scene surrounds an object, so an area counts by its extent.
-        """
-        return _spread(self.rather_than(other)) > _spread(other.rather_than(self))
-
-
-def _spread(part: BoolArray) -> float:
-    """Return the number of pixels of a part times the standard deviations of their coordinates."""
-    y, x = np.nonzero(part)
-    return float(len(y) * y.std() * x.std()) if len(y) else 0.0
-
-
-def follows(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
+def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
     """Find the part of a template that follows a motion.
 
     Args:
@@ -90,19 +41,10 @@ def follows(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
     """
     buffers = buffers_of(moving)
     residuals_and_moments(moving, fixed, homography, buffers, np.empty((3, 3)), np.empty((3, 3)))
-    seen = (buffers.weight > 0).astype(np.float32)
-    near = _averaged(seen)
     noise_left = 1 / (4 * np.pi * moving.blur_px**2)
-    noise = noise_left * np.divide(seen, buffers.weight, out=np.zeros_like(seen), where=seen > 0)
-    noise = _averaged(np.asarray(noise, np.float32)) / np.maximum(near, np.float32(1e-6))
-    difference, first, second = (
-        _variance(image * seen, near) for image in (buffers.residual, moving.image, moving.image + buffers.residual)
-    )
-    chance = _SURE * np.sqrt(2 / (_SIDE_PX**2 * noise_left)) * noise
-    texture = first + second - noise
-    textured = (near > _DIFFERENT) & (seen > 0) & (texture > chance)
-    relative = np.clip((difference - noise) / np.maximum(texture, np.float32(1e-12)), 0, 1)
-    return Follows(np.where(textured, relative, np.float32(np.nan)))
+    unknown = np.full_like(buffers.weight, np.inf)
+    noise = np.divide(np.float32(noise_left), buffers.weight, out=unknown, where=buffers.weight > 0)
+    return follows(moving.image, moving.image + buffers.residual, noise, noise_left)
 
 
 def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
@@ -153,16 +95,6 @@ def masked(pyramid: Pyramid, part: BoolArray) -> Pyramid:
 
     layers = tuple(layer._replace(weight=limited(layer.weight)) for layer in pyramid.layers)
     return pyramid._replace(layers=layers, details=pyramid.details._replace(weight=limited(pyramid.details.weight)))
-
-
-def _variance(image: NDArray[np.float32], near: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the variance in the square around each pixel; `image` is 0 where nothing is seen."""
-    near = np.maximum(near, np.float32(1e-6))
-    return np.asarray(_averaged(image * image) / near - (_averaged(image) / near) ** 2, np.float32)
-
-
-def _averaged(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    return _blur(image, _SIDE_PX)
 
 
 def _blur(image: NDArray[np.float32], side: int) -> NDArray[np.float32]:

@@ -161,7 +161,7 @@ ROWS: dict[str, Row] = {
     "every tenth frame doubled": Row(PAN, changed({"repeats": [{"at": at} for at in range(5, 2000, 10)]})),
     **{
         f"moving object over {share:.0%}": Row(PAN, partial(moving, share))  # the size comes last
-        for share in (0.3, 0.5, 0.6, 0.7)
+        for share in (0.15, 0.3, 0.5, 0.6, 0.7)
     },
     "object that crosses the frame": Row(PAN, crossing),
     "light that falls to an eighth": Row(PAN, changed({"drift": 0.125})),

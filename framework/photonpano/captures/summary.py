@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.locating import shift_by_phase
+from photonpano.geometry import translation
+from photonpano.locating import Follows, follows, shift_by_phase
 from photonpano.merging import binned_mean, binning_of
 from photonpano.protocols import Source
-from photonpano.values import CaptureSummary, FluxImage, FrameSpan
+from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
 
 _PLACES = 12
 """The speed is measured at 12 places, evenly spaced over the capture."""
@@ -78,27 +80,67 @@ def _measure(source: Source, centre: float, lengths: Sequence[int]) -> tuple[flo
         start = int(np.clip(centre - 1.5 * length, 0, n_frames - 3 * length))
         spans = (FrameSpan(first, first + length) for first in range(start, start + 3 * length, length))
         means = [binned_mean(source, span) for span in spans]
-        shift = _common_shift([_stabilised(source, mean, length) for mean in means])
+        noise = 2 * float(source.response.stabilised_std(float(length * binning**2))) ** 2
+        shift = _majority_shift([_stabilised(source, mean, length) for mean in means], noise)
         if shift is not None:
-            speed = _Speed(shift * binning / length, length)
-            if shift >= _LARGE_SHIFT_PX:
+            speed = _Speed(float(np.linalg.norm(shift)) * binning / length, length)
+            if np.linalg.norm(shift) >= _LARGE_SHIFT_PX:
                 break
     return _mean_flux(source, means, 3 * length), speed
 
 
-def _common_shift(images: Sequence[FluxImage]) -> float | None:
-    """Return the shift from each of three images to the next, in their pixels; None if the shifts do not agree."""
+def _majority_shift(images: Sequence[FluxImage], noise: float) -> FloatArray | None:
+    """Return the shift from each of three images to the next that most of the image follows; None if the shifts do not agree.
+
+    An object with strong contrast has the highest peak of the correlation even if it is small. So where a part of the image
+    does not follow the shift, that part is correlated by itself, and the larger part decides.
+
+    Args:
+        images: on the scale on which noise is uniform.
+        noise: variance of the difference of two of them.
+    """
+    shift = _common_shift(images)
+    if shift is None:
+        return None
+    part = _following(images, shift, noise)
+    if not part.suspect:
+        return shift
+    other = _common_shift(images, part.rest)
+    if other is None or np.linalg.norm(other - shift) < _TOLERANCE_PX:
+        return shift
+    return other if _following(images, other, noise).more_than(part) else shift
+
+
+def _following(images: Sequence[FluxImage], shift: FloatArray, noise: float) -> Follows:
+    """Find the part of the first two of three images that follows a shift."""
+    height, width = images[0].shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    fixed = cv2.warpAffine(images[1], translation(*shift)[:2], (width, height), flags=flags, borderValue=np.nan)
+    seen = np.isfinite(fixed)
+    return follows(images[0], np.nan_to_num(fixed), np.where(seen, np.float32(noise), np.float32(np.inf)))
+
+
+def _common_shift(images: Sequence[FluxImage], weight: NDArray[np.float32] | None = None) -> FloatArray | None:
+    """Return the shift (x, y) from each of three images to the next, in their pixels; None if the shifts do not agree.
+
+    Args:
+        images: of mean 0.
+        weight: (H, W) of their pixels, 1 by default.
+    """
     if not all(np.ptp(image) for image in images):
         return None
     height, width = images[0].shape
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    if weight is not None:
+        window = window * weight
+        images = [image - np.float32(np.average(image, weights=window)) for image in images]
     pairs = ((images[0], images[1]), (images[1], images[2]), (images[0], images[2]))
     first, second, both = (shift_by_phase(a * window, b * window, _PEAK_PX, gaussian_peak=False) for a, b in pairs)
     if first is None or second is None or both is None:
         return None
     if max(np.linalg.norm(second - first), np.linalg.norm(both - first - second)) > _TOLERANCE_PX:
         return None
-    return float(np.linalg.norm(both)) / 2
+    return both / 2
 
 
 def _mean_flux(source: Source, means: Sequence[FluxImage], n_frames: int) -> float:

@@ -18,6 +18,8 @@ from .configs import PyramidConfig as PyramidConfig
 from .fitting import MIN_NOISE_PX as MIN_NOISE_PX
 from .fitting import Fit as Fit
 from .fitting import fit_homography as fit_homography
+from .following import Follows as Follows
+from .following import follows as follows
 from .images import motion_from_images as motion_from_images
 from .phase import correlation_peaks as correlation_peaks
 from .phase import correlation_surface as correlation_surface

@@ -13,6 +13,7 @@ from photonpano.context import Context
 from photonpano.motion.checks import require_motion
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
+from photonpano.motion.fallbacks import checked_fallbacks
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import instants_of, pairs_of
@@ -96,6 +97,7 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
         require_motion(level, edges, shape, partial(_seen_px, exposures, edges, pool))
         with exposures.clock("locate"), solving(level.number):
+            edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane)
             labels = components(len(groups), edges)
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
             largest = np.flatnonzero(labels == 0)

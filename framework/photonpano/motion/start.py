@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from photonpano.geometry import translation
-from photonpano.locating import correlation_peaks, correlation_surface
+from photonpano.locating import Follows, correlation_peaks, correlation_surface, follows
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.pairs import lengths_of
 from photonpano.motion.timeline import Timeline
@@ -33,12 +33,18 @@ _STD_PER_MEDIAN = 1.4826
 """Standard deviation of Gaussian numbers over the median of their magnitudes."""
 _RIVAL = 0.6
 """Peaks of at least this share of the highest one are kept as hypotheses."""
+_LEAST_EXTENT = 0.05
+"""A part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's."""
+_DISTINCT_PX = 4.0
+"""Two motions are told apart if they differ by this many binned pixels over a window."""
 _EXACT_PX = 4.0
 """Spans are doubled until the image moves by this many binned pixels from one to the next, which determines the speed."""
 _TRACKED_PX = 2.0
 """A peak of doubled spans lies within this many binned pixels of twice the shift of single ones."""
 _CONTINUITY_PX = 1.0
 """Standard deviation of the change of a shift, in binned pixels, from one window to the next."""
+_CONTINUITY_SHARE = 0.3
+"""It is at most this share of the difference of two hypotheses: the motions of scene and object go on."""
 _SLOWER = 3.0
 """A motion is taken for granted, and one that is this many times as fast is not considered."""
 _TIE = 4.0
@@ -53,11 +59,19 @@ class Hypotheses:
         velocities: (P, 2) in px of a frame per frame period, likeliest first.
         heights: (P,) of the peaks, as shares of the highest.
         px_per_frame: velocity that moves the image by one binned pixel between spans.
+        suspect: whether a part of the image may move otherwise than the likeliest velocity of its peaks.
     """
 
     velocities: FloatArray
     heights: FloatArray
     px_per_frame: float
+    suspect: bool = False
+
+    @property
+    def apart(self) -> float:
+        """Least difference of two of the velocities; infinite for a single one."""
+        differences = np.linalg.norm(self.velocities[:, None] - self.velocities, axis=-1)
+        return float(differences[differences > 0].min(initial=np.inf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +132,7 @@ def starting_motion(
     length = min(n_frames, max(2 * _SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
     starts = np.rint(np.linspace(0, n_frames - length, max(1, n_frames // length))).astype(int).tolist()
     found = list(pool.map(partial(_hypotheses, source, length), starts))
+    found = list(pool.map(partial(_with_those_near, source, length, starts, found), range(len(starts))))
     known = [(start + (length - 1) / 2, each) for start, each in zip(starts, found, strict=True) if each is not None]
     if not known:
         return None
@@ -125,34 +140,107 @@ def starting_motion(
     return StartingMotion(np.array([instant for instant, _ in known]), velocities, alternatives, 1.5 * length, timeline)
 
 
-def _hypotheses(source: Source, length: int, start: int) -> Hypotheses | None:
-    """Return the velocities that a window may have; None if no peak is significant."""
+def _hypotheses(source: Source, length: int, start: int, offered: Sequence[FloatArray] = ()) -> Hypotheses | None:
+    """Return the velocities that a window may have; None if no peak is significant.
+
+    Where a part of the image does not follow the highest peak, its own velocity is a hypothesis, too. The heights of both are
+    then the extents of these parts, for an object with strong contrast makes the highest peak even if it is small.
+
+    Args:
+        source: the capture.
+        length: frames of a window.
+        start: its first frame.
+        offered: velocities that such a part may have beside its own, in px of a frame per frame period.
+    """
     short = max(_SHORTEST[source.info.kind], length // _SPANS)
     spans = [FrameSpan(first, first + short) for first in range(start, start + length - short + 1, short)]
-    binned = [_binned(source, span) for span in spans]
-    window = _window(binned[0].shape)
-    spectra = np.array([fft.rfft2(window * (image - image.mean())) for image in binned])
-    found = _velocities(spectra, binned[0].shape)
+    binned = np.stack([_binned(source, span) for span in spans])
+    window = _window(binned.shape[1:])
+    found = _velocities(binned, window)
     if found is None:
         return None
     shifts, heights, doubled = found
-    px_per_frame = binning_of(source) / (short * doubled)
-    sizes = np.linalg.norm(shifts, axis=1)
+    heights, px_per_frame = heights / heights[0], binning_of(source) / short
+    part = _following(source, binned, short, shifts[0])
+    if part.suspect:
+        of_rest = _velocities(binned, window * part.rest)
+        rivals = [each / px_per_frame for each in offered] + ([] if of_rest is None else [of_rest[0][0]])
+        extents = [_extents(part, _following(source, binned, short, rival)) for rival in rivals]
+        distinct = [np.linalg.norm(rival - shifts[0]) * len(binned) > _DISTINCT_PX for rival in rivals]
+        shares = [
+            other / max(own, other, 1e-12) if apart else 0.0 for (own, other), apart in zip(extents, distinct, strict=True)
+        ]
+        if shares and max(shares) > _LEAST_EXTENT:
+            best = int(np.argmax(shares))
+            own, other = np.maximum(extents[best], _LEAST_EXTENT * max(extents[best])) / max(extents[best])
+            shifts, heights = np.vstack([rivals[best], shifts]), np.append(other, own * heights)
+    order = np.argsort(-heights, kind="stable")
+    shifts, heights = shifts[order], heights[order]
+    sizes = np.linalg.norm(shifts, axis=1) * doubled
     slow = sizes <= _SLOWER * max(1.0, sizes.min())
-    return Hypotheses(shifts[slow] * px_per_frame, heights[slow] / heights[0], px_per_frame)
+    return Hypotheses(shifts[slow] * px_per_frame, heights[slow], px_per_frame / doubled, part.suspect)
 
 
-def _velocities(spectra: NDArray[np.complexfloating], shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray, int] | None:
-    """Return the (P, 2) shifts between successive images, in their pixels, the heights of the peaks, and the spans of an image.
+def _with_those_near(
+    source: Source, length: int, starts: Sequence[int], found: Sequence[Hypotheses | None], index: int
+) -> Hypotheses | None:
+    """Return the hypotheses of a window; those of its neighbours, too, where a part moves otherwise, by a motion not found."""
+    here = found[index]
+    if here is None or not here.suspect or len(here.velocities) > 1:
+        return here
+    near = [each for each in (*found[max(0, index - 1) : index], *found[index + 1 : index + 2]) if each is not None]
+    return _hypotheses(source, length, starts[index], [velocity for each in near for velocity in each.velocities])
+
+
+def _extents(part: Follows, other: Follows) -> tuple[float, float]:
+    """Return the extents of the parts of an image that clearly follow one of two motions."""
+    return part.extent_beyond(other), other.extent_beyond(part)
+
+
+def _following(source: Source, binned: NDArray[np.float32], n_frames: int, shift: FloatArray) -> Follows:
+    """Find the part of a window that follows a shift between successive spans: compare its first third with its last.
+
+    Args:
+        source: the capture.
+        binned: (S, h, w) means of the spans.
+        n_frames: of a span.
+        shift: (x, y) in binned pixels.
+    """
+    height, width = binned.shape[1:]
+    middle, third = (len(binned) - 1) / 2, max(1, len(binned) // 3)
+
+    def along(index: int) -> NDArray[np.float32]:
+        there = translation(*(shift * (index - middle)))[:2]
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return np.asarray(cv2.warpAffine(binned[index], there, (width, height), flags=flags, borderValue=np.nan), np.float32)
+
+    frames = float(n_frames * third * binning_of(source) ** 2)
+    first, last = (
+        source.response.stabilised(source.response.flux(np.mean([along(index) for index in part], axis=0), frames), frames)
+        for part in (range(third), range(len(binned) - third, len(binned)))
+    )
+    noise = 2 * float(source.response.stabilised_std(frames)) ** 2
+    seen = np.isfinite(first) & np.isfinite(last)
+    return follows(np.nan_to_num(first), np.nan_to_num(last), np.where(seen, np.float32(noise), np.float32(np.inf)))
+
+
+def _velocities(images: NDArray[np.float32], window: NDArray[np.float32]) -> tuple[FloatArray, FloatArray, int] | None:
+    """Return the (P, 2) shifts between successive images, in their pixels, the heights of the peaks, and how many were summed.
 
     Images are summed in twos until a peak is significant; then on, to make the shift exact, as long as the peak is found again.
+
+    Args:
+        images: (S, h, w).
+        window: (h, w) weights of their pixels.
     """
-    doubled = 1
+    weight = window / max(float(window.sum()), 1e-12)
+    spectra = np.array([fft.rfft2(window * (image - float((weight * image).sum()))) for image in images])
+    shape, doubled = images.shape[1:], 1
     while len(spectra) >= 2:
         surface = _surface(spectra, shape)
         if surface is not None and surface.max() >= _SIGNIFICANT:
             shifts, heights = correlation_peaks(surface, _RIVAL)
-            return _refined(spectra, shape, shifts), heights, doubled
+            return _refined(spectra, shape, shifts) / doubled, heights, doubled
         spectra, doubled = _summed_in_twos(spectra), 2 * doubled
     return None
 
@@ -217,7 +305,7 @@ def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
 def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:
     """Return the log likelihood of each change of velocity from one window to the next: (P, Q)."""
     change = before.velocities[:, None] - after.velocities
-    std = _CONTINUITY_PX * max(before.px_per_frame, after.px_per_frame)
+    std = min(_CONTINUITY_PX * max(before.px_per_frame, after.px_per_frame), _CONTINUITY_SHARE * min(before.apart, after.apart))
     return np.asarray(-np.sum((change / std) ** 2, axis=-1) / 2)
 
 

@@ -14,7 +14,7 @@ from photonpano.locating import NO_TEXTURE, NOTHING_SEEN
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.locator import DirectLocator
-from photonpano_direct.majority import JUDGED, follows
+from photonpano_direct.majority import JUDGED, part_following
 from photonpano_direct.small_matrices import rescaled
 
 SHAPE = (160, 240)
@@ -185,9 +185,26 @@ def test_object_that_moves_by_itself_does_not_change_motion(seen_from: Callable,
     assert error_px < min(0.2, 3 * located.residual_px)
 
 
+def test_known_motion_of_the_scene_is_kept_where_an_object_stands_out(
+    seen_from: Callable,
+) -> None:
+    """The scene is blurred, and the object sharp, as where the camera pans and the object moves along."""
+    true, elsewhere, own = translation(24, -7), translation(-300, 150), translation(-3, 2)
+
+    def blurred(motion: np.ndarray, seed: int) -> VirtualExposure:
+        views = [seen_from(motion @ translation(shift, 0), seed + shift) for shift in range(-6, 7)]
+        return replace(views[0], flux=np.mean([view.flux for view in views], axis=0, dtype=np.float32))
+
+    moving = with_object(blurred(true, 100), seen_from(elsewhere @ own, seed=3))
+    fixed = with_object(blurred(STILL, 200), seen_from(elsewhere, seed=4))
+    located = register(moving, fixed, translation(22, -6))
+    assert isinstance(located, Located), located
+    assert corner_displacements(located.homography, true, SHAPE).mean() < 1.0
+
+
 def test_image_that_moves_as_a_whole_is_aligned_as_a_whole(seen_from: Callable) -> None:
     """No part is left out, so that nothing of its information is lost."""
     moving, fixed = (LOCATOR.describe(seen_from(motion, seed)) for seed, motion in enumerate((translation(9, 4), STILL)))
-    part = follows(moving.layers[JUDGED], fixed.layers[JUDGED], rescaled(translation(9, 4), 0.5**JUDGED))
+    part = part_following(moving.layers[JUDGED], fixed.layers[JUDGED], rescaled(translation(9, 4), 0.5**JUDGED))
     assert not part.suspect
     assert part.part.mean() > 0.99

@@ -15,7 +15,10 @@ SHAPE = (96, 128)
 
 
 class Film:
-    """A source of a texture that moves, made when it is asked for; the x of its frames is a function of their indices."""
+    """A source of a texture that moves, made when it is asked for; the x of its frames is a function of their indices.
+
+    `front` stands before it.
+    """
 
     def __init__(self, x_px: Any, n_frames: int, flux: float, contrast: float = 0.9, hot: bool = False) -> None:
         rng = np.random.default_rng(5)
@@ -28,12 +31,15 @@ class Film:
             self.hot = rng.random(SHAPE) < 0.02
             self.valid = ~self.hot
         self.x_px = x_px
+        self.front = np.zeros((0, 0))
 
     def counts(self, span: FrameSpan) -> np.ndarray:
         counts = np.zeros(SHAPE, np.uint32)
         for frame in range(span.start, span.stop):
             shift = np.float32([[1, 0, -float(self.x_px(frame))], [0, 1, 0]])
             flux = cv2.warpAffine(self.scene, shift, SHAPE[::-1], borderMode=cv2.BORDER_REFLECT)
+            height, width = self.front.shape
+            flux[20 : 20 + height, 25 : 25 + width] = self.front
             lit = np.random.default_rng(frame).random(SHAPE) < -np.expm1(-flux)
             counts += lit | self.hot
         return counts
@@ -59,6 +65,14 @@ def test_summary_gives_the_speed_of_the_fast_part() -> None:
         return 0.1 * frame + 0.9 * max(0, frame - 280)  # 1 px a frame in the last third
 
     assert summarise(Film(x_px, 400, 0.5)).speed_px == pytest.approx(1.0, rel=0.1)
+
+
+def test_summary_gives_the_speed_of_the_scene_behind_an_object_with_strong_contrast() -> None:
+    """The object covers 30 % of the frame, and makes the highest peak of the correlation."""
+    film = Film(lambda frame: 0.3 * frame, 400, 1.0, contrast=2.0)
+    texture = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, (56, 66)), (0, 0), 2)
+    film.front = np.exp(1.5 * texture / texture.std()) / 3
+    assert summarise(film).speed_px == pytest.approx(0.3, rel=0.35)
 
 
 def test_summary_of_a_still_capture_is_slow() -> None:

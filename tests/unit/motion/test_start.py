@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,13 +26,16 @@ def tiled(period: int) -> np.ndarray:
 
 @pytest.fixture
 def started(memory_source: type) -> Callable[..., StartingMotion | None]:
-    """Simulate a pan over a scene at a whole number of px per frame, and measure its start."""
+    """Simulate a pan over a scene in steps of a px, behind what stands in front, and measure its start."""
 
-    def started(scene: np.ndarray, px_per_frame: int, n_frames: int = 128) -> Any:
+    def started(scene: np.ndarray, px_per_frame: float, n_frames: int = 128, front: np.ndarray | None = None) -> Any:
         rng = np.random.default_rng(0)
-        views = [scene[:, px_per_frame * frame :][:, : SHAPE[1]] for frame in range(n_frames)]
+        views = [scene[:, int(px_per_frame * frame) :][:, : SHAPE[1]] for frame in range(n_frames)]
+        if front is not None:
+            views = [np.where(np.isnan(front), view, front) for view in views]
         source = memory_source([rng.random(SHAPE) < -np.expm1(-view) for view in views])
-        spans = [FrameSpan(start, start + LENGTH) for start in range(0, n_frames, LENGTH)]
+        length = LENGTH if front is None else 2 * LENGTH
+        spans = [FrameSpan(start, start + length) for start in range(0, n_frames, length)]
         with ThreadPoolExecutor(1) as pool:
             return starting_motion(source, [Group(span, span.centre) for span in spans], pool)
 
@@ -51,6 +55,21 @@ def test_slower_motion_is_taken_and_the_other_named_where_spans_move_by_half_a_p
     start = started(tiled(20), 2)
     np.testing.assert_allclose(start.between(80.0, 48.0)[:2, 2], [64, 0], atol=6)
     assert start.alternative_px(80.0, 48.0) == pytest.approx(32 / 4 * 20, abs=8)
+
+
+def textured(shape: tuple[int, int], contrast: float, seed: int) -> np.ndarray:
+    """Flux of texture without a period."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 1, shape), (0, 0), 2)
+    return 0.8 * np.exp(contrast * noise / noise.std())
+
+
+def test_start_follows_the_scene_and_not_an_object_with_strong_contrast(started: Callable) -> None:
+    """Most of the image counts, and not the highest peak of the correlation, which is that of the object."""
+    front = np.full(SHAPE, np.nan)
+    front[16:44, 26:70] = textured((28, 44), 1.0, 2)  # 20 % of the frame
+    start = started(textured((64, 800), 1.0, 1), 0.25, 256, front)
+    np.testing.assert_allclose(start.velocities, np.tile([-0.25, 0.0], (len(start.velocities), 1)), atol=0.1)
+    assert start.alternative_px(80.0, 48.0) == 0
 
 
 def test_motion_is_unknown_beyond_the_windows_with_a_significant_peak(started: Callable) -> None:

@@ -64,6 +64,33 @@ def test_failure_of_all_locators_joins_their_reasons(
     assert [(edge.moving, edge.fixed) for edge in found.failures] == [(4, 3), (4, 2), (4, 1), (5, 4)]
 
 
+def test_fallback_is_not_believed_where_it_contradicts_pairs_of_the_locator_in_between(
+    run: Callable, make_level: Callable, pan: Callable, make_second: type
+) -> None:
+    """Distant exposures share an object rather than the scene: the first locator fails, and the second follows the object."""
+
+    def near(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+        return found if moving.span.start - fixed.span.start == 10 else NotLocated("lost")
+
+    second = make_second(pan(-0.5))
+    found = run(make_level(pan(0.3), near, fallbacks={"second": second}), graph=GraphSettings(skips=(1.0, 4.0)))
+    np.testing.assert_allclose(found.homographies[:, 0, 2], 0.3 * (found.instants - found.instants[6]), atol=1e-9)
+    reasons = {edge.moving - edge.fixed: edge.motion.reason for edge in found.failures}
+    assert reasons[4] == "second: the motion is 32 px from that along the pairs of toy in between"
+    assert 1 not in reasons
+
+
+def test_fallback_is_believed_where_the_locator_does_not_tie_the_exposures(
+    run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
+) -> None:
+    def behind(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+        return NotLocated("lost") if moving.span.start >= 60 > fixed.span.start else found
+
+    jump = make_second(pan(0.3), lambda _, __, found: Located(translation(50, 0) @ found.homography))
+    found = run(make_level(pan(0.3), behind, fallbacks={"second": jump}), graph=GraphSettings(skips=(1.0, 2.0)))
+    np.testing.assert_allclose(found.homographies[6:, 0, 2] - found.homographies[5, 0, 2], 50 + 3 * np.arange(1, 7), atol=1e-6)
+
+
 def test_fallback_does_not_describe_blank_exposures(
     run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
 ) -> None:
