@@ -4,7 +4,7 @@
 
 Each row is a kind of capture of 96x144 px and 1,600 frames with a known truth, simulated with another scene, path and noise for
 each seed. A cut is right if the camera left out, or repeated, frames within two frames of it; jumps that are smaller than 1 px
-are not counted as missed. Two seconds a run on two cores.
+are not counted as missed. A run takes about ten seconds on two cores.
 """
 
 from __future__ import annotations

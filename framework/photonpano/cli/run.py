@@ -37,6 +37,7 @@ def run(
     from photonpano.cli.errors import warn
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.verdict import print_verdict, require_trust
+    from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
     from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
 
@@ -45,6 +46,9 @@ def run(
     print_verdict(result.verdict)
     for warning in record["warnings"]:
         warn(warning)
+    for decision in record["decisions"]:
+        if decision["what"] in (CUT, DARK_JUMP, REPEATED):
+            typer.echo(f"{decision['what']:<9} {decision['value']}: {decision['reason']}")
     for refinement in record["refinements"]:
         if refinement["rounds"]:
             typer.echo(f"refined   {_correction(refinement)}")

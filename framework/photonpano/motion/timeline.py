@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photonpano.geometry import apply, corners, inverse
 from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 
@@ -33,6 +34,13 @@ class Cut:
     shift_px: FloatArray
     sigmas: float
     dark: FrameSpan | None = None
+
+    def along(self, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Cut:
+        """Return this cut with the shift that a trajectory has there, beyond the motion from frame to frame beside it."""
+        homographies = trajectory.at(self.frame + np.arange(-2, 2))
+        middle = corners(frame_shape).mean(axis=0)
+        before, here, after = apply(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
+        return replace(self, shift_px=here - (before + after) / 2)
 
     @property
     def size_px(self) -> float:

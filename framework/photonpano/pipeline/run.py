@@ -173,7 +173,7 @@ def _cut_at(
         places = ", ".join(f"frame {each.frame}" for each in cuts)
         logger.warning(f"the image seems to jump before {places}, but the motion is not cut there: {worse}")
         return timeline, results, look
-    return cut, again, seen
+    return cut.cut_at([each.along(motion.trajectory, motion.frame_shape) for each in cuts]), again, seen
 
 
 def _require_photons(plan: Plan, source: Source) -> None:

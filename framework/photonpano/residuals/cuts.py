@@ -37,13 +37,15 @@ _FEWEST = 6
 """Fewer sums are not tracked."""
 _DARK = 0.2
 """Sums, and frames, with less than this share of the usual light show nothing."""
-_TEMPLATE = 4
-"""Sums before and after a jump that make the templates, with which the frames between are compared."""
+_SIDE = 4
+"""Further sums before and after a jump, which make the template with which the frames between are compared."""
+_BLUR_PX = 0.7
+"""Standard deviation of the Gaussian that smooths the template, in binned px."""
 _STEPS = 8
 """A jump is divided into eighths, to compare it with a fast motion."""
 _SHORT_RAMP, _RAMPS = 4, (8, 16, 32, 64, 128)
 """Lengths, in frames, of the fast motions that a jump is compared with."""
-_SURE = 5.0
+_SURE = 4.0
 """Standard deviations by which a jump must be likelier than motions of 8 frames and more. One of 4 must not be likelier."""
 _NOISE_FLOOR = 1e-4
 """Least variance of a binned pixel."""
@@ -223,42 +225,84 @@ def _dark_frames(source: Source, span: FrameSpan) -> FrameSpan | None:
 def _located(source: Source, track: _Track, outlier: _Outlier) -> Cut | None:
     """Find the first frame after a jump; None if a fast motion explains the frames as well.
 
-    The log likelihood of each frame is that of its residual from the template before the jump, moved on, or from that after,
-    moved back; and of positions between. A jump takes the image from the one to the other at once, a fast motion in some
-    frames.
+    The log likelihood of each frame is that of its residual from a template, seen from the path before the jump, from that
+    after, and from positions between. A jump takes the image from the one to the other at once, a fast motion in some frames.
     """
-    first, last = track.spans[outlier.before].start, track.spans[outlier.after].stop
-    before = range(max(0, outlier.before - _TEMPLATE), outlier.before)
-    after = range(outlier.after + 1, min(len(track.spans), outlier.after + 1 + _TEMPLATE))
-    onwards, back = track.velocity(before[0], outlier.before), track.velocity(outlier.after, after[-1])
-    sides = [_template(track, before, onwards, first - 0.5), _template(track, after, back, last - 0.5)]
-    whole = shift_by_phase(_windowed(sides[0]), _windowed(sides[1]), _PEAK_PX, gaussian_peak=False)
-    if whole is None:
-        return None
-    frames = np.arange(first, last)
-    # Where the image is, relative to the template before: moved on by the old motion, or back by the new one.
-    old, new = (frames - (first - 0.5))[:, None] * onwards, whole - ((last - 0.5) - frames)[:, None] * back
+    path = _Path.of(track, outlier)
+    template = _template(track, outlier, path)
+    frames = range(track.spans[outlier.before].start, track.spans[outlier.after].stop)
     likelihood = np.empty((len(frames), _STEPS + 1))
     for row, frame in enumerate(frames):
-        image = binned_mean(source, FrameSpan(int(frame), int(frame) + 1))
-        expected = []
-        for share in np.linspace(0, 1, _STEPS + 1):
-            place = (1 - share) * old[row] + share * new[row]
-            expected.append(_moved(sides[0], place) if share < 0.5 else _moved(sides[1], place - whole))
+        image = binned_mean(source, FrameSpan(frame, frame + 1))
+        expected = [_moved(template, path.at(frame, share)) for share in np.linspace(0, 1, _STEPS + 1)]
         likelihood[row] = _log_likelihoods(image, np.array(expected), binning_of(source) ** 2)
     jumps = _likelihoods_of(likelihood, 0)
     at = min(int(np.argmax(jumps)), len(frames) - 1)
     short, *motions = (float(_likelihoods_of(likelihood, ramp).max()) for ramp in (_SHORT_RAMP, *_RAMPS))
     sigmas = np.sqrt(2 * max(float(jumps[at]) - max(motions), 0.0))
-    cut = Cut(int(first + at), (new[at] - old[at]) * binning_of(source), float(sigmas))
+    cut = Cut(frames[at], path.jump * binning_of(source), float(sigmas))
     return None if sigmas < _SURE or short > jumps[at] or cut.size_px < _SMALLEST_PX else cut
 
 
-def _template(track: _Track, numbers: Sequence[int], velocity: FloatArray, instant: float) -> FluxImage:
-    """Average sums of a track, moved to an instant: (h, w); NaN beyond their borders."""
-    moved = [_moved(track.images[number], velocity * (instant - track.spans[number].centre)) for number in numbers]
-    mean = np.mean(moved, axis=0)
-    return np.asarray(cv2.GaussianBlur(mean, (0, 0), 0.7), np.float32)
+@dataclass(frozen=True, slots=True)
+class _Path:
+    """A smooth path of the image with a jump: a cubic polynomial of time, and a step.
+
+    Attributes:
+        middle: the instant around which time is counted.
+        scale: frames of a unit of time.
+        coefficients: (4, 2) of the polynomial, in binned px.
+        jump: (2,) the step.
+    """
+
+    middle: float
+    scale: float
+    coefficients: FloatArray
+    jump: FloatArray
+
+    @classmethod
+    def of(cls, track: _Track, outlier: _Outlier) -> _Path:
+        """Fit the path to the sums on both sides of an outlier."""
+        before, after = outlier.before, outlier.after
+        across = track.next_px[before] if after == before + 1 else track.second_px[before]
+        numbers = _beside(track, outlier)
+        places = [
+            -track.next_px[number:before].sum(axis=0) if number <= before else across + track.next_px[after:number].sum(axis=0)
+            for number in numbers
+        ]
+        centres = track.centres[numbers]
+        middle = float(centres[[numbers.index(before), numbers.index(after)]].mean())
+        scale = float(np.abs(centres - middle).max())
+        equations = np.column_stack([_powers((centres - middle) / scale), np.asarray(numbers) >= after])
+        solution = np.linalg.lstsq(equations, np.array(places))[0]
+        return cls(middle, scale, solution[:-1], solution[-1])
+
+    def at(self, instant: float, share: float) -> FloatArray:
+        """Return where the image is after a share of the jump: (2,) in binned px."""
+        return np.asarray(_powers(np.array([(instant - self.middle) / self.scale]))[0] @ self.coefficients + share * self.jump)
+
+
+def _powers(times: FloatArray) -> FloatArray:
+    return np.asarray(times[:, None] ** np.arange(4))
+
+
+def _beside(track: _Track, outlier: _Outlier) -> list[int]:
+    """Return the numbers of the sums before and after an outlier."""
+    first, last = max(0, outlier.before - _SIDE), min(len(track.spans), outlier.after + _SIDE + 1)
+    return [*range(first, outlier.before + 1), *range(outlier.after, last)]
+
+
+def _template(track: _Track, outlier: _Outlier, path: _Path) -> FluxImage:
+    """Average the sums on both sides of an outlier, taken back along the path: (h, w); NaN beyond their borders."""
+    moved = [
+        _moved(track.images[number], -path.at(track.spans[number].centre, float(number >= outlier.after)))
+        for number in _beside(track, outlier)
+        if number not in (outlier.before, outlier.after)
+    ]
+    seen = np.isfinite(moved)
+    mean = np.where(seen, moved, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    smooth = cv2.GaussianBlur(mean.astype(np.float32), (0, 0), _BLUR_PX)
+    return np.where(seen.any(axis=0), smooth, np.float32(np.nan))
 
 
 def _moved(image: FluxImage, shift: FloatArray) -> FluxImage:
@@ -267,11 +311,6 @@ def _moved(image: FluxImage, shift: FloatArray) -> FluxImage:
     border = cv2.BORDER_CONSTANT
     size, nothing = image.shape[::-1], float("nan")
     return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=border, borderValue=nothing))
-
-
-def _windowed(image: FluxImage) -> FluxImage:
-    filled = np.nan_to_num(image, nan=float(np.nanmean(image)))
-    return np.asarray(cv2.createHanningWindow(image.shape[::-1], cv2.CV_32F) * (filled - filled.mean()), np.float32)
 
 
 def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> FloatArray:

@@ -81,6 +81,11 @@ def test_trajectory_jumps_at_cut_and_is_exact_beside_it(estimated: Callable[...,
     assert not any(group.span.start < 50 < group.span.stop for group in result.groups)
 
 
+def test_shift_of_cut_is_that_of_trajectory_beyond_its_motion(known_motion: type) -> None:
+    moved = known_motion(lambda frame: translation(0.3 * frame + 7 * (frame >= 49.5), -2 * (frame >= 49.5)))
+    np.testing.assert_allclose(cut_at(50).along(moved, (40, 60)).shift_px, [-7, 2], atol=1e-9)
+
+
 def test_repeated_frames_stand_still(estimated: Callable[..., LevelResult]) -> None:
     """Every fifth frame is sent twice: the camera moves by 0.3 px in each of the others."""
     timeline = repeating(*range(5, N_FRAMES, 6))
