@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, look_first, objections, read_json
+from photonpano.reading import BinarySource, FrameLayout, look_first, objections, read_json, require_readable
 from photonpano_sensors.looks import spread
 from photonpano_sensors.mat_file import MatFrames, is_hdf
 
@@ -81,6 +81,7 @@ def _parts(folder: Path) -> list[Path]:
     """Return the parts in order; raise if one is missing."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; name the folder of part_1.mat and so on")
+    require_readable(folder)
     numbers = {int(match[1]) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))}
     info = _info(folder)
     expected = max(numbers, default=0) if info is None else info.no_parts

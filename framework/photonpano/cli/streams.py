@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import sys
 from typing import NoReturn
@@ -12,7 +13,7 @@ from photonpano.errors import OutputError
 
 
 def prepare_streams() -> None:
-    """Open nothing in place of standard streams that are closed, and make a full disk an `OutputError`.
+    """Open nothing in place of standard streams that are closed, make a full disk an `OutputError`, and silence libraries.
 
     A file that is opened later would take the number of a closed stream, and receive what is printed.
     """
@@ -22,6 +23,9 @@ def prepare_streams() -> None:
             if nothing != number:
                 os.dup2(nothing, number)
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))  # noqa: PTH123, SIM115
+    # Readers of pictures print what they find in damaged ones; our own error says it in a sentence.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    logging.getLogger("tifffile").addHandler(logging.NullHandler())
     if isinstance(sys.stdout, io.TextIOWrapper):
         encoding, errors, by_line = sys.stdout.encoding, sys.stdout.errors, sys.stdout.line_buffering
         sys.stdout = _Output(sys.stdout.detach(), encoding, errors, line_buffering=by_line)

@@ -13,6 +13,7 @@ from photonpano.reading.files import (
     read_json,
     read_start,
     reading,
+    require_readable,
 )
 from photonpano.reading.first_look import look_first
 from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, unpacked_start
@@ -53,6 +54,7 @@ __all__ = [
     "read_start",
     "reading",
     "require_frames",
+    "require_readable",
     "require_whole",
     "sampled_frames",
     "sampled_spans",

@@ -72,6 +72,19 @@ def objections(read: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> 
     return ()
 
 
+def require_readable(path: Path) -> None:
+    """Refuse a file that may not be opened, or a folder that may not be listed.
+
+    Raises:
+        InputError: the system refuses it, or it is no regular file.
+    """
+    with reading(path):
+        if path.is_dir():
+            next(path.iterdir(), None)
+        else:
+            os.close(os.open(path, os.O_RDONLY))
+
+
 def files_in(path: Path, suffix: str) -> list[Path]:
     """Return the files of a capture: the file itself, or those of a folder, nested ones too, in natural order (0, 2, 10).
 
@@ -89,6 +102,7 @@ def files_in(path: Path, suffix: str) -> list[Path]:
             return [path]
         if not path.is_dir():
             raise InputError(missing_file(path, "file or folder"))
+    require_readable(path)
     found = [
         file.relative_to(path)
         for file in path.rglob("*")

@@ -15,7 +15,7 @@ from photonpano.contributions import Config, Recognised, SourceContribution, Spe
 from photonpano.errors import described
 from photonpano.hookspecs import hookimpl
 from photonpano.interrupts import is_interrupt
-from photonpano.reading import missing_file
+from photonpano.reading import missing_file, objections, require_readable
 from photonpano.specs.aliases import LocatorAlias, SourceAlias
 from photonpano.specs.checks import complaints
 from photonpano.specs.plan import Choice
@@ -94,6 +94,9 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
     path = config.path
     if not path.exists():
         spec.wrong(f"{keys}.path", missing_file(path, "file or folder"))
+        return None
+    if unreadable := objections(require_readable, path):
+        spec.wrong(f"{keys}.path", unreadable[0])
         return None
     recognised, failures = ask_sources(spec.catalog, path)
     if len(recognised) != 1:

@@ -147,7 +147,7 @@ def _load(
     for override in overrides:
         _apply_override(written, override)
     other = _capture(written)
-    named = name if other in (own, None) else f"{name}-{other}"
+    named = name if other in (own, None) or refusal(Path(str(other))) else f"{name}-{other}"
     _set_output(written, None if output is None else Path(output).absolute(), Path("runs", named))
     written.directory, written.catalog = directory, catalog
     return resolve(written)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
-from photonpano.reading import look_first, read_picture, reading
+from photonpano.reading import look_first, read_picture, reading, require_readable
 from photonpano_sensors.intensity.configs import ImageFolderConfig
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import pictures_in
@@ -27,8 +26,8 @@ Image = NDArray[np.generic]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}
 """The colour types of PNG other than grey."""
-_MOST_SQUEEZED = 1032
-"""A byte of a PNG file unpacks to so many at most."""
+_MOST_SQUEEZED = 4096
+"""A byte of a file unpacks to so many at most: 1,032 with the compression of PNG, more with others, for black frames."""
 _DAMAGED = "is damaged: it is not a TIFF file that can be read; copy it again"
 
 
@@ -89,6 +88,7 @@ class _Folder:
     """A file for each frame."""
 
     def __init__(self, path: Path) -> None:
+        require_readable(path)
         self._files = pictures_in(path)
         if not self._files:
             raise InputError(f"{path} holds no .png or .tif files; name the folder that the frames are in")
@@ -168,16 +168,12 @@ def _form_of(file: Path) -> _Form:
             return _form_of_page(file, tiff.pages[0])
     with reading(file), file.open("rb") as opened:
         header = opened.read(26)
-        n_bytes = os.fstat(opened.fileno()).st_size
     if len(header) < 26 or not header.startswith(_PNG):
         raise InputError(f"{file} is not a PNG file, by its first bytes; remove it, or save it again")
     width, height, bits, colours = struct.unpack(">IIBB", header[16:])
     if colours:
         raise InputError(f"{file} has {_PNG_COLOURS.get(colours, 'colours')}; convert the frames to grey")
-    form = _grey(file, _Form(height, width, bits))
-    if height * width * bits // 8 > n_bytes * _MOST_SQUEEZED:
-        raise InputError(f"{file} is damaged: it promises {form}, and has {n_bytes:,} bytes; copy it again")
-    return form
+    return _grey(file, _Form(height, width, bits))
 
 
 def _form_of_page(file: Path, page: tifffile.TiffPage | tifffile.TiffFrame) -> _Form:
@@ -192,6 +188,9 @@ def _grey(file: Path, form: _Form) -> _Form:
         raise InputError(f"{file} has no pixels: it promises {form}; remove it, or copy it again")
     if form.bits not in (8, 16):
         raise InputError(f"{file} has {form}; convert the frames to 8 or 16 bits")
+    n_bytes = file.stat().st_size
+    if form.height * form.width * form.bits // 8 > n_bytes * _MOST_SQUEEZED:
+        raise InputError(f"{file} is damaged: it promises {form}, and has {n_bytes:,} bytes; copy it again")
     return form
 
 
