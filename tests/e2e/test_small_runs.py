@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -136,10 +137,32 @@ def test_panorama_lies_in_plane_of_reference_frame(run: Callable, reference: str
     np.testing.assert_array_equal(canvas, translation(round(canvas[0, 2]), round(canvas[1, 2])))
 
 
-def test_trajectory_bytes_do_not_depend_on_threads(run: Callable) -> None:
+def test_bytes_of_results_do_not_depend_on_threads(run: Callable) -> None:
     """Levels of four and nine groups: the order in which threads finish must not matter."""
     runs = [run(f"run.threads={threads}", "resample.with.group_size=75", levels=2) for threads in (1, 2, 3)]
-    assert len({(each.directory / "trajectory.npz").read_bytes() for each in runs}) == 1
+    hashes = [{name: content["sha256"] for name, content in each.record["files"].items()} for each in runs]
+    assert {"trajectory.npz", "panorama.tiff", "coverage.tiff", "panorama.png"} <= set(hashes[0])
+    assert hashes[1:] == hashes[:-1]
+
+
+@pytest.mark.parametrize("wrong", ["frame rate", "backend"])
+def test_run_without_report_keeps_its_results(
+    small_spec: dict[str, Any], tmp_path: Path, wrong: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A figure over a time axis without end, and a matplotlib that cannot be used."""
+    overrides = ["levels=1"]
+    if wrong == "frame rate":
+        overrides.append("source.with.frame_rate_hz=1e-320")
+    else:
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    plan = parse_spec(small_spec | {"output": {"directory": str(tmp_path / "run")}}, overrides=overrides)
+    record = photonpano.run(plan).record
+    (warning,) = [each for each in record["warnings"] if "report" in each]
+    assert warning.startswith("the report could not be drawn (")
+    assert warning.endswith("); all other files of the run are written")
+    assert json.loads((tmp_path / "run" / "run.json").read_text()) == json.loads(json.dumps(record))
+    assert set(record["files"]) == {"trajectory.npz", "panorama.tiff", "coverage.tiff", "panorama.png"}
+    assert photonpano.verify(tmp_path / "run").problems == ()
 
 
 def test_recorded_spec_repeats_run(run: Callable, outcome_of: Callable) -> None:

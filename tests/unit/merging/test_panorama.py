@@ -128,16 +128,22 @@ def test_render_tiles_equals_render(panning: Any, known_motion: type, motion: tu
     np.testing.assert_allclose(shown.panorama.weight, single.panorama.weight, rtol=1e-6)
 
 
-def test_render_of_rolled_frames_does_not_depend_on_threads(memory_source: type, known_motion: type) -> None:
+@pytest.mark.parametrize("n_tiles", [1, 2])
+def test_render_of_rolled_frames_does_not_depend_on_threads(memory_source: type, known_motion: type, n_tiles: int) -> None:
     """Warps of parts of the grid are rounded by where the parts start: these must not depend on the threads."""
     frames = np.random.default_rng(2).random((40, 150, 60)) < 0.4
     source = memory_source(frames)
     roll = known_motion(lambda frame: np.array([[1, -0.002 * frame, 0.3 * frame], [0.002 * frame, 1, 0.1], [1e-5, 0, 1]]))
     canvas = plan_canvas(roll, source.info.span, source.info.frame_shape, 1.0, 2**30)
-    one, *others = (render(source, roll, source.info.span, canvas, 0.1, Context(threads)) for threads in (1, 2, 3, 5))
+    tiles, _ = tiles_of(canvas, BYTES_PER_PIXEL * canvas.height * canvas.width // (1 if n_tiles == 1 else 2))
+    assert (len(tiles) > 1) == (n_tiles > 1)
+    one, *others = (
+        list(render_tiles(source, roll, source.info.span, tiles, 0.1, Context(threads))) for threads in (1, 2, 3, 5)
+    )
     for other in others:
-        np.testing.assert_array_equal(one.flux, other.flux)
-        np.testing.assert_array_equal(one.weight, other.weight)
+        for part, same in zip(one, other, strict=True):
+            np.testing.assert_array_equal(part.flux, same.flux)
+            np.testing.assert_array_equal(part.weight, same.weight)
 
 
 def test_thumbnail_averages_seen_pixels() -> None:

@@ -197,6 +197,23 @@ def test_output_counts_from_the_current_folder(catalog, tmp_path, monkeypatch):
     assert load_spec(path, catalog=catalog).output.directory == tmp_path / "specs" / "elsewhere"
 
 
+def test_default_run_folder_follows_a_capture_that_is_chosen_by_override(catalog, tmp_path):
+    path = tmp_path / "scan.yaml"
+    path.write_text("version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\n")
+
+    def folder(*overrides):
+        return load_spec(path, overrides, catalog=catalog).output.directory.relative_to(tmp_path)
+
+    for capture in ("cube.npy", "other.npy", "night/cube.npy", "day/cube.npy"):
+        (tmp_path / capture).parent.mkdir(exist_ok=True)
+        (tmp_path / capture).touch()
+    assert folder() == folder("source.with.path=cube.npy") == Path("runs/scan")
+    assert folder("source.with.path=other.npy") == Path("runs/scan-other")
+    assert folder("source.with.path=night/cube.npy") == Path("runs/scan-night-cube")
+    assert folder(f"source.with.path={tmp_path}/day/cube.npy") == Path("runs/scan-day-cube")
+    assert folder("source.with.path=other.npy", f"output.directory={tmp_path}/mine") == Path("mine")
+
+
 def test_parse_spec_accepts_numpy_numbers_tuples_and_paths(catalog, tmp_path):
     source = {"use": "simulator", "with": {"flux": np.float32(0.5), "frames": np.int64(7), "size": (3, 4)}}
     plan = parse_spec({"version": 1, "source": source, "output": {"directory": tmp_path}}, catalog=catalog)

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import gzip
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonpano import OutputError
+from photonpano.reading.gzipped import unpacked
+
+FRAMES = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
+
+
+def write(path: Path, frames: np.ndarray) -> None:
+    with gzip.open(path, "wb") as file:
+        np.save(file, frames)
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    write(tmp_path / "cube.npy.gz", FRAMES)
+    return tmp_path / "cube.npy.gz"
+
+
+def test_unpacked_copy_is_used_again(archive: Path) -> None:
+    first = unpacked(archive).stat()
+    assert unpacked(archive).stat().st_ino == first.st_ino
+    np.testing.assert_array_equal(np.load(unpacked(archive)), FRAMES)
+
+
+def test_unpacked_copy_of_another_archive_is_not_used(archive: Path) -> None:
+    """An older archive of the same size, as after restoring a backup."""
+    unpacked(archive)
+    write(archive, FRAMES[::-1])
+    os.utime(archive, (0, 0))
+    np.testing.assert_array_equal(np.load(unpacked(archive)), FRAMES[::-1])
+
+
+def test_damaged_unpacked_copy_is_not_used(archive: Path) -> None:
+    copy = unpacked(archive)
+    before = copy.stat()
+    with copy.open("r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(bytes([255 - int(FRAMES[-1, -1, -1])]))
+    os.utime(copy, ns=(before.st_atime_ns, before.st_mtime_ns))
+    np.testing.assert_array_equal(np.load(unpacked(archive)), FRAMES)
+
+
+def test_unpacking_replaces_no_symbolic_link(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("content")
+    link = tmp_path / "cube.npy.gz.unpacked.npy"
+    link.symlink_to("precious")
+    with pytest.raises(OutputError) as caught:
+        unpacked(archive)
+    assert str(caught.value) == f"cannot write {link}: it is a symbolic link; remove it, or choose another name"
+    assert (tmp_path / "precious").read_text() == "content"
+
+
+def test_unpacking_removes_what_a_killed_process_has_left(archive: Path, tmp_path: Path) -> None:
+    left = tmp_path / ".cube.npy.gz.unpacked.0123abcd.partial.npy"
+    left.write_bytes(b"half")
+    unpacked(archive)
+    assert not left.exists()
