@@ -5,7 +5,7 @@
     python tests/benchmarks/crashes.py races --number 50 --at-once 2
     python tests/benchmarks/crashes.py cost
 
-Every trial works on a simulated capture of 64x96 px in a temporary folder. The exit code is 1 if a trial fails.
+Every trial works on a simulated capture of 48x64 px in a temporary folder. The exit code is 1 if a trial fails.
 """
 
 from __future__ import annotations
@@ -69,10 +69,14 @@ class Run:
             sys.stderr.flush()
             os._exit(code)
 
-    def kill(self) -> None:
-        """Kill the process; nothing if it has ended."""
-        if self.code is None:
-            os.kill(self._pid, signal.SIGKILL)
+    def kill_after(self, seconds: float) -> None:
+        """Kill the process after a time, unless it ends before."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if os.waitid(os.P_PID, self._pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                return
+            time.sleep(0.002)
+        os.kill(self._pid, signal.SIGKILL)
 
     def wait(self) -> str:
         """Wait for the end, and return what was printed; `code` is the exit code then."""
@@ -119,7 +123,7 @@ def prepare(folder: Path, seed: int = 0) -> None:
     """Simulate the capture, and write the spec."""
     from photonpano import parse_spec, simulate
 
-    settings = {"n_frames": 400, "frame_shape": [64, 96], "path": {"kind": "pan", "length_px": 30}, "flux": 0.5}
+    settings = {"n_frames": 200, "frame_shape": [48, 64], "path": {"kind": "pan", "length_px": 16}, "flux": 0.5}
     simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": settings}}), folder / "cube.npy")
     write_spec(folder, seed)
 
@@ -157,6 +161,7 @@ def leftovers(folder: Path) -> list[str]:
 def kills(folder: Path, number: int, seed: int) -> list[str]:
     """Kill runs at random moments, a third of them while they write, and run again after each tenth."""
     rng, wrong, writing, counts = random.Random(seed), [], 0, {"old": 0, "new": 0}
+    Run(folder).wait()  # which may compile
     start = time.perf_counter()
     Run(folder).wait()
     whole_s, old = time.perf_counter() - start, 0
@@ -166,8 +171,7 @@ def kills(folder: Path, number: int, seed: int) -> list[str]:
             process = Run(folder, killed_at=rng.randint(1, 60))
         else:
             process = Run(folder)
-            time.sleep(rng.uniform(0, 1.05 * whole_s))
-            process.kill()
+            process.kill_after(rng.uniform(0, whole_s))
         process.wait()
         writing += index % 3 == 0 and process.code == -signal.SIGKILL
         found, problems = state(folder)
@@ -175,6 +179,7 @@ def kills(folder: Path, number: int, seed: int) -> list[str]:
         if problems or found not in (old, index):
             wrong.append(f"kill {index}: seed {found} after {old}; {problems}")
         old = found
+        print(f"kill {index}: {process.code}, seed {found} {problems or ''}", file=sys.stderr)
         if index % 10 == 0:
             printed = Run(folder).wait()
             found, problems = state(folder)
