@@ -90,7 +90,7 @@ def run_with(folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.Monke
         still = {"use": "other", "rounds": [], "change_px": 0.0, "kept_out": None}
         record = {"warnings": ["a warning"], "refinements": [refined, still], "files": {"report.html": {}}}
         result = RunResult(folder / "run", record, verdict)
-        monkeypatch.setattr("photonpano.pipeline.run.run", lambda *_, overwrite: result)
+        monkeypatch.setattr("photonpano.pipeline.run.run", lambda *_, **_options: result)
         return invoke("run", "capture.yaml", *arguments)
 
     return run_with

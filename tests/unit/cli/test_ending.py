@@ -16,8 +16,9 @@ ENDS_WITHIN_S = 2.0
 PROGRAM = """\
 import ctypes, hashlib, itertools, threading, time
 from pathlib import Path
-from photonpano.atomic import atomic_files, atomic_path
+from photonpano.atomic import atomic_path
 from photonpano.cli.app import app, main
+from photonpano.folders import staging_of
 from photonpano.threads import thread_pool
 
 def swallow():
@@ -29,7 +30,7 @@ def swallow():
 
 @app.command()
 def work():
-    with atomic_path(Path("cube.npy")), atomic_files(Path("run")) as folder:
+    with atomic_path(Path("cube.npy")), staging_of(Path("run").absolute()) as folder:
         (folder / "run.json").write_text("{}")
         print("working", flush=True)
         WORK
@@ -94,7 +95,7 @@ def test_signal_ends_command_in_time_and_leaves_no_file(
     if work != HOLDING_INTERPRETER:
         assert process.returncode == 128 + sent
         assert "\ninterrupted" in err
-        assert list(tmp_path.rglob("*.npy")) + list(tmp_path.rglob(".part-*")) == []
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("work", ["swallow()", HOLDING_INTERPRETER], ids=["swallowed", "holds the interpreter"])
