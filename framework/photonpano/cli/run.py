@@ -25,6 +25,19 @@ def run(
         bool,
         typer.Option("--overwrite", help="Write beside other files, which stay, or replace a run of another capture."),
     ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run of this spec that was interrupted.")] = False,
+    from_level: Annotated[
+        int | None,
+        typer.Option(
+            "--from-level",
+            metavar="N",
+            help="Take the levels before N from the run before, whose work was kept, and compute N and what follows.",
+            show_default=False,
+        ),
+    ] = None,
+    keep_work: Annotated[
+        bool, typer.Option("--keep-work", help="Keep what each level has found, for --from-level, in the folder DIR.work.")
+    ] = False,
     strict: Strict = False,
 ) -> None:
     """Make a panorama from a spec.
@@ -34,15 +47,22 @@ def run(
 
     Example: photonpano run scan.yaml --output runs/first --set render.scale=2
     """
-    from photonpano.cli.errors import warn
+    from photonpano.cli.errors import WrongArgumentError, warn
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.verdict import print_verdict, require_trust
     from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
     from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
 
-    result = run_plan(load_spec(spec, overrides or (), output), progress_for_stderr(), overwrite=overwrite)
+    if resume and from_level is not None:
+        raise WrongArgumentError("--resume and --from-level: give one of them")
+    plan = load_spec(spec, overrides or (), output)
+    result = run_plan(
+        plan, progress_for_stderr(), overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work
+    )
     record, directory = result.record, result.directory.resolve()
+    if result.was_finished:
+        typer.echo("finished  this run was finished before; nothing was left to do")
     print_verdict(result.verdict)
     for warning in record["warnings"]:
         warn(warning)

@@ -89,7 +89,8 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
     pairs = pairs_of(groups, graph.skips)
-    log = context.checkpoints.log(f"level-{level.number}", groups, pairs, exposures.previous_homographies())
+    given = groups, pairs, exposures.previous_homographies(), exposures.timeline
+    log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:
         registrar = Registrar(exposures, pool, log)
         title = f"level {level.number}: merge and locate"

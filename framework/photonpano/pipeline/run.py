@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from photonpano.captures.fingerprint import capture_files, fingerprint
+from photonpano.captures.fingerprint import capture_files
 from photonpano.captures.order import order_warning
 from photonpano.captures.repeats import timeline_of
 from photonpano.captures.summary import require_photons
@@ -22,6 +23,9 @@ from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.loop import LevelResult, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
+from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
+from photonpano.pipeline.checkpoints.finished import finished_run
+from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
 from photonpano.pipeline.components import build_levels, build_refiners, open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
@@ -48,20 +52,35 @@ class RunResult:
         directory: the run folder.
         record: the content of its `run.json`.
         verdict: whether motion and panorama explain the photons.
+        was_finished: whether `resume` found that nothing was left to do.
     """
 
     directory: Path
     record: RunRecord
     verdict: Verdict
+    was_finished: bool = False
 
 
-def run(plan: Plan, progress: Progress | None = None, *, overwrite: bool = False) -> RunResult:
+def run(
+    plan: Plan,
+    progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    from_level: int | None = None,
+    keep_work: bool = False,
+) -> RunResult:
     """Run a plan and write its run folder: panorama, coverage, trajectory, record and report.
 
     Args:
         plan: from `load_spec` or `parse_spec`.
         progress: receives stages and messages; quiet by default.
         overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
+        resume: go on with a run of the same spec, capture and versions that was interrupted. If it was finished, its results
+            are returned.
+        from_level: take the levels before this one from the run before, whose work was kept; compute this one and what follows.
+            The work is kept again.
+        keep_work: keep what each level has found, beside the run folder, for `from_level`.
 
     Raises:
         InputError: the capture cannot be used, shows nothing, or does not suit the plan.
@@ -79,13 +98,20 @@ def run(plan: Plan, progress: Progress | None = None, *, overwrite: bool = False
         loading_figures(),
         one_thread_inside(),
         notify_on_first_compile(partial(context.progress.note, COMPILING)),
+        ExitStack() as stack,
     ):
         start, memory = time.perf_counter(), int(plan.run.memory)
         _require_photons(plan, source)
-        capture = fingerprint(plan, source)
+        depends_on = run_fingerprint(plan, source)
+        if resume and (done := finished_run(plan, depends_on)) is not None:
+            finished(done[0])
+            return RunResult(plan.output.directory, *done, was_finished=True)
         if warning := order_warning(source):
             logger.warning(warning)
         decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
+        how = Continuation(resume, from_level, keep_work)
+        work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
+        context = replace(context, checkpoints=work.checkpoints)
         reference = _reference_frame(plan, source)
         levels = build_levels(plan, source, decisions)
         timeline = timeline_of(source, context)
@@ -93,7 +119,7 @@ def run(plan: Plan, progress: Progress | None = None, *, overwrite: bool = False
         known, later = results[0].trajectory, levels[1:]
         if vignette := vignette_of(plan, source, known):
             decisions.append(vignette.decision)
-            source = divided_by(source, vignette)
+            source, context = divided_by(source, vignette), replace(context, checkpoints=work.checkpoints.within(vignette))
             if not later:
                 results, later = [], levels
         results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
@@ -112,7 +138,10 @@ def run(plan: Plan, progress: Progress | None = None, *, overwrite: bool = False
         observers.rendered(panorama.canvas, panorama.seconds)
         folder.write_results(panorama, motion)
         seconds = time.perf_counter() - start
-        record = folder.commit(record_of(plan, source.info, decisions, results, explained, verdict, panorama, seconds, capture))
+        record = folder.commit(
+            record_of(plan, source.info, decisions, results, explained, verdict, panorama, seconds, depends_on["capture"])
+        )
+        work.finish()
         record = _with_report(folder, record, explained, panorama)
         finished(record)
     return RunResult(plan.output.directory, record, verdict)

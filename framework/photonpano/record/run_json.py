@@ -216,6 +216,11 @@ def verdict_record(verdict: Verdict) -> VerdictRecord:
     return {"status": verdict.status, "reasons": reasons, "residual_ratio": verdict.residual_ratio}
 
 
+def verdict_of(found: VerdictRecord) -> Verdict:
+    """Return the verdict that a record describes."""
+    return Verdict(found["status"], tuple(Reason(**reason) for reason in found["reasons"]), found["residual_ratio"])
+
+
 def _reason(reason: Reason) -> ReasonRecord:
     return {
         "what": reason.what,

@@ -1,0 +1,146 @@
+"""What the results of a run depend on, in parts, so that a change can be named."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import photonpano
+from photonpano.captures.fingerprint import changes, fingerprint
+from photonpano.pipeline.components import scale_of
+from photonpano.protocols import Source
+from photonpano.record.run_json import library_versions
+from photonpano.specs.plan import Choice, Plan
+
+Fingerprint = dict[str, Any]
+_STAGES = ("resample", "merge", "locate", "interpolate")
+
+
+def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
+    """Return what the results of a run depend on, as plain data.
+
+    The number of threads and the run folder are left out: results do not depend on them.
+
+    Returns:
+        `versions`, `code` and `capture`, on which everything depends; `common`, the parts of the spec on which it does;
+        `levels`, a list; and `rest`, what only the steps after the last level depend on.
+    """
+    document = plan.document
+    rest = {
+        "refine": [_component(choice) for choice in plan.refine],
+        "render": document["render"],
+        "memory": int(plan.run.memory),
+    }
+    found: Fingerprint = _plain(
+        {
+            "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
+            "code": _code([plan.source], photonpano),
+            "capture": fingerprint(plan, source),
+            "common": {
+                "source": _component(plan.source),
+                "corrections": document.get("corrections"),
+                "graph": document["graph"],
+                "run.seed": plan.run.seed,
+                "render.reference": document["render"]["reference"],
+            },
+            "levels": [_level(plan, number, source.info.frame_shape) for number in range(1, len(plan.levels) + 1)],
+            "rest": rest,
+        }
+    )
+    return found
+
+
+def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None) -> list[str]:
+    """Return what differs between two fingerprints, a clause each.
+
+    Args:
+        before: of what was kept.
+        now: of the run.
+        levels: compare only what the first so many levels depend on; None for everything.
+    """
+    found = [
+        f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])
+    ]
+    found += [f"the code of {path} has changed" for path, _, _ in _changed(before["code"], now["code"])]
+    found += changes(before["capture"], now["capture"])
+    found += _settings(before["common"], now["common"])
+    if levels is None and len(before["levels"]) != len(now["levels"]):
+        found.append(f"there were {len(before['levels'])} levels and are {len(now['levels'])}")
+    for number, (old, new) in enumerate(zip(before["levels"][:levels], now["levels"][:levels], strict=False), start=1):
+        found += _settings(old, new, f" at level {number}")
+    return found if levels is not None else found + _settings(before["rest"], now["rest"])
+
+
+def _level(plan: Plan, number: int, frame_shape: tuple[int, int]) -> dict[str, Any]:
+    level = plan.levels[number - 1]
+    choices = {stage: getattr(level, stage) for stage in _STAGES}
+    return {
+        "scale": scale_of(plan, number, frame_shape),
+        **{stage: _component(choice) for stage, choice in choices.items()},
+        "fallback": [_component(choice) for choice in level.fallbacks],
+        "code": _code([*choices.values(), *level.fallbacks]),
+    }
+
+
+def _component(choice: Choice) -> dict[str, Any]:
+    return {
+        "use": choice.contribution.name,
+        "plugin": f"{choice.origin.plugin} {choice.origin.version}",
+        "with": choice.config.model_dump(mode="json"),
+    }
+
+
+def _code(choices: Sequence[Choice], *packages: Any) -> dict[str, str]:
+    """Return a hash of the Python files of the plugins that provide components, by package.
+
+    The version of a plugin stays the same while its author works on it.
+    """
+    built_by = (sys.modules.get(choice.contribution.build.__module__.partition(".")[0]) for choice in choices)
+    return {
+        module.__name__: _hash_of(module.__file__) for module in (*packages, *built_by) if getattr(module, "__file__", None)
+    }
+
+
+@cache
+def _hash_of(file: str) -> str:
+    """Hash a module; of a package, all its Python files."""
+    path, found = Path(file), hashlib.blake2b(digest_size=16)
+    files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+    for each in files:
+        found.update(f"{each.relative_to(path.parent)}\0".encode())
+        found.update(hashlib.sha256(each.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def _settings(before: Any, now: Any, where: str = "") -> list[str]:
+    return [
+        f"the code of {path.removeprefix('code.')} has changed"
+        if path.startswith("code.")
+        else f"{path} was {_short(old)} and is {_short(new)}{where}"
+        for path, old, new in _changed(before, now)
+    ]
+
+
+def _changed(before: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the places where two values of plain data differ, with both values; None stands for nothing."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for key in dict.fromkeys([*before, *now]):
+            yield from _changed(before.get(key), now.get(key), f"{path}.{key}" if path else key)
+    elif before != now:
+        yield path, before, now
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _plain(value: Any) -> Any:
+    """Return data as it is read back from JSON."""
+    return json.loads(json.dumps(value))

@@ -1,0 +1,48 @@
+"""Find a run that is finished already, so that nothing is left to do."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from photonpano.captures.fingerprint import changes
+from photonpano.errors import InputError
+from photonpano.pipeline.checkpoints.fingerprint import Fingerprint
+from photonpano.record.contents import changed_files
+from photonpano.record.run_json import library_versions, plugin_records, read_record, verdict_of
+from photonpano.record.schema import RunRecord
+from photonpano.residuals.verdict import Verdict
+from photonpano.specs.plan import Plan
+
+
+def finished_run(plan: Plan, now: Fingerprint) -> tuple[RunRecord, Verdict] | None:
+    """Return the record and verdict in the run folder of a plan, if it is of this spec, capture and software, and unchanged.
+
+    Args:
+        plan: what would be run.
+        now: what its results would depend on.
+    """
+    try:
+        record = read_record(plan.output.directory)
+        same = (
+            record["photonpano"] == importlib.metadata.version("photonpano")
+            and record["libraries"] == library_versions(plan)
+            and record["plugins"] == plugin_records(plan)
+            and _without_machine(record["spec"]) == _without_machine(plan.document)
+            and not changes(record["capture"], now["capture"])
+            and all((plan.output.directory / name).exists() for name in record["files"])
+            and not changed_files(plan.output.directory)
+        )
+        return (record, verdict_of(record["verdict"])) if same and record["verdict"] is not None else None
+    except (InputError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _without_machine(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a spec as plain data, without what results do not depend on: the run folder, and the number of threads."""
+    run = {key: value for key, value in document["run"].items() if key != "threads"}
+    plain: dict[str, Any] = json.loads(json.dumps({**document, "run": run}))
+    plain.pop("output", None)
+    return plain

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from photonpano.pipeline.checkpoints.kept import Kept, finished
+from photonpano.pipeline.checkpoints.store import Store
+from photonpano.values import Decision, Located
+
+VALUE = Located(np.random.default_rng(0).random((3, 3)), None, 0.25, {"matches": 7.0})
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path)
+
+
+def test_store_returns_what_was_saved(store: Store) -> None:
+    assert not store.holds_something
+    assert store.save("a.1", VALUE)
+    assert store.load("a.1").homography.tobytes() == VALUE.homography.tobytes()
+    assert store.load("a.2") is None
+    assert store.names("a.") == ["a.1"]
+    assert Store(store.folder).holds_something
+
+
+def test_damaged_record_is_reported_or_reads_the_same(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    store.save("a", VALUE)
+    path = store.folder / "a.npz"
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    damages = [whole[: int(length)] for length in rng.integers(0, len(whole), 60)]
+    for place, bit in zip(rng.integers(0, len(whole), 400), rng.integers(0, 8, 400), strict=True):
+        damages.append(whole[:place] + bytes([whole[place] ^ (1 << bit)]) + whole[place + 1 :])
+    n_damaged = 0
+    for damaged in damages:
+        path.write_bytes(damaged)
+        caplog.clear()
+        found = store.load("a")
+        if found is None:
+            n_damaged += 1
+            assert f"{path} is damaged (" in caplog.text
+            assert not path.exists()
+        else:  # the bit is one that nothing depends on, such as that of a date
+            assert found.homography.tobytes() == VALUE.homography.tobytes()
+            assert (found.information, found.residual_px, found.evidence) == (None, 0.25, {"matches": 7.0})
+    assert n_damaged > 300
+
+
+@contextmanager
+def full_disk(monkeypatch: pytest.MonkeyPatch, free: int) -> Iterator[None]:
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+        yield
+
+
+def test_full_disk_is_one_warning_and_leaves_room_for_the_results(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with full_disk(monkeypatch, free=300):
+        assert not store.save("a", VALUE)
+        assert not store.save("b", VALUE)
+    assert caplog.messages == [
+        f"{store.folder}: what was found is not kept, as the 300 B free are for the results; the run goes on, but if it is "
+        "interrupted, this is computed again"
+    ]
+    assert not store.holds_something
+    assert list(store.folder.iterdir()) == []
+    assert store.save("a", VALUE)
+
+
+def test_error_while_writing_is_a_warning(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(np, "savez", fails)
+    assert not store.save("a", VALUE)
+    assert caplog.messages == [
+        f"cannot write {store.folder}/a.npz: No space left on device; free some space or choose another folder; the run goes "
+        "on, but if it is interrupted, this is computed again"
+    ]
+    assert list(store.folder.iterdir()) == []
+
+
+def test_once_computes_a_result_once_and_repeats_its_decisions(store: Store) -> None:
+    calls, decisions = [], []
+
+    def compute() -> Located:
+        calls.append(1)
+        decisions.append(Decision("chunks", 3, "short"))
+        return VALUE
+
+    kept = Kept(store, decisions)
+    given = np.eye(3), "x"
+    for _ in range(2):
+        assert kept.once("step", compute, *given).residual_px == VALUE.residual_px
+    assert len(calls) == 1
+    assert decisions == 2 * [Decision("chunks", 3, "short")]
+    kept.once("step", compute, np.eye(3), "y")
+    kept.once("other", compute, *given)
+    kept.within("vignette").once("step", compute, *given)
+    assert len(calls) == 4
+
+
+def test_once_keeps_none_as_a_result(store: Store) -> None:
+    calls: list[int] = []
+    for _ in range(2):
+        assert Kept(store, []).once("step", lambda: calls.append(1)) is None
+    assert len(calls) == 1
+
+
+@pytest.fixture
+def written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0)
+
+
+def test_log_goes_on_after_the_last_result_that_was_written(store: Store, written_at_once: None) -> None:
+    log = Kept(store, []).log("level-1", "given")
+    for number in range(5):
+        log.add(number)
+    again = Kept(store, []).log("level-1", "given")
+    assert again.found == [0, 1, 2, 3, 4]
+    again.add(5)
+    assert Kept(store, []).log("level-1", "given").found == [0, 1, 2, 3, 4, 5]
+    assert Kept(store, []).log("level-1", "other").found == []
+    assert Kept(store, []).log("level-1-revisits", "given").found == []
+    assert not finished(store, "level-1")
+    again.finish()
+    assert finished(store, "level-1")
+
+
+def test_log_waits_between_files_until_it_is_flushed(store: Store) -> None:
+    kept = Kept(store, [])
+    log = kept.log("level-1")
+    log.add(0)
+    log.add(1)
+    assert Kept(store, []).log("level-1").found == []
+    kept.flush()
+    assert Kept(store, []).log("level-1").found == [0, 1]
+    assert len(store.names("level-1")) == 1
+
+
+def test_log_ends_before_a_damaged_file(store: Store, written_at_once: None, caplog: pytest.LogCaptureFixture) -> None:
+    log = Kept(store, []).log("level-1")
+    for number in range(4):
+        log.add(number)
+    (store.folder / f"{store.names('level-1')[2]}.npz").write_bytes(b"nonsense")
+    log = Kept(store, []).log("level-1")
+    assert log.found == [0, 1]
+    assert "is damaged" in caplog.text
+    log.add(2)
+    # What comes after it was found from the same results, and is still right.
+    assert Kept(store, []).log("level-1").found == [0, 1, 2, 3]
+
+
+def test_log_repeats_decisions_unless_they_are_taken_again(store: Store, written_at_once: None) -> None:
+    first, second = Decision("chunk_frames", 3, "short"), Decision("other", 1, "why")
+    decisions: list[Decision] = []
+    log = Kept(store, decisions).log("level-1")
+    decisions += [first, second]
+    log.add(0)
+    later: list[Decision] = [Decision("source", "npy", "suffix")]
+    log = Kept(store, later).log("level-1")
+    later.append(first)
+    log.finish()
+    assert later[1:] == [first, second]

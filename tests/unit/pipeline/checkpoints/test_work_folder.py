@@ -1,0 +1,306 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from photonpano import InputError
+from photonpano.context import Quiet
+from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, path_of, work_folder
+
+RESUMING = Continuation(resume=True)
+LEVEL = {"scale": 1.0, "locate": {"use": "direct", "with": {"blur_px": 0.8}}, "code": {"photonpano_direct": "aa"}}
+
+
+def fingerprint(**changes: Any) -> dict[str, Any]:
+    """Return a fingerprint of a run of three levels; a change of `levels.2.scale` is written `levels__2__scale`."""
+    found: dict[str, Any] = {
+        "versions": {"photonpano": "0.1.0", "numpy": "2.4.6"},
+        "code": {"photonpano": "aa"},
+        "capture": {"files": [], "frames_sha256": "aa", "pixels_sha256": "aa"},
+        "common": {"source": {"use": "packed-npy"}, "run.seed": 0},
+        "levels": [LEVEL, LEVEL, LEVEL],
+        "rest": {"render": {"scale": 1.0}},
+    }
+    found = json.loads(json.dumps(found))
+    for path, value in changes.items():
+        *keys, last = path.split("__")
+        at = found
+        for key in keys:
+            at = at[int(key)] if isinstance(at, list) else at[key]
+        at[last] = value
+    return found
+
+
+class Notes(Quiet):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.lines.append(message)
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    return tmp_path / "runs" / "scan"
+
+
+@contextmanager
+def working(
+    place: Path, now: dict[str, Any] | None = None, how: Continuation | None = None, notes: Notes | None = None
+) -> Iterator[Work]:
+    with work_folder(place, now or fingerprint(), [], how or Continuation(), notes or Notes()) as work:
+        yield work
+
+
+def interrupt(place: Path, now: dict[str, Any] | None = None, levels: int = 1, notes: Notes | None = None, **how: Any) -> None:
+    """Find `levels` levels and the motion of a refiner, and be interrupted."""
+    with suppress(Killed), working(place, now, Continuation(**how), notes) as work:
+        for level in range(1, levels + 1):
+            log = work.checkpoints.log(f"level-{level}")
+            log.add(level)
+            log.finish()
+        work.checkpoints.once("refined", lambda: 7)
+        raise Killed
+
+
+def found(work: Work) -> dict[str, Any]:
+    """Return what is there."""
+    logs = {f"level-{level}": work.checkpoints.log(f"level-{level}").found for level in (1, 2, 3)}
+    computed: list[int] = []
+    work.checkpoints.once("refined", lambda: computed.append(1))
+    return {name: results for name, results in logs.items() if results} | ({} if computed else {"refined": True})
+
+
+def test_finished_run_leaves_no_work_folder(place: Path) -> None:
+    with working(place) as work:
+        work.checkpoints.once("refined", lambda: 7)
+        assert path_of(place).is_dir()
+        work.finish()
+    assert list(place.parent.iterdir()) == []
+
+
+def test_error_before_anything_is_found_leaves_no_work_folder(place: Path) -> None:
+    notes = Notes()
+    with pytest.raises(InputError), working(place, notes=notes):
+        raise InputError("no photons")
+    assert list(place.parent.iterdir()) == []
+    assert notes.lines == []
+
+
+def test_resumed_run_finds_what_was_kept(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+    notes = Notes()
+    interrupt(place, notes=notes)
+    assert notes.lines == [f"{path_of(place)} holds what was found; with --resume, the run goes on from there"]
+    with working(place, how=RESUMING, notes=notes) as work:
+        assert found(work) == {"level-1": [1], "refined": True}
+    assert notes.lines[1:] == [f"going on with the interrupted run, from {path_of(place)}"]
+    assert caplog.messages == []
+
+
+def test_resume_without_interrupted_run_starts_at_the_beginning(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+    notes = Notes()
+    with working(place, how=RESUMING, notes=notes) as work:
+        assert found(work) == {}
+    assert notes.lines == ["there is no interrupted run to go on with: the run starts at the beginning"]
+    assert caplog.messages == []
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"versions__photonpano": "0.2.0"}, "the version of photonpano was 0.1.0 and is 0.2.0"),
+        ({"code__photonpano": "bb"}, "the code of photonpano has changed"),
+        ({"levels__0__code__photonpano_direct": "bb"}, "the code of photonpano_direct has changed"),
+        ({"capture__frames_sha256": "bb"}, "the frames are others"),
+        ({"common__run.seed": 1}, "run.seed was 0 and is 1"),
+        ({"levels__1__locate__with__blur_px": 1.5}, "locate.with.blur_px was 0.8 and is 1.5 at level 2"),
+        ({"levels": [LEVEL]}, "there were 3 levels and are 1"),
+        ({"rest__render__scale": 2.0}, "render.scale was 1.0 and is 2.0"),
+    ],
+    ids=str,
+)
+def test_changed_run_starts_again_and_says_why(
+    place: Path, change: dict[str, Any], reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    interrupt(place)
+    with working(place, fingerprint(**change), RESUMING) as work:
+        assert found(work) == {}
+    assert caplog.messages == [f"{path_of(place)}: the interrupted run is not continued, but started again: {reason}"]
+
+
+def test_message_names_three_of_many_changes(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+    interrupt(place)
+    with working(place, fingerprint(code__a="b", code__c="d", code__e="f", code__g="h", code__i="j"), RESUMING):
+        pass
+    assert caplog.messages[0].endswith(
+        "the code of a has changed, the code of c has changed, the code of e has changed, and 2 more"
+    )
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", '{"format": 1}', '{"format": 2, "finished": false}', "[" * 10_000, "\xff", "null"]
+)
+def test_damaged_manifest_starts_again_and_says_why(place: Path, content: str, caplog: pytest.LogCaptureFixture) -> None:
+    interrupt(place)
+    (path_of(place) / "work.json").write_text(content, encoding="latin-1")
+    with working(place, how=RESUMING) as work:
+        assert found(work) == {}
+    assert caplog.messages == [
+        f"{path_of(place)}: the interrupted run is not continued, but started again: work.json is missing or damaged"
+    ]
+
+
+def test_run_without_resume_replaces_the_work_and_says_so(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+    interrupt(place)
+    with working(place) as work:
+        assert found(work) == {}
+    assert caplog.messages == [
+        f"{path_of(place)} held the work of an interrupted run, which --resume would have continued; it is replaced"
+    ]
+
+
+def test_run_of_another_spec_replaces_the_work_and_says_so(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+    interrupt(place)
+    with working(place, fingerprint(rest__render__scale=2.0)):
+        pass
+    assert caplog.messages == [f"{path_of(place)} held the work of an interrupted run of something else; it is replaced"]
+
+
+def test_kept_work_is_replaced_in_silence(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with working(place, how=Continuation(keep=True)) as work:
+        work.checkpoints.once("refined", lambda: 7)
+        work.finish()
+    assert path_of(place).is_dir()
+    with working(place) as work:
+        assert found(work) == {}
+    assert caplog.messages == []
+
+
+def test_from_level_takes_the_levels_before_it_alone(place: Path) -> None:
+    interrupt(place, levels=3)
+    changed = fingerprint(levels__2__scale=2.0, rest__render__scale=2.0)
+    with working(place, changed, Continuation(from_level=3)) as work:
+        assert found(work) == {"level-1": [1], "level-2": [2]}
+        work.finish()
+    # The work is kept, so that more can be tried.
+    with working(place, changed, Continuation(from_level=2)) as work:
+        assert found(work) == {"level-1": [1]}
+
+
+def test_from_level_after_the_last_takes_all_levels(place: Path) -> None:
+    interrupt(place, levels=3)
+    with working(place, fingerprint(rest__render__scale=2.0), Continuation(from_level=4)) as work:
+        assert found(work) == {"level-1": [1], "level-2": [2], "level-3": [3]}
+
+
+@pytest.mark.parametrize(
+    ("levels", "from_level", "change", "message"),
+    [
+        (0, 2, {}, "--from-level 2: {work} holds no finished level; run without the option"),
+        (1, 3, {}, "--from-level 3: {work} holds 1 finished level; expected 2"),
+        (2, 4, {}, "--from-level 4: {work} holds 2 finished levels; expected 2 or 3"),
+        (3, 5, {}, "--from-level 5: the spec has 3 levels; expected 2 to 4"),
+        (3, 1, {}, "--from-level 1: the spec has 3 levels; expected 2 to 4"),
+        (
+            3,
+            3,
+            {"levels__1__scale": 2.0},
+            "--from-level 3: the levels before it were found in another way: scale was 1.0 and is 2.0 at level 2; run without "
+            "the option, or from an earlier level",
+        ),
+        (
+            3,
+            2,
+            {"capture__frames_sha256": "bb"},
+            "--from-level 2: the levels before it were found in another way: the frames are others; run without the option, or "
+            "from an earlier level",
+        ),
+    ],
+)
+def test_from_level_without_such_levels_is_an_error_and_changes_nothing(
+    place: Path, levels: int, from_level: int, change: dict[str, Any], message: str
+) -> None:
+    interrupt(place, levels=levels)
+    with pytest.raises(InputError) as error, working(place, fingerprint(**change), Continuation(from_level=from_level)):
+        pass
+    assert str(error.value) == message.format(work=path_of(place))
+    with working(place, how=RESUMING) as work:
+        assert found(work) == {"refined": True} | {f"level-{each}": [each] for each in range(1, levels + 1)}
+
+
+def test_from_level_without_work_is_an_error(place: Path) -> None:
+    with pytest.raises(InputError) as error, working(place, how=Continuation(from_level=2)):
+        pass
+    assert str(error.value) == f"--from-level 2: there is no work folder {path_of(place)}; run with --keep-work first"
+
+
+def test_folder_of_somebody_else_is_left_alone(place: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path_of(place).mkdir(parents=True)
+    (path_of(place) / "thesis.tex").write_text("unique")
+    with working(place) as work:
+        assert work.checkpoints.once("refined", lambda: 7) == 7
+        work.finish()
+    assert caplog.messages == [
+        f"{path_of(place)}: what the run finds cannot be kept (it is there already, and is not the work folder of a run); if it"
+        " is interrupted, all of it is computed again"
+    ]
+    assert [path.name for path in path_of(place).iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_file_or_link_in_place_of_the_folder_is_left_alone(
+    place: Path, tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    place.parent.mkdir()
+    target = tmp_path / "elsewhere"
+    target.mkdir()
+    if kind == "file":
+        path_of(place).write_text("mine")
+    else:
+        path_of(place).symlink_to(target)
+    with working(place, how=RESUMING) as work:
+        work.checkpoints.once("refined", lambda: 7)
+        work.finish()
+    assert "is not the work folder of a run" in caplog.text
+    assert list(target.iterdir()) == []
+    assert path_of(place).is_symlink() == (kind == "link")
+
+
+def test_folder_that_cannot_be_made_is_a_warning(
+    place: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuses(*_: Any, **__: Any) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", refuses)  # permissions do not bind root
+    with working(place) as work:
+        assert work.checkpoints.once("refined", lambda: 7) == 7
+        work.finish()
+    assert caplog.messages == [
+        f"{path_of(place)}: what the run finds cannot be kept (Permission denied); if it is interrupted, all of it is computed "
+        "again"
+    ]
+
+
+def test_leftovers_of_a_killed_process_are_removed(place: Path) -> None:
+    interrupt(place)
+    for name in (".level-1.aa.0000.0123abcd.partial.npz", ".work.0123abcd.partial.json"):
+        (path_of(place) / name).write_text("cut sh")
+    with working(place, how=RESUMING):
+        assert sorted(path.name for path in path_of(place).iterdir() if path.name.startswith(".")) == []
+
+
+def test_work_stands_beside_the_run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert path_of(Path("runs/scan")) == tmp_path / "runs" / "scan.work"
+    assert path_of(Path("runs/v1.2")) == tmp_path / "runs" / "v1.2.work"
+    assert path_of(Path()) == tmp_path.with_name(f"{tmp_path.name}.work")
