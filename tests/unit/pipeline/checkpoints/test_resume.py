@@ -1,0 +1,137 @@
+"""Whole runs that are interrupted, and go on with the same bytes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonpano import Plan, run
+from photonpano.corrections import Vignette
+from photonpano.pipeline.checkpoints.store import Store
+from photonpano.pipeline.checkpoints.work_folder import path_of
+from photonpano.pipeline.run import RunResult
+from photonpano.specs import parse_spec
+from photonpano.values import FrameSpan
+from photonpano_direct.locator import DirectLocator
+
+SHAPE = (64, 96)
+FILES = ("trajectory.npz", "panorama.tiff", "coverage.tiff")
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no report, and write every result at once, so that a run can be killed after each."""
+    monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0)
+
+
+@pytest.fixture(scope="module")
+def capture(simulated: Callable[..., Path]) -> Path:
+    return simulated(n_frames=240, frame_shape=list(SHAPE), path={"kind": "pan", "length_px": 40})
+
+
+@pytest.fixture
+def plan_of(capture: Path, tmp_path: Path) -> Callable[..., Plan]:
+    spec: dict[str, Any] = {
+        "version": 1,
+        "source": {"use": "packed-npy", "with": {"path": str(capture), "frame_rate_hz": 96800}},
+        "resample": {"use": "midpoint", "with": {"group_size": 40}},
+        "levels": 2,
+    }
+
+    def plan_of(name: str, **changes: Any) -> Plan:
+        return parse_spec(spec | changes, output=tmp_path / name)
+
+    return plan_of
+
+
+def bytes_of(result: RunResult) -> list[bytes]:
+    return [(result.directory / name).read_bytes() for name in FILES]
+
+
+def decisions_of(result: RunResult) -> list[str]:
+    return sorted(json.dumps(decision) for decision in result.record["decisions"])
+
+
+def kill(monkeypatch: pytest.MonkeyPatch, plan: Plan, n_records: int) -> None:
+    """Run a plan until it has kept this many more records, and kill it then."""
+    save, saved = Store.save, 0
+
+    def dying(self: Store, name: str, value: Any) -> bool:
+        nonlocal saved
+        saved += 1
+        if saved > n_records:
+            raise Killed
+        return save(self, name, value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "save", dying)
+        with pytest.raises(Killed):
+            run(plan, resume=True)
+
+
+def test_run_killed_five_times_ends_with_the_same_bytes(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+    gain = np.linspace(0.9, 1, SHAPE[0] * SHAPE[1], dtype=np.float32).reshape(SHAPE)
+    vignette = Vignette(gain, np.full_like(gain, 0.3), (FrameSpan(0, 240),))
+    monkeypatch.setattr("photonpano.pipeline.run.vignette_of", lambda *_: vignette)  # the last level runs twice
+    unbroken, killed = run(plan_of("unbroken")), plan_of("killed")
+    for n_records in (3, 8, 9, 6, 4):
+        kill(monkeypatch, killed, n_records)
+    resumed = run(killed, resume=True)
+    assert bytes_of(resumed) == bytes_of(unbroken)
+    assert decisions_of(resumed) == decisions_of(unbroken)
+    assert resumed.verdict == unbroken.verdict
+    assert not path_of(resumed.directory).exists()
+
+
+def test_resumed_run_repeats_nothing_that_was_kept(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+    killed = plan_of("killed", render={"scale": 1.5})
+
+    def dies(*_: Any) -> None:
+        raise Killed
+
+    def repeats(*_: Any) -> None:
+        pytest.fail("this was found before")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("photonpano.pipeline.run_folder.RunFolder.write_results", dies)
+        with pytest.raises(Killed):
+            run(killed)
+    monkeypatch.setattr(DirectLocator, "register", repeats)
+    for step in ("motion.registration.starting_motion", "residuals.refinement.measure", "merging.panorama.accumulate"):
+        monkeypatch.setattr(f"photonpano.{step}", repeats)
+    run(killed, resume=True)
+
+
+def test_last_level_with_other_settings_starts_from_the_first(
+    plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(plan_of("scan"), keep_work=True)
+    other = {"levels": [{}, {"resample": {"with": {"group_size": 30}}}], "render": {"scale": 0.5}}
+    anew = run(plan_of("anew", **other))
+    monkeypatch.setattr("photonpano.motion.registration.starting_motion", lambda *_: pytest.fail("level 1 was found before"))
+    again = run(plan_of("scan", **other), from_level=2)
+    assert bytes_of(again) == bytes_of(anew)
+    assert path_of(again.directory).is_dir()
+
+
+def test_resume_of_finished_run_returns_its_results(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+    first = run(plan_of("scan"))
+    written = bytes_of(first)
+    monkeypatch.setattr("photonpano.pipeline.run.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
+    again = run(plan_of("scan"), resume=True)
+    assert again.was_finished
+    assert not first.was_finished
+    assert again.verdict == first.verdict
+    assert bytes_of(again) == written
+    with pytest.raises(pytest.fail.Exception, match="it was finished"):
+        run(plan_of("scan", render={"scale": 0.5}), resume=True)
