@@ -29,8 +29,8 @@ from photonpano import parse_spec, run, simulate
 FILES = ("trajectory.npz", "panorama.tiff", "coverage.tiff")
 CAPTURE = {
     "scene": {"kind": "street", "width": 512, "height": 400},
-    "path": {"kind": "pan", "length_px": 60, "shake": {"rms_px": 1.5, "frequencies_hz": [600, 1500]}},
-    "n_frames": 600,
+    "path": {"kind": "pan", "length_px": 40, "shake": {"rms_px": 1.5, "frequencies_hz": [600, 1500]}},
+    "n_frames": 300,
     "frame_shape": [64, 96],
 }
 
