@@ -195,7 +195,8 @@ def _cut_at(
         again = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged, timeline=cut)
         motion = motion_of_frames(again, source.info, reference)
         seen = Look(source, motion, plan.render.tolerance_px, int(plan.run.memory), context)
-        worse = seen.worse_than(look)
+        # Frames that show nothing contradict any motion, and the surer it is the more; such a run is doubtful in any case.
+        worse = "" if any(each.dark is not None for each in cuts) else seen.worse_than(look)
     except (LocationError, CanvasTooLargeError) as error:
         worse = str(error)
     if worse:
