@@ -369,11 +369,12 @@ def fuzz(name: str, seed: int, seconds: float) -> tuple[Counter[str], dict[str, 
     """Damage files of a kind for some time; return counts, and the numbers of failures by their messages."""
     counts: Counter[str] = Counter()
     failures: dict[str, list[int]] = {}
-    first, end = 0, time.monotonic() + seconds
+    first, end = 0, float("inf")
     worker = Worker(name, seed, first)
     try:
         while time.monotonic() < end:
             begun = worker.line(300)
+            end = min(end, time.monotonic() + seconds)  # without the imports of the first file
             if not begun:
                 raise RuntimeError(f"{name}: the worker ended with {worker.end()}")
             first = int(begun.split()[1]) + 1
