@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -218,7 +219,8 @@ def verdict_record(verdict: Verdict) -> VerdictRecord:
 
 def verdict_of(found: VerdictRecord) -> Verdict:
     """Return the verdict that a record describes."""
-    return Verdict(found["status"], tuple(Reason(**reason) for reason in found["reasons"]), found["residual_ratio"])
+    status: Literal["trusted", "doubtful"] = "trusted" if found["status"] == "trusted" else "doubtful"
+    return Verdict(status, tuple(Reason(**reason) for reason in found["reasons"]), found["residual_ratio"])
 
 
 def _reason(reason: Reason) -> ReasonRecord:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from photonpano.captures.fingerprint import CaptureRecord
 
@@ -140,7 +140,7 @@ class VerdictRecord(TypedDict):
     what noise explains: about 1 if nothing is left. None if there are too few frames to tell.
     """
 
-    status: Literal["trusted", "doubtful"]
+    status: str
     reasons: Sequence[ReasonRecord]
     residual_ratio: float | None
 
