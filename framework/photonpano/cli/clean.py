@@ -12,9 +12,9 @@ def clean(
     ],
     dry_run: Annotated[bool, typer.Option("--dry-run", "-n", help="List what would be removed, and remove nothing.")] = False,
 ) -> None:
-    """Remove what killed processes have left: unfinished files, locks, unpacked archives.
+    """Remove what killed processes have left.
 
-    Looks into all folders in DIR, and prints what it removes. Nothing is removed that a process uses, nor the unfinished files
+    That is unfinished files, locks and unpacked archives. Looks into all folders in DIR, and prints what it removes. Nothing is removed that a process uses, nor the unfinished files
     of 'convert', which it continues.
 
     Example: photonpano clean . --dry-run
