@@ -14,8 +14,8 @@ def clean(
 ) -> None:
     """Remove what killed processes have left.
 
-    That is unfinished files, locks and unpacked archives. Looks into all folders in DIR, and prints what it removes. Nothing is removed that a process uses, nor the unfinished files
-    of 'convert', which it continues.
+    That is unfinished files, locks and unpacked archives. Looks into all folders in DIR, and prints what it removes. Nothing
+    is removed that a process uses, nor the unfinished files of 'convert', which it continues.
 
     Example: photonpano clean . --dry-run
     """
