@@ -16,7 +16,7 @@ from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.geometry import FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.components import open_source
-from photonpano.pipeline.run import vignette_of
+from photonpano.pipeline.estimate import vignette_of
 from photonpano.protocols import Source
 from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,29 +11,24 @@ from pathlib import Path
 
 from photonpano.captures.fingerprint import capture_files
 from photonpano.captures.order import order_warning
-from photonpano.captures.repeats import timeline_of
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
-from photonpano.contributions import MergerContribution
-from photonpano.corrections import CorrectedSource, Vignette, divided_by, estimate_vignette
-from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError
+from photonpano.corrections import CorrectedSource
+from photonpano.errors import InputError, OutputError
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
-from photonpano.motion.frame_motion import motion_of_frames
-from photonpano.motion.loop import LevelResult, estimate_motion
-from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
-from photonpano.pipeline.components import build_levels, build_refiners, open_source
+from photonpano.pipeline.components import build_refiners, open_source
+from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
-from photonpano.protocols import Source, Trajectory
+from photonpano.protocols import Source
 from photonpano.record.run_json import peak_memory_bytes, record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
-from photonpano.residuals.cuts import find_cuts
-from photonpano.residuals.refinement import Explained, Look, refine
+from photonpano.residuals.refinement import Explained, refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
@@ -112,25 +106,11 @@ def run(
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
         context = replace(context, checkpoints=work.checkpoints)
-        reference = _reference_frame(plan, source)
-        levels = build_levels(plan, source, decisions)
-        timeline = timeline_of(source, context)
-        results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline)
-        known, later = results[0].trajectory, levels[1:]
-        if vignette := vignette_of(plan, source, known):
-            decisions.append(vignette.decision)
-            source, context = divided_by(source, vignette), replace(context, checkpoints=work.checkpoints.within(vignette))
-            if not later:
-                results, later = [], levels
-        results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
-        rendering = plan.render.tolerance_px, memory, context
-        look = Look(source, motion_of_frames(results, source.info, reference), *rendering)
-        if cuts := find_cuts(source, look, context):
-            timeline, results, look = _cut_at(cuts, plan, source, context, timeline, results, look)
-        decisions += timeline.decisions
+        found = estimate(plan, source, decisions, context)
+        source, context = found.source, found.context
         refiners = build_refiners(plan, source, decisions)
-        explained = refine(source, look, refiners, *rendering)
-        verdict = judge(explained, results, decisions)
+        explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)
+        verdict = judge(explained, found.results, decisions)
         motion = explained.motion
         panorama = render_panorama(
             source, motion.trajectory, motion.span, plan.render, memory, folder.write_tile, context, explained.panorama
@@ -139,21 +119,12 @@ def run(
         folder.write_results(panorama, motion)
         seconds = time.perf_counter() - start
         record = folder.commit(
-            record_of(plan, source.info, decisions, results, explained, verdict, panorama, seconds, depends_on["capture"])
+            record_of(plan, source.info, decisions, found.results, explained, verdict, panorama, seconds, depends_on["capture"])
         )
         work.finish()
         record = _with_report(folder, record, explained, panorama)
         finished(record)
     return RunResult(plan.output.directory, record, verdict)
-
-
-def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
-    """Measure the vignette of a capture, unless its spec lists corrections, or a merger does not accept corrected sums."""
-    mergers = [level.merge.contribution for level in plan.levels]
-    accepted = all(isinstance(merger, MergerContribution) and merger.accepts_corrected_sums for merger in mergers)
-    if not plan.corrects_itself or source.info.kind != "binary" or not accepted:
-        return None
-    return estimate_vignette(source, trajectory)
 
 
 def _read_files(plan: Plan) -> list[Path]:
@@ -176,45 +147,9 @@ def _with_report(folder: RunFolder, record: RunRecord, explained: Explained, pan
         return {**record, "warnings": [*record["warnings"], warning]}
 
 
-def _cut_at(
-    cuts: Sequence[Cut],
-    plan: Plan,
-    source: Source,
-    context: Context,
-    timeline: Timeline,
-    results: list[LevelResult],
-    look: Look,
-) -> tuple[Timeline, list[LevelResult], Look]:
-    """Estimate the motion again, cut where the image jumps; keep what was known if that explains the photons better.
-
-    All levels run again: with exposures across a jump, the first went astray, too.
-    """
-    cut, reference = timeline.cut_at(cuts), look.motion.reference
-    try:
-        levels = build_levels(plan, source, [])
-        again = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged, timeline=cut)
-        motion = motion_of_frames(again, source.info, reference)
-        seen = Look(source, motion, plan.render.tolerance_px, int(plan.run.memory), context)
-        # Frames that show nothing contradict any motion, and the surer it is the more; such a run is doubtful in any case.
-        worse = "" if any(each.dark is not None for each in cuts) else seen.worse_than(look)
-    except (LocationError, CanvasTooLargeError) as error:
-        worse = str(error)
-    if worse:
-        places = ", ".join(f"frame {each.frame}" for each in cuts)
-        logger.warning(f"the image seems to jump before {places}, but the motion is not cut there: {worse}")
-        return timeline, results, look
-    return cut.cut_at([each.along(motion.trajectory, motion.frame_shape) for each in cuts]), again, seen
-
-
 def _require_photons(plan: Plan, source: Source) -> None:
     """Refuse a capture that is all dark or all lit, at the place of the spec that names it."""
     try:
         require_photons(source)
     except InputError as error:
         raise InputError(str(plan.place("source").problem(str(error)))) from error
-
-
-def _reference_frame(plan: Plan, source: Source) -> int:
-    n_frames, reference = source.info.n_frames, plan.render.reference
-    named = {"first": 0, "middle": n_frames // 2, "last": n_frames - 1}
-    return named[reference] if isinstance(reference, str) else reference

@@ -1,0 +1,119 @@
+"""Estimate the motion of a capture: all levels, and again what a vignette or a jump of the image has led astray."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from photonpano.captures.repeats import timeline_of
+from photonpano.context import Context
+from photonpano.contributions import MergerContribution
+from photonpano.corrections import Vignette, divided_by, estimate_vignette
+from photonpano.errors import CanvasTooLargeError, LocationError
+from photonpano.motion.frame_motion import motion_of_frames
+from photonpano.motion.loop import LevelResult, estimate_motion
+from photonpano.motion.timeline import Cut, Timeline
+from photonpano.pipeline.components import build_levels
+from photonpano.protocols import Source, Trajectory
+from photonpano.residuals.cuts import find_cuts
+from photonpano.residuals.refinement import Look
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The motion of a capture.
+
+    Attributes:
+        source: the capture, divided by its vignette if it has one.
+        context: of what is done with this source: its checkpoints depend on the vignette.
+        results: of all levels.
+        timeline: where frames repeat, and where the image jumps.
+        look: the motion, the panorama along it, and what that does not explain.
+    """
+
+    source: Source
+    context: Context
+    results: list[LevelResult]
+    timeline: Timeline
+    look: Look
+
+
+def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Context) -> Estimate:
+    """Estimate the motion of a capture, and correct what the capture shows to be in its way.
+
+    Args:
+        plan: what to do.
+        source: the capture.
+        decisions: what was chosen from the capture; added to.
+        context: threads, progress and checkpoints.
+
+    Raises:
+        LocationError: the motion could not be estimated.
+        CanvasTooLargeError: the panorama would be far larger than the memory.
+        PluginError: a component failed in its own way, or broke its contract.
+    """
+    reference = _reference_frame(plan, source)
+    levels = build_levels(plan, source, decisions)
+    timeline = timeline_of(source, context)
+    results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline)
+    known, later = results[0].trajectory, levels[1:]
+    if vignette := vignette_of(plan, source, known):
+        decisions.append(vignette.decision)
+        source, context = divided_by(source, vignette), replace(context, checkpoints=context.checkpoints.within(vignette))
+        if not later:
+            results, later = [], levels
+    results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
+    found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context))
+    if cuts := find_cuts(source, found.look, context):
+        found = _cut_at(cuts, plan, found)
+    decisions += found.timeline.decisions
+    return found
+
+
+def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
+    """Measure the vignette of a capture, unless its spec lists corrections, or a merger does not accept corrected sums."""
+    mergers = [level.merge.contribution for level in plan.levels]
+    accepted = all(isinstance(merger, MergerContribution) and merger.accepts_corrected_sums for merger in mergers)
+    if not plan.corrects_itself or source.info.kind != "binary" or not accepted:
+        return None
+    return estimate_vignette(source, trajectory)
+
+
+def _look(plan: Plan, source: Source, results: Sequence[LevelResult], reference: int, context: Context) -> Look:
+    motion = motion_of_frames(results, source.info, reference)
+    return Look(source, motion, plan.render.tolerance_px, int(plan.run.memory), context)
+
+
+def _cut_at(cuts: Sequence[Cut], plan: Plan, found: Estimate) -> Estimate:
+    """Estimate the motion again, cut where the image jumps; keep what was known if that explains the photons better.
+
+    All levels run again: with exposures across a jump, the first went astray, too.
+    """
+    source, context, reference = found.source, found.context, found.look.motion.reference
+    timeline = found.timeline.cut_at(cuts)
+    try:
+        levels = build_levels(plan, source, [])
+        results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged, timeline=timeline)
+        look = _look(plan, source, results, reference, context)
+        # Frames that show nothing contradict any motion, and the surer it is the more; such a run is doubtful in any case.
+        worse = "" if any(each.dark is not None for each in cuts) else look.worse_than(found.look)
+    except (LocationError, CanvasTooLargeError) as error:
+        worse = str(error)
+    if worse:
+        places = ", ".join(f"frame {each.frame}" for each in cuts)
+        logger.warning(f"the image seems to jump before {places}, but the motion is not cut there: {worse}")
+        return found
+    motion = look.motion
+    measured = [each.along(motion.trajectory, motion.frame_shape) for each in cuts]
+    return replace(found, results=results, timeline=timeline.cut_at(measured), look=look)
+
+
+def _reference_frame(plan: Plan, source: Source) -> int:
+    n_frames, reference = source.info.n_frames, plan.render.reference
+    named = {"first": 0, "middle": n_frames // 2, "last": n_frames - 1}
+    return named[reference] if isinstance(reference, str) else reference
