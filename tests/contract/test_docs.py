@@ -287,7 +287,7 @@ def test_trust_page_shows_thresholds_of_verdict():
     limits = (
         *(verdict.MAX_MISFIT, verdict.MAX_MOVING_SHARE, verdict.MAX_RATIO, verdict.MAX_GAIN, verdict.MAX_GAIN),
         *(verdict.MAX_HOT_SHARE, verdict.MAX_LENS, verdict.MAX_DEFORMATION_PX, verdict.MAX_STD_PX),
-        *(verdict.MAX_CONTRADICTIONS, verdict.MAX_AMBIGUOUS, verdict.MAX_STANDING),
+        *(verdict.MAX_CONTRADICTIONS, verdict.MAX_AMBIGUOUS, verdict.MAX_STANDING, 0),
     )
     assert shown == [f"{limit:g}" for limit in limits]
     assert f"more than {100 * verdict.MAX_CONTRAST:g} % of the light" in page

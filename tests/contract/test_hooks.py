@@ -115,14 +115,14 @@ class TestHalves(ResamplerConformance):
     """The example of a resampler keeps what resamplers promise, also for a capture of one frame."""
 
     contribution = contributions_of(example_of("photonpano_resamplers"))[0]
-    hook_module = "photonpano.hookspecs"
+    hook_module = "photonpano_core.hooks"
 
 
 class TestJump(RefinerConformance):
     """The example of a refiner keeps what refiners promise."""
 
     contribution = contributions_of(example_of("photonpano_refiners"))[0]
-    hook_module = "photonpano.hookspecs"
+    hook_module = "photonpano_core.hooks"
 
 
 def test_locator_example_returns_not_located() -> None:

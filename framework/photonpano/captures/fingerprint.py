@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypedDict
@@ -37,7 +37,7 @@ class CaptureRecord(TypedDict):
     mask and of what corrections make of a sum of frames.
     """
 
-    files: list[FileRecord]
+    files: Sequence[FileRecord]
     frames_sha256: str
     pixels_sha256: str
 

@@ -152,8 +152,12 @@ def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progre
         progress.note("there is no interrupted run to go on with: the run starts at the beginning")
     elif there:
         if manifest is None or not manifest["finished"]:
-            which = " of something else" if _why_not(manifest, now) else ", which --resume would have continued"
-            logger.warning("%s held the work of an interrupted run%s; it is replaced", folder, which)
+            if _why_not(manifest, now):
+                progress.note(f"{folder} held the work of an interrupted run of something else; it is replaced")
+            else:
+                logger.warning(
+                    "%s held the work of an interrupted run, which --resume would have continued; it is replaced", folder
+                )
         _clear(folder)
     folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(folder, now, finished=False)

@@ -168,11 +168,12 @@ def test_run_without_resume_replaces_the_work_and_says_so(place: Path, caplog: p
     ]
 
 
-def test_run_of_another_spec_replaces_the_work_and_says_so(place: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_run_of_another_spec_replaces_the_work_and_notes_it(place: Path) -> None:
     interrupt(place)
-    with working(place, fingerprint(rest__render__scale=2.0)):
+    notes = Notes()
+    with working(place, fingerprint(rest__render__scale=2.0), notes=notes):
         pass
-    assert caplog.messages == [f"{path_of(place)} held the work of an interrupted run of something else; it is replaced"]
+    assert notes.notes == [f"{path_of(place)} held the work of an interrupted run of something else; it is replaced"]
 
 
 def test_kept_work_is_replaced_in_silence(place: Path, caplog: pytest.LogCaptureFixture) -> None:
