@@ -173,7 +173,7 @@ def test_run_of_another_spec_replaces_the_work_and_notes_it(place: Path) -> None
     notes = Notes()
     with working(place, fingerprint(rest__render__scale=2.0), notes=notes):
         pass
-    assert notes.notes == [f"{path_of(place)} held the work of an interrupted run of something else; it is replaced"]
+    assert notes.lines == [f"{path_of(place)} held the work of an interrupted run of something else; it is replaced"]
 
 
 def test_kept_work_is_replaced_in_silence(place: Path, caplog: pytest.LogCaptureFixture) -> None:
