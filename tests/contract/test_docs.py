@@ -281,6 +281,18 @@ def test_architecture_page_lists_import_layers_bottom_up():
     assert shown == [set(re.findall(r"photonpano\.(\w+)", layer)) for layer in reversed(layers)]
 
 
+def test_promises_page_names_tests_that_exist():
+    page = (ROOT / "docs" / "explanation" / "promises.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(test_\w+)`", page))
+    written = {
+        name
+        for file in (*(ROOT / "tests").rglob("test_*.py"), *(ROOT / "framework" / "photonpano" / "testing").glob("*.py"))
+        for name in re.findall(r"def (test_\w+)", file.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 20
+    assert sorted(named - written) == []
+
+
 def test_trust_page_shows_thresholds_of_verdict():
     page = (ROOT / "docs" / "explanation" / "trust.md").read_text(encoding="utf-8")
     shown = re.findall(r"^\|[^|]+\|[^|]+\| ([\d.]+) \|$", page, re.MULTILINE)
