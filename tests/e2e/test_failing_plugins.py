@@ -173,7 +173,7 @@ def failure(spec: dict[str, Any], contribution: Any, folder: Path) -> str:
     catalog = Catalog((*discover().rows, entry))
     (folder / "panorama.png").write_text("of an earlier run")
     with pytest.raises(PluginError) as caught:
-        run(parse_spec(spec, output=folder, catalog=catalog))
+        run(parse_spec(spec, output=folder, catalog=catalog), overwrite=True)
     assert [(file.name, file.read_text()) for file in folder.iterdir()] == [("panorama.png", "of an earlier run")]
     return str(caught.value)
 

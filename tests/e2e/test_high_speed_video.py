@@ -40,7 +40,7 @@ def scored(tmp_path: Path) -> Callable[..., tuple[Evaluation, dict[str, Any]]]:
     ) -> tuple[Evaluation, dict[str, Any]]:
         with open_source(parse_spec({"version": 1, "source": simulated})) as opened:
             np.savez(tmp_path / "truth.npz", **opened.truth())
-        result = run(parse_spec({"version": 1, "source": source, **sections}, output=tmp_path / "run"))
+        result = run(parse_spec({"version": 1, "source": source, **sections}, output=tmp_path / "run"), overwrite=True)
         return evaluate(result.directory, tmp_path / "truth.npz", oracle=oracle), result.record
 
     return scored

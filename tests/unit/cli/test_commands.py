@@ -88,7 +88,7 @@ def run_with(folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.Monke
     def run_with(verdict: Verdict, *arguments: str) -> Any:
         refined = {"use": "short-spans", "rounds": ["tremor at 223 Hz", "less"], "change_px": 0.664, "kept_out": None}
         still = {"use": "other", "rounds": [], "change_px": 0.0, "kept_out": None}
-        record = {"warnings": ["a warning"], "refinements": [refined, still], "files": {"report.html": {}}}
+        record = {"warnings": ["a warning"], "refinements": [refined, still], "decisions": [], "files": {"report.html": {}}}
         result = RunResult(folder / "run", record, verdict)
         monkeypatch.setattr("photonpano.pipeline.run.run", lambda *_, **_options: result)
         return invoke("run", "capture.yaml", *arguments)

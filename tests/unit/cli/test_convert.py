@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from photonpano import Config, SourceContribution, SpecPath, StreamInfo, discover
+from photonpano import Config, FrameSpan, SourceContribution, SpecPath, StreamInfo, discover
+from photonpano.photometry import IntensityResponse
 
 
 @pytest.fixture
@@ -69,6 +70,13 @@ class GreyConfig(Config):
 class Grey:
     info = StreamInfo(5, 6, 19, None, "intensity", 8)
     valid = np.ones((6, 19), bool)
+    response = IntensityResponse(1, 0, 255, 1)
+
+    def counts(self, span: FrameSpan) -> np.ndarray:
+        return np.zeros((6, 19), np.uint32)
+
+    def frames(self, span: FrameSpan) -> np.ndarray:
+        return np.zeros((len(span), 6, 19), np.uint8)
 
     def close(self) -> None:
         pass

@@ -13,7 +13,7 @@ from typing import Any
 
 from photonpano.atomic import atomic_path
 from photonpano.context import Checkpoints, KeepNothing, Progress
-from photonpano.errors import InputError, OutputError
+from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
 from photonpano.pipeline.checkpoints.kept import Kept, finished
 from photonpano.pipeline.checkpoints.store import SUFFIX, Store
@@ -68,14 +68,19 @@ class Work:
         else:
             _remove(self._folder)
 
-    def close(self) -> bool:
-        """Write what has not been written yet; return whether there is work to go on with."""
+    def close(self, *, failed: bool = False) -> bool:
+        """Write what has not been written yet; return whether there is work to go on with.
+
+        Args:
+            failed: whether the same run would fail again, so that only finished levels are of use.
+        """
         if self._finished or self._kept is None or self._store is None or self._folder is None:
             return False
         self._kept.flush()
-        if not self._store.holds_something:
+        useful = finished(self._store, "level-1") if failed else self._store.holds_something
+        if not useful:
             _remove(self._folder)
-        return self._store.holds_something
+        return useful
 
 
 def path_of(run_folder: Path) -> Path:
@@ -115,8 +120,8 @@ def work_folder(
         work = Work(None, now, decisions, keep=False)
     try:
         yield work
-    except BaseException:
-        if work.close():
+    except BaseException as error:
+        if work.close(failed=isinstance(error, PhotonpanoError) and not isinstance(error, OutputError)):
             progress.note(f"{folder} holds what was found; with --resume, the run goes on from there")
         raise
     work.close()

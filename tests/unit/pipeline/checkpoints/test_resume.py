@@ -127,7 +127,7 @@ def test_last_level_with_other_settings_starts_from_the_first(
 def test_resume_of_finished_run_returns_its_results(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
     first = run(plan_of("scan"))
     written = bytes_of(first)
-    monkeypatch.setattr("photonpano.pipeline.run.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
+    monkeypatch.setattr("photonpano.pipeline.estimate.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
     again = run(plan_of("scan"), resume=True)
     assert again.was_finished
     assert not first.was_finished
