@@ -165,6 +165,12 @@ def write_video(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write an empty report in runs of this process: drawing it takes longer than a small run."""
+    monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
+
+
+@pytest.fixture
 def heeded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Handle SIGINT as the program does."""
     monkeypatch.setattr(interrupts, "_noted", [])

@@ -212,6 +212,7 @@ class Reader:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=ident)
+@pytest.mark.usefixtures("without_report")
 def test_code_and_commands_of_page_work(page, workplace, make_capture):
     reader = Reader(workplace, {"make_capture": make_capture})
     for block in blocks_of(page):

@@ -17,6 +17,8 @@ from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, obs
 from photonpano.specs import parse_spec
 from photonpano.testing import RefinerConformance, ResamplerConformance
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}
 KINDS = {
     "photonpano_sources": ("source", "my-camera"),

@@ -22,6 +22,8 @@ from photonpano.pipeline.forecast import forecast
 from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 SHAPE, N = (128, 160), 300
 RAW = (132, 168)
 GEOMETRY: list[Any] = [

@@ -28,6 +28,8 @@ from photonpano.registry import Catalog, Origin, discover
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 
 class Fragile:
     """Any component whose method raises."""

@@ -16,6 +16,8 @@ from photonpano.registry.catalog import make_entry
 from photonpano.specs import parse_spec
 from photonpano.values import Homography
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 SIFT = discover().find("locator", "opencv-sift").contribution
 
 

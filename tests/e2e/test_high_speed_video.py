@@ -16,6 +16,8 @@ from photonpano.cli.app import app
 from photonpano.evaluation import Evaluation
 from photonpano.specs import parse_spec
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 SHAKE = {"rms_px": 1.0, "frequencies_hz": [3, 5, 8]}
 CAMERA = {
     "scene": {"kind": "street", "width": 1024, "height": 682},

@@ -13,6 +13,8 @@ import pytest
 from photonpano import LocationError
 from photonpano.specs import parse_spec
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 
 @pytest.fixture(scope="module")
 def run(outcome_of: Callable) -> Callable[..., Any]:
