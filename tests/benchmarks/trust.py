@@ -199,9 +199,9 @@ CAUSES: dict[str, tuple[str, ...]] = {
     "light": ("light",),
     "parallax": ("depth",),
     "repeat": ("repeat",),
-    "checkerboard": ("repeat", "could not be located"),
-    "stripes": ("repeat", "could not be located"),
-    "unpacked": ("unpacked",),
+    "checkerboard": ("repeat",),
+    "stripes": ("repeat", "no texture"),
+    "unpacked": ("not packed",),
     "lowest bit": ("bit",),
     "along the height": ("axis", "height", "packed"),
 }
@@ -246,7 +246,7 @@ def measured(name: str, seed: int, size: Size) -> Result:
         except PhotonpanoError as error:
             return result | {
                 "exit_code": 2 if isinstance(error, SpecError) else 1,
-                "message": str(error).splitlines()[0],
+                "message": str(error),
                 "seconds": time.perf_counter() - start,
             }
         except Exception as error:  # a defect of photonpano is a result too
@@ -378,7 +378,7 @@ def of_clean(scored: Sequence[Result], results: Sequence[Result]) -> str:
 def notes(results: Sequence[Result]) -> Iterator[str]:
     """Yield, for each run, what it said: reasons of a doubt or a refusal, and warnings."""
     for result in results:
-        said = [*reasons(result), *result["warnings"]]
+        said = [each.splitlines()[0] for each in (*reasons(result), *result["warnings"])]
         if said:
             yield f"- {result['row']}, seed {result['seed']}: {'; '.join(said)}"
 
@@ -404,7 +404,11 @@ def write(file: Path, results: Sequence[Result], size: Size) -> None:
 def measured_with_progress(task: tuple[str, int], size: Size) -> Result:
     """Measure a row and a seed."""
     result = measured(*task, size)
-    error = f"{result['mean_px']:.3f} px, claims {result['std_px']:.3f}" if "mean_px" in result else result["message"]
+    error = (
+        f"{result['mean_px']:.3f} px, claims {result['std_px']:.3f}"
+        if "mean_px" in result
+        else result["message"].partition("\n")[0]
+    )
     print(f"{result['row']}, seed {result['seed']}: {status(result)}, {error}, {result['seconds']:.0f} s", flush=True)
     return result
 

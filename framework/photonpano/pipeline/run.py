@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from photonpano.captures.fingerprint import capture_files
+from photonpano.captures.obstacles import naming_obstacles
 from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
@@ -106,7 +107,8 @@ def run(
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
         context = replace(context, checkpoints=work.checkpoints)
-        found = estimate(plan, source, decisions, context)
+        with naming_obstacles(source, decisions):
+            found = estimate(plan, source, decisions, context)
         source, context = found.source, found.context
         refiners = build_refiners(plan, source, decisions)
         explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)

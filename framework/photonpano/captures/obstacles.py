@@ -1,0 +1,114 @@
+"""Obstacles to locating: properties of a capture that explain why its exposures could not be located."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from scipy import fft, ndimage
+
+from photonpano.errors import LocationError
+from photonpano.locating.phase import correlation_peaks
+from photonpano.protocols import Source
+from photonpano.values import Counts, Decision, FrameSpan
+
+_PLACES, _FRAMES = 5, 256
+"""Five spans of at most 256 frames are looked at."""
+_ALIKE = 0.7
+"""An image repeats if another shift fits at least this well, as a share of the best one."""
+_DIP = 0.5
+"""Between two peaks, the correlation falls below this share of the best one; on the slope of one peak it does not."""
+_AGREE = 0.2
+"""Periods of spans agree within this share of their median."""
+_SURE = 6.0
+"""Standard deviations from which the best correlation is not chance."""
+_MOST_PEAKS = 200
+"""Most peaks that are compared."""
+_REACH = 1 / 3
+"""Largest shift that is looked at, as a share of the frame."""
+_STANDING = 0.3
+"""Share of the frame from which what stands still is named."""
+
+
+@contextmanager
+def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[None]:
+    """Add the obstacles of a capture to the error of a block that could not locate its exposures.
+
+    Raises:
+        LocationError: with the sentences of `obstacles` at its end.
+    """
+    try:
+        yield
+    except LocationError as error:
+        found = obstacles(source, decisions)
+        if not found:
+            raise
+        raise LocationError("\n".join([str(error), *found])) from error
+
+
+def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:
+    """Return sentences about what makes a capture hard to locate; empty if nothing is found.
+
+    Args:
+        source: the capture.
+        decisions: what was chosen from the capture; of them, the share of the frame that stands still is used.
+    """
+    return [*_standing(decisions), *_repeating(source)]
+
+
+def _standing(decisions: Sequence[Decision]) -> Iterator[str]:
+    share = next((float(each.value) for each in decisions if each.what == "standing_share"), 0.0)
+    if share >= _STANDING:
+        yield (
+            f"{share:.0%} of the frame stands still while the rest moves, as a window or dirt in front of the sensor does: "
+            "mask it under corrections, or cut it off."
+        )
+
+
+def _repeating(source: Source) -> Iterator[str]:
+    spans = source.info.spread(_PLACES, min(_FRAMES, max(2, source.info.n_frames // _PLACES - 1)))
+    found = [each for span in spans if (each := _repetition_within(source, span)) is not None]
+    period = float(np.median(found)) if found else 0.0
+    if 2 * sum(abs(each - period) < _AGREE * period for each in found) > len(spans):
+        yield (
+            f"The image repeats every {period:.0f} px, so that pairs fit at several places: "
+            "use shorter groups, between which it moves by less than half of that."
+        )
+
+
+def _repetition_within(source: Source, span: FrameSpan) -> float | None:
+    middle = (span.start + span.stop) // 2
+    if middle == span.start:
+        return None
+    parts = FrameSpan(span.start, middle), FrameSpan(middle, span.stop)
+    first, second = (np.where(source.valid, source.counts(part), 0) for part in parts)
+    return repetition_px(first, second)
+
+
+def repetition_px(first: Counts, second: Counts) -> float | None:
+    """Return the distance after which an image repeats; None if it does not.
+
+    Two sums of frames are compared, so that photon noise, which they do not share, plays no part.
+
+    Args:
+        first: (H, W) sum of frames.
+        second: (H, W) sum of the frames that follow.
+    """
+    height, width = first.shape
+    padded = 2 * height, 2 * width
+    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
+    views = [window * (image - np.average(image, weights=window)) for image in (first, second)]
+    spectra = [fft.rfft2(view, padded) for view in views]
+    alike = fft.irfft2(spectra[1] * spectra[0].conj(), padded)
+    if not alike.max() > _SURE * np.sqrt(np.sum(views[0] ** 2) * np.sum(views[1] ** 2) * np.sum(window**4)) / np.sum(window**2):
+        return None
+    overlap = fft.irfft2(np.abs(fft.rfft2(window, padded)) ** 2, padded)
+    down, across = (np.minimum(np.arange(2 * size), 2 * size - np.arange(2 * size)) for size in (height, width))
+    near = np.logical_and.outer(down <= _REACH * height, across <= _REACH * width)
+    surface = np.divide(alike, overlap, out=np.zeros(padded), where=near)
+    shifts, _ = correlation_peaks(surface, _ALIKE, _MOST_PEAKS)
+    between = shifts[0] + np.linspace(0, 1, 33)[:, np.newaxis, np.newaxis] * (shifts[1:] - shifts[0])
+    along = ndimage.map_coordinates(surface, np.moveaxis(between, -1, 0)[::-1], order=1, mode="grid-wrap")
+    apart = np.hypot(*(shifts[1:] - shifts[0]).T)[along.min(axis=0, initial=np.inf) < _DIP * surface.max()]
+    return float(apart.min()) if apart.size else None
