@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,15 @@ def write_video(tmp_path: Path) -> Callable[..., Path]:
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write an empty report in runs of this process: drawing it takes longer than a small run."""
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown() -> Iterator[None]:
+    """Release the lock of numba's compiler, which the error of a timeout can leave locked: later tests would wait for ever."""
+    locks = sys.modules.get("numba.core.compiler_lock")
+    while locks is not None and locks.global_compiler_lock.is_locked():
+        locks.global_compiler_lock.release()
+    return (yield)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
-from photonpano.reading import read_picture
+from photonpano.reading import look_first, read_picture
 from photonpano_simulator.config import PhotoScene, StreetScene
 from photonpano_simulator.street import street
 
@@ -40,6 +40,7 @@ def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float
 def _photo(path: Path, width: int | None) -> NDArray[np.float32]:
     """Return the linear luminance of a photograph, from 0 to 1."""
     otherwise = "is not an image that OpenCV reads; save it as PNG or JPEG"
+    look_first(path, "cv2:imread")
     image = read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path} holds {image.dtype} values; a photograph has 8 or 16 bits: save it as PNG")

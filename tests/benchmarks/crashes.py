@@ -3,9 +3,11 @@
     python tests/benchmarks/crashes.py kills --number 100 --seed 0
     python tests/benchmarks/crashes.py disks --number 20
     python tests/benchmarks/crashes.py races --number 50 --at-once 2
-    python tests/benchmarks/crashes.py cost
+    python tests/benchmarks/crashes.py cost --spec scan.yaml
 
-Every trial works on a simulated capture of 48x64 px in a temporary folder. The exit code is 1 if a trial fails.
+Every trial but the last works on a simulated capture of 48x64 px in a temporary folder. `disks` mounts file systems in memory,
+which takes the rights of root; without them, it limits the size of files only. `cost` runs a spec of your own, and prints what
+share of the run hashes, checkpoints, locks and the step of the run folder take. The exit code is 1 if a trial fails.
 """
 
 from __future__ import annotations
@@ -15,15 +17,22 @@ import importlib
 import json
 import multiprocessing
 import os
+import pkgutil
 import random
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 SPEC = """version: 1
 source: {{use: packed-npy, with: {{path: cube.npy, frame_rate_hz: 96800}}}}
@@ -43,13 +52,16 @@ class Run:
         folder: the current folder of the process.
         options: of `photonpano run`.
         killed_at: the number of the change of a file at which the process kills itself; 0 for none.
+        largest: the largest size of a file, in bytes; 0 for no limit.
     """
 
-    def __init__(self, folder: Path, *options: str, killed_at: int = 0) -> None:
+    def __init__(self, folder: Path, *options: str, killed_at: int = 0, largest: int = 0) -> None:
         self._printed = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the object
         self._pid = os.fork()
         self.code: int | None = None
         if not self._pid:
+            if largest:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.RLIM_INFINITY))
             self._work(folder, options, killed_at)
 
     def _work(self, folder: Path, options: tuple[str, ...], killed_at: int) -> None:
@@ -192,31 +204,62 @@ def kills(folder: Path, number: int, seed: int) -> list[str]:
 
 
 def disks(folder: Path, number: int, seed: int) -> list[str]:
-    """Run on full disks: file sizes are limited, or a small file system is mounted if that is allowed."""
+    """Run on disks of many sizes, and with limits of the size of files; go on where there is room."""
     del seed
-    disk, wrong, counts = folder / "disk", [], {0: 0, 1: 0}
-    disk.mkdir()
-    for index in range(number):
-        size = 4096 * (8 + 8 * index)
-        write_spec(folder, index + 1)
-        mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], capture_output=True, check=False)
-        if mounted.returncode:
-            return [f"a file system cannot be mounted: {mounted.stderr.decode().strip()}"]
-        try:
-            process = Run(folder, "--output", "disk/scan")
+    wrong: list[str] = []
+    for way in (_disk, _limit):
+        counts = Counter[int | None]()
+        sizes = sorted({int(4096 * 256 ** (index / max(number - 1, 1))) for index in range(number)})
+        for index, size in enumerate(sizes):
+            write_spec(folder, 2 * index)
+            Run(folder).wait()
+            write_spec(folder, 2 * index + 1)
+            with way(folder / "runs", size) as largest:
+                process = Run(folder, largest=largest)
+                printed = process.wait()
+                found, problems = state(folder)
+            counts[process.code] += 1
+            left = set(leftovers(folder)) - ({"scan.work"} if process.code else set())
+            if process.code not in (0, 1) or found != 2 * index + (not process.code) or problems or left or "Trace" in printed:
+                wrong.append(f"{size} bytes: exit {process.code}, seed {found}, {problems}, left {left}: {printed}")
+            process = Run(folder, "--resume")
             printed = process.wait()
-            counts[process.code] = counts.get(process.code, 0) + 1
-            there = sorted(path.name for path in disk.rglob("*"))
-            if process.code not in (0, 1) or "Traceback" in printed:
-                wrong.append(f"{size} bytes: exit {process.code}: {printed}")
-            elif process.code == 1 and there:
-                wrong.append(f"{size} bytes: left {there}")
-            elif process.code == 0 and not {"run.json", "trajectory.npz", "panorama.tiff"} <= {*there}:
-                wrong.append(f"{size} bytes: exit 0 with {there}")
-        finally:
-            subprocess.run(["umount", disk], check=True)
-    print(f"{number} disks: {counts[0]} runs fitted, {counts[1]} were refused with a sentence, {len(wrong)} failed")
+            found, problems = state(folder)
+            if process.code or found != 2 * index + 1 or problems or leftovers(folder):
+                wrong.append(f"after {size} bytes: exit {process.code}, {problems}, left {leftovers(folder)}: {printed}")
+        title = "disks with room for" if way is _disk else "limits of files of"
+        print(f"{title} {sizes[0]} to {sizes[-1]} bytes: {counts[0]} runs fitted, {counts[1]} were refused with a sentence")
+    print(f"{len(wrong)} failed")
     return wrong
+
+
+@contextmanager
+def _disk(runs: Path, room: int) -> Iterator[int]:
+    """Move the run folder to a file system in memory that has room for some bytes more; afterwards move it back."""
+    with tempfile.TemporaryDirectory() as kept:
+        shutil.copytree(runs, kept, dirs_exist_ok=True)
+        mounted = ["mount", "-t", "tmpfs", "-o", f"size={64 * 2**20}", "none", runs]
+        if subprocess.run(mounted, capture_output=True, check=False).returncode:
+            raise SystemExit("a file system cannot be mounted: only root can")
+        try:
+            shutil.copytree(kept, runs, dirs_exist_ok=True)
+            disk = os.statvfs(runs)
+            used = (disk.f_blocks - disk.f_bfree) * disk.f_frsize
+            subprocess.run(["mount", "-o", f"remount,size={used + room}", runs], check=True)
+            yield 0
+            shutil.rmtree(kept)
+            shutil.copytree(runs, kept)
+        finally:
+            subprocess.run(["umount", runs], check=True)
+        shutil.rmtree(runs)
+        shutil.copytree(kept, runs)
+
+
+@contextmanager
+def _limit(runs: Path, room: int) -> Iterator[int]:
+    """Limit the size of files."""
+    del runs
+    yield room
 
 
 def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
@@ -237,36 +280,80 @@ def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
     return wrong
 
 
-def cost(folder: Path, number: int, seed: int) -> list[str]:
-    """Measure what hashes, flushes and the step take: of a run folder of a panorama of 1,000 x 4,000 px."""
-    del seed
-    import numpy as np
+COSTS = {
+    "fingerprint of the capture": ("photonpano.pipeline.run.run_fingerprint",),
+    "lock, run folder and work folder": ("photonpano.pipeline.run.run_folder", "photonpano.pipeline.run.work_folder"),
+    "checkpoints": (
+        "photonpano.pipeline.checkpoints.store.Store.save",
+        "photonpano.pipeline.checkpoints.store.Store.load",
+        "photonpano.pipeline.checkpoints.kept.Kept._name",
+    ),
+    "hashes of results": ("photonpano.pipeline.run_folder.contents_of",),
+    "flushes, and the step": (
+        "photonpano.pipeline.run_folder.replace_folder",
+        "photonpano.pipeline.run_folder.RunFolder.reopen",
+    ),
+}
+"""Functions whose time is the cost of safety."""
 
-    from photonpano.captures.fingerprint import frames_sha256
-    from photonpano.pipeline.components import open_source
-    from photonpano.pipeline.run_folder import run_folder
-    from photonpano.specs import load_spec
 
-    content = np.random.default_rng(0).bytes(4 * 1000 * 4000)
-    times = []
-    for _ in range(min(number, 10)):
+class Stopwatch:
+    """Adds up the time of functions, by what they are for; of nested ones, the outermost counts."""
+
+    def __init__(self) -> None:
+        self.seconds = Counter[str]()
+        self._running = threading.local()
+
+    @contextmanager
+    def running(self, what: str) -> Iterator[None]:
+        if getattr(self._running, "what", None):
+            yield
+            return
+        self._running.what, start = what, time.perf_counter()
+        try:
+            yield
+        finally:
+            self._running.what = None
+            self.seconds[what] += time.perf_counter() - start
+
+    def timed(self, function: Callable[..., Any], what: str) -> Callable[..., Any]:
+        """Return a function, or one that returns a context, whose time is added up; that of the block is not."""
+
+        def call(*args: Any, **keys: Any) -> Any:
+            with self.running(what):
+                found = function(*args, **keys)
+            return self._entered(found, what) if isinstance(found, AbstractContextManager) else found
+
+        return call
+
+    @contextmanager
+    def _entered(self, context: AbstractContextManager[Any], what: str) -> Iterator[Any]:
+        with ExitStack() as stack:
+            with self.running(what):
+                found = stack.enter_context(context)
+            yield found
+            with self.running(what):
+                stack.close()
+
+
+def cost(folder: Path, number: int, seed: int, spec: Path) -> list[str]:
+    """Print what a run spends on hashes, checkpoints, locks and the step."""
+    del number, seed
+    from photonpano import load_spec, run
+
+    plan, watch = load_spec(spec, output=folder / "run"), Stopwatch()
+    with ExitStack() as stack:
+        for what, names in COSTS.items():
+            for name in names:
+                stack.enter_context(mock.patch(name, watch.timed(pkgutil.resolve_name(name), what)))
         start = time.perf_counter()
-        with run_folder(folder / "runs" / "cost") as results:
-            for name in ("panorama.tiff", "coverage.tiff", "trajectory.npz"):
-                (results.staging / name).write_bytes(content[: 80 * 100_000] if name == "trajectory.npz" else content)
-            written = time.perf_counter()
-            results.commit({"photonpano": "0", "spec": {}})  # type: ignore[typeddict-item]
-            results.reopen()
-            results.commit({"photonpano": "0", "spec": {}})  # type: ignore[typeddict-item]
-        times.append((written - start, time.perf_counter() - written))
-    plan = load_spec(folder / "scan.yaml")
-    with open_source(plan) as source:
-        start = time.perf_counter()
-        frames_sha256(source)
-        sampled = time.perf_counter() - start
-    commit = sorted(each for _, each in times)[len(times) // 2]
-    print(f"hashes, flushes and two commits of 40 MB: {commit:.3f} s (median of {len(times)}); fingerprint {sampled:.3f} s")
-    return []
+        run(plan)
+        whole_s = time.perf_counter() - start
+    for what, seconds in watch.seconds.items():
+        print(f"{what}: {seconds:.2f} s, {seconds / whole_s:.2%}")
+    share = watch.seconds.total() / whole_s
+    print(f"together {watch.seconds.total():.2f} s of {whole_s:.1f} s, {share:.2%}")
+    return [] if share < 0.03 else ["more than 3 %"]
 
 
 def main() -> int:
@@ -276,6 +363,7 @@ def main() -> int:
     parser.add_argument("--number", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--at-once", type=int, default=2)
+    parser.add_argument("--spec", type=Path, help="of the run that `cost` measures")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -285,7 +373,7 @@ def main() -> int:
         simulation = multiprocessing.get_context("spawn").Process(target=prepare, args=(folder,))
         simulation.start()  # in a process of its own: a forked process keeps the locks of threads that it has not got
         simulation.join()
-        more = {"at_once": options.at_once} if options.trial == "races" else {}
+        more = {"races": {"at_once": options.at_once}, "cost": {"spec": options.spec}}.get(options.trial, {})
         wrong: list[str] = globals()[options.trial](folder, options.number, options.seed, **more)
     print(*wrong, sep="\n")
     return bool(wrong)

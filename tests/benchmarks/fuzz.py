@@ -156,8 +156,13 @@ SOURCES = {
     **{"avi": "video", "mkv": "video", "mp4": "video"},
 }
 KINDS = [*SOURCES, "mask", "mask-png", "dark", "spec", "truth", "run"]
-LOOKED_AT = {"mat73", "ubicept", "tiff-folder", "tiff", "tiff-zlib", "avi", "mkv", "mp4"}
+LOOKED_AT = {"mask-png", "mat73", "ubicept", "tiff-folder", "tiff", "tiff-zlib", "avi", "mkv", "mp4"}
 """Kinds that a process of its own looks at first."""
+LOOKING = (
+    "photonpano.corrections.masks",
+    *(f"photonpano_sensors.{module}" for module in ("mat_parts", "ubicept", "intensity.pictures", "intensity.video_index")),
+)
+"""Modules that have it look."""
 
 
 def _film(path: Path, codec: str) -> None:
@@ -261,9 +266,9 @@ def damaged(content: bytes, rng: random.Random) -> bytes:
 def cases(name: str, seed: int, looks: bool) -> Iterator[tuple[int, Callable[[], None]]]:
     """Yield numbered cases of a kind, endlessly; each damages one file of the same valid ones."""
     if not looks:
-        for module in ("mat_parts", "ubicept", "intensity.pictures", "intensity.video_index"):
-            __import__(f"photonpano_sensors.{module}")
-            sys.modules[f"photonpano_sensors.{module}"].look_first = lambda *_: None
+        for name_of_module in LOOKING:
+            __import__(name_of_module)
+            sys.modules[name_of_module].look_first = lambda *_: None
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         path = whole(name, folder)

@@ -11,7 +11,7 @@ from pydantic import Field
 from photonpano.contributions import SpecPath
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
-from photonpano.reading import read_array, read_picture
+from photonpano.reading import look_first, read_array, read_picture
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -125,5 +125,6 @@ def _read_picture(path: Path, expected: str) -> NDArray[np.uint8]:
     """Read a picture: (H, W, 3) uint8, red first."""
     import cv2
 
+    look_first(path, "cv2:imread")
     picture = read_picture(path, f"is not {expected}: it is no picture that can be read", cv2.IMREAD_COLOR)
     return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)

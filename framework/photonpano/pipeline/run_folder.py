@@ -30,7 +30,7 @@ from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
-from photonpano.record.schema import RunRecord
+from photonpano.record.schema import FileContent, RunRecord
 from photonpano.values import FluxImage, Panorama
 
 SHOWN_FILES = 3
@@ -49,6 +49,8 @@ class RunFolder:
         self.directory = directory
         self._stack = stack
         self.staging = stack.enter_context(staging_of(directory))
+        self._contents: dict[str, FileContent] = {}
+        """Sizes and hashes of files that were committed before."""
 
     def write_tile(self, tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
         """Write a part of panorama.tiff and coverage.tiff (float32); the parts make up the canvas."""
@@ -76,6 +78,7 @@ class RunFolder:
     def write_report(self, page: str) -> None:
         """Write report.html."""
         path = self.staging / "report.html"
+        self._contents.pop(path.name, None)
         try:
             with _writing(self.directory):
                 path.write_text(page, encoding="utf-8")
@@ -90,7 +93,8 @@ class RunFolder:
             The content of run.json: the record, with sizes and hashes of the files.
         """
         with _writing(self.directory):
-            record = {**record, "files": contents_of(self.staging)}
+            self._contents = contents_of(self.staging, self._contents)
+            record = {**record, "files": self._contents}
             text = json.dumps(record, indent=2, allow_nan=False) + "\n"
             (self.staging / RECORD).write_text(text, encoding="utf-8")
             replace_folder(self.staging, self.directory, names_of_results(self.directory))

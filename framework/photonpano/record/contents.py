@@ -25,9 +25,15 @@ RESULTS = frozenset({"panorama.tiff", "panorama.png", "coverage.tiff", "trajecto
 """The files of a run. Runs of older versions do not list theirs."""
 
 
-def contents_of(folder: Path) -> dict[str, FileContent]:
-    """Return size and SHA-256 of the files in a folder, without run.json."""
-    return {path.name: _content(path) for path in sorted(folder.iterdir()) if path.name != RECORD}
+def contents_of(folder: Path, known: Mapping[str, FileContent] | None = None) -> dict[str, FileContent]:
+    """Return size and SHA-256 of the files in a folder, without run.json.
+
+    Args:
+        folder: all files of it count.
+        known: those of some files, which are not read.
+    """
+    names = sorted(path.name for path in folder.iterdir() if path.name != RECORD)
+    return {name: (known or {}).get(name) or _content(folder / name) for name in names}
 
 
 def recorded_json(folder: Path) -> Mapping[str, Any] | None:

@@ -11,7 +11,7 @@ from photonpano.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
 from photonpano.specs.resolution import resolve
 from photonpano.specs.written import Place, WrittenSpec, from_python, given, joined
-from photonpano.specs.yaml_reader import read_yaml
+from photonpano.specs.yaml_reader import MAX_LENGTH, read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from photonpano.specs.plan import Plan
 
 SPEC_SUFFIXES = {".yaml", ".yml"}
-MAX_BYTES = 2**20
-"""The largest size of a spec file: no spec is as long, but a capture that is given by mistake is."""
 
 
 def load_spec(
@@ -110,7 +108,7 @@ def _read(path: Path) -> str:
         raise SpecError([Problem("", reason.removeprefix(f"{path} "), path)])
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            data = file.read(MAX_LENGTH + 1)
     except FileNotFoundError:
         problem = Problem("", "there is no such file", path)
     except IsADirectoryError:
@@ -118,8 +116,8 @@ def _read(path: Path) -> str:
     except OSError as error:
         problem = Problem("", f"cannot be read: {error.strerror}", path)
     else:
-        if len(data) > MAX_BYTES:
-            raise SpecError([Problem("", f"not a spec: longer than {MAX_BYTES} bytes", path)])
+        if len(data) > MAX_LENGTH:  # a capture that is given by mistake is
+            raise SpecError([Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)])
         try:
             return data.decode("utf-8-sig")
         except UnicodeDecodeError as error:

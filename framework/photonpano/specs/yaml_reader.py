@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
+MAX_LENGTH = 2**18
+"""The largest number of characters of a spec, or bytes of its file: a text of a megabyte takes 4 s to read."""
 MAX_VALUES = 5000
 """The largest number of values in a spec; aliases of aliases multiply."""
 MAX_DEPTH = 100
@@ -65,6 +67,9 @@ def read_yaml(text: str, place: Place) -> WrittenSpec:
     yaml.composer.warn_double_anchors = False
     reader = _Reader(place)
     problems = reader.spec.problems
+    if len(text) > MAX_LENGTH:
+        problems.append(place.problem(f"not a spec: longer than {MAX_LENGTH} characters"))
+        return reader.spec
     try:
         node = yaml.compose(text)
         if node is not None:

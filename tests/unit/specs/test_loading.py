@@ -243,7 +243,7 @@ def test_load_spec_of_other_file_is_an_error(catalog, tmp_path, monkeypatch):
     Path("folder.yaml").mkdir()
     Path("null.yaml").write_text("---\n...\n")
     Path("deep.yaml").write_text("a: " + "[" * 500)
-    Path("long.yaml").write_text("#" * 2**20 + "\n")
+    Path("long.yaml").write_text("#" * 2**18 + "\n")
     Path("utf16.yaml").write_text("version: 1\n", encoding="utf-16-le")
     Path("bom16.yaml").write_text("version: 1\n", encoding="utf-16")
     told = {}
@@ -254,7 +254,7 @@ def test_load_spec_of_other_file_is_an_error(catalog, tmp_path, monkeypatch):
     assert told == {
         "missing.yaml": "missing.yaml: there is no such file",
         "folder.yaml": "folder.yaml: this is a folder, expected a spec in YAML",
-        "long.yaml": "long.yaml: not a spec: longer than 1048576 bytes",
+        "long.yaml": "long.yaml: not a spec: longer than 262144 bytes",
         "null.yaml": "null.yaml:2:1: the spec is empty; it needs at least `version` and `source`",
         "deep.yaml": "deep.yaml: not a spec: nested too deeply",
         "utf16.yaml": "utf16.yaml:1:2: not valid YAML: special characters are not allowed, got the character 0x00",
