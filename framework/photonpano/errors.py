@@ -38,6 +38,10 @@ class PluginError(PhotonpanoError):
     """A plugin is broken, missing a library, in conflict with another, or broke its contract."""
 
 
+_LONGEST = 200
+"""Characters of a path in a spec, or of an override, that a message shows."""
+
+
 @dataclass(frozen=True, slots=True)
 class Problem:
     """One thing that is wrong with a spec.
@@ -61,8 +65,14 @@ class Problem:
     def __str__(self) -> str:
         position = [str(part) for part in (self.file, self.line, self.column) if part is not None]
         head = ":".join(position)
-        message = f"{self.message} (in the override {self.override})" if self.override else self.message
-        return ": ".join(part for part in (head, self.where, message) if part)
+        message = f"{self.message} (in the override {_cut(self.override)})" if self.override else self.message
+        return ": ".join(part for part in (head, _cut(self.where), message) if part)
+
+
+def _cut(text: str) -> str:
+    """Return a text for a line of a message: without control characters, and not much longer than a line."""
+    shown = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text[:_LONGEST])
+    return shown if len(text) <= _LONGEST else f"{shown}..."
 
 
 def described(error: BaseException) -> str:

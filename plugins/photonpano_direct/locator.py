@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from photonpano import Homography, Located, NotLocated, VirtualExposure
@@ -18,7 +17,7 @@ from photonpano.locating import (
     correlation_surface,
     free_parameters,
 )
-from photonpano.photometry import Similarity
+from photonpano.photometry import Similarity, tapered
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.layers import Layer
@@ -231,7 +230,7 @@ def _best(found: Sequence[tuple[float, Aligned]]) -> tuple[float, Homography, Qu
 def _hypotheses(moving: Layer, fixed: Layer, n_layers: int) -> list[Homography]:
     """Return the shifts at which the phase correlation of the coarsest layers peaks, in pixels of the finest layer."""
     height, width = moving.image.shape
-    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    window = tapered((height, width))
     flat = [np.where(layer.weight > 0, layer.image - layer.image[layer.weight > 0].mean(), 0) for layer in (moving, fixed)]
     spectra = [np.fft.rfft2(window * image) for image in flat]
     surface = correlation_surface(spectra[1] * spectra[0].conj(), (height, width), _PEAK_PX)

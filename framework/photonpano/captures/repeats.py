@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
+from photonpano.errors import InputError
 from photonpano.motion.timeline import Timeline
 from photonpano.protocols import PackedSource, Source
 from photonpano.threads import in_order
@@ -26,6 +27,9 @@ def timeline_of(source: Source, context: Context) -> Timeline:
     """Return the timeline of a capture, in which repeated frames take no time.
 
     Only packed frames are compared: others would have to be read twice.
+
+    Raises:
+        InputError: all frames are copies of the first one.
     """
     n_frames = source.info.n_frames
     if not isinstance(source, PackedSource):
@@ -34,6 +38,8 @@ def timeline_of(source: Source, context: Context) -> Timeline:
     same = np.zeros(n_frames, dtype=bool)
     for span, found in zip(spans, in_order(partial(_same_as_before, source), spans, context.threads), strict=True):
         same[span.start + 1 : span.stop] = found
+    if n_frames > 1 and same[1:].all():
+        raise InputError(f"all {n_frames} frames are copies of the first one; check that the camera went on recording")
     for run in true_spans(same):
         original = run.start - 1
         if original and not _differ(*source.packed(FrameSpan(original - 1, original + 1))):

@@ -14,6 +14,7 @@ from photonpano.errors import InputError
 from photonpano.geometry import translation
 from photonpano.locating import Follows, follows, shift_by_phase
 from photonpano.merging import binned_mean, binning_of
+from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
 
@@ -129,8 +130,7 @@ def _common_shift(images: Sequence[FluxImage], weight: NDArray[np.float32] | Non
     """
     if not all(np.ptp(image) for image in images):
         return None
-    height, width = images[0].shape
-    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    window = tapered(images[0].shape)
     if weight is not None:
         window = window * weight
         images = [image - np.float32(np.average(image, weights=window)) for image in images]

@@ -110,6 +110,8 @@ def read_dark(path: Path) -> DarkFrames:
         raise InputError(f"{path} is an archive without `rates`; name what `photonpano dark` wrote, or a .npy file of rates")
     if rates.ndim != 2 or rates.dtype.kind not in "fiu":
         raise InputError(f"{path} holds {rates.dtype} of shape {rates.shape}; dark counts are numbers of shape (height, width)")
+    with np.errstate(over="ignore"):
+        rates = rates.astype(np.float32)
     if not (np.isfinite(rates).all() and (rates >= 0).all()):
         row, column = np.argwhere(~(np.isfinite(rates) & (rates >= 0)))[0].tolist()
         raise InputError(
@@ -118,4 +120,4 @@ def read_dark(path: Path) -> DarkFrames:
         )
     if n_frames is not None and (n_frames.shape != () or n_frames.dtype.kind not in "iu" or n_frames < 1):
         raise InputError(f"{path} is damaged: n_frames is not a positive integer; write it again with `photonpano dark`")
-    return DarkFrames(rates.astype(np.float32), None if n_frames is None else int(n_frames))
+    return DarkFrames(rates, None if n_frames is None else int(n_frames))

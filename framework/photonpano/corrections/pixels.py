@@ -71,8 +71,9 @@ class Pixels:
             InputError: the sizes differ.
         """
         if shape != self.shape:
-            given, here = ("x".join(map(str, size)) for size in (shape, self.shape))
-            raise InputError(f"{what} has {given} px, and frames have {here} px at this place of the list")
+            given = "x".join(map(str, shape)) + " px" if len(shape) == 2 and all(shape) else f"the shape {shape}"
+            here = "x".join(map(str, self.shape))
+            raise InputError(f"{what} has {given}, and frames have {here} px at this place of the list")
 
 
 class Correction(Config, ABC):

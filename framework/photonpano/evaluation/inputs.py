@@ -63,13 +63,11 @@ def load_truth(path: Path) -> Truth:
     optional = ("scene", "undistorted_corners")
     arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), optional)
     scene = arrays.get("scene")
-    if scene is not None and (scene.ndim != 2 or not scene.size):
-        raise InputError(f"{path}: scene must be an image (height, width), got the shape {scene.shape}")
     frame_shape = _frame_shape(path, arrays)
     return Truth(
         homographies=_homographies(path, arrays) @ _lens(path, arrays, frame_shape),
         frame_shape=frame_shape,
-        scene=None if scene is None else scene.astype(np.float32, copy=False),
+        scene=None if scene is None else _scene(path, scene),
     )
 
 
@@ -96,6 +94,8 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
     std_px = arrays.get("std_px", np.full(len(homographies), np.nan))
     if canvas.shape != (3, 3):
         raise InputError(f"{path}: canvas must have the shape (3, 3), got {canvas.shape}")
+    if not np.isfinite(canvas).all() or not np.linalg.det(canvas):
+        raise InputError(f"{path}: canvas must be finite and invertible")
     if located.shape != (len(homographies),):
         raise InputError(f"{path}: located must have a flag for each of {len(homographies)} frames, got {located.shape}")
     if std_px.shape != (len(homographies),):
@@ -143,6 +143,17 @@ def _read_archive(path: Path, content: str, required: tuple[str, ...], optional:
         if name in arrays and arrays[name].dtype.kind not in "biuf":
             raise InputError(f"{path}: {name} must contain numbers")
     return arrays
+
+
+def _scene(path: Path, scene: NDArray[Any]) -> FluxImage:
+    """Return the true flux (H, W); NaN where it is unknown."""
+    if scene.ndim != 2 or not scene.size:
+        raise InputError(f"{path}: scene must be an image (height, width), got the shape {scene.shape}")
+    with np.errstate(over="ignore"):
+        flux = scene.astype(np.float32, copy=False)
+    if np.isinf(flux).any():
+        raise InputError(f"{path}: scene must be finite, or NaN where it is unknown")
+    return flux
 
 
 def _homographies(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:

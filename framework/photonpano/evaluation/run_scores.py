@@ -79,7 +79,7 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     flux, weight = load_panorama(folder)
     canvas = Canvas(flux.shape[0], flux.shape[1], run.canvas)
     true_image = true_panorama(truth.scene, canvas, motion.alignment)
-    compared = covered(weight) & np.isfinite(true_image)
+    compared = covered(weight) & np.isfinite(true_image) & np.isfinite(flux)
     oracle = None
     if render is not None:
         true_motion = normalised(inverse(motion.alignment) @ truth.homographies)

@@ -18,6 +18,7 @@ from photonpano.locating import Follows, correlation_peaks, correlation_surface,
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.pairs import lengths_of
 from photonpano.motion.timeline import Timeline
+from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FrameSpan, Group
 
@@ -317,4 +318,4 @@ def _binned(source: Source, span: FrameSpan) -> NDArray[np.float32]:
 
 @cache
 def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    return np.asarray(cv2.createHanningWindow((shape[1], shape[0]), cv2.CV_32F))
+    return tapered(shape)

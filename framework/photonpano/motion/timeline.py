@@ -103,7 +103,8 @@ class Timeline:
     def parts(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """Divide groups at the cuts and the frames without light; leave out those that consist mostly of repeated frames.
 
-        Parts shorter than 4 frames are left out, and those that were taken at the same time as another one.
+        Parts shorter than 4 frames are left out, and those that were taken at the same time as another one. If nothing else is
+        left, groups of repeated frames are.
         """
         found: dict[float, Group] = {}
         for group in groups:
@@ -115,7 +116,8 @@ class Timeline:
                     continue
                 part = group if whole else Group(span, span.centre)
                 found.setdefault(float(self.times(part.reference)), part)
-        return tuple(found[time] for time in sorted(found)) or tuple(groups)
+        found = found or {float(self.times(group.reference)): group for group in reversed(groups)}
+        return tuple(found[time] for time in sorted(found))
 
     def fit(self, interpolate: Callable[[slice, FloatArray], Trajectory], instants: FloatArray) -> Trajectory:
         """Interpolate each piece between two cuts by itself.

@@ -8,6 +8,7 @@ from photonpano.photometry.similarity import (
     autocorrelation,
     noise_free_correlation,
     similarity_of,
+    tapered,
     without_local_mean,
 )
 from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
@@ -27,6 +28,7 @@ __all__ = [
     "signal_to_noise",
     "similarity_of",
     "srgb_to_linear",
+    "tapered",
     "tone_mapped",
     "without_local_mean",
 ]

@@ -24,6 +24,18 @@ at flux 0.02 and 0.1, pale and blurred ones among them, those that `direct` alig
 or of different places none reached 5.2, at correlations of up to 0.77. Repeated texture, such as windows, may pass."""
 
 
+def tapered(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return the Hann window of OpenCV: (H, W), 0 at the edges of an image; along sides of 1 or 2 px it is constant."""
+    import cv2
+
+    height, width = (max(side, 3) for side in shape)
+    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    for axis, side in enumerate(shape):
+        if side < 3:
+            window = np.repeat(window.take([1], axis), side, axis)
+    return np.asarray(window)
+
+
 class Similarity(NamedTuple):
     """Similarity of two aligned images.
 

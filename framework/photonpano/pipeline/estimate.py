@@ -53,6 +53,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         context: threads, progress and checkpoints.
 
     Raises:
+        InputError: all frames are copies of the first one.
         LocationError: the motion could not be estimated.
         CanvasTooLargeError: the panorama would be far larger than the memory.
         PluginError: a component failed in its own way, or broke its contract.

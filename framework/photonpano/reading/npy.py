@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from gzip import GzipFile
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -60,7 +61,7 @@ def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
         # Version 3 differs only for structured types, which no capture has.
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran_order, dtype = read(file)
-        return NpyHeader(shape, dtype, fortran_order, file.tell())
+        return NpyHeader(tuple(map(operator.index, shape)), dtype, fortran_order, file.tell())
     except OSError:
         raise
     except Exception:  # a damaged header makes numpy's parser raise nearly anything

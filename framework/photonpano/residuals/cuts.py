@@ -14,6 +14,7 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.locating import shift_by_phase
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
+from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.residuals.refinement import Look
 from photonpano.residuals.unexplained import standing_out
@@ -159,7 +160,7 @@ def _tracked(spans: Sequence[FrameSpan], images: Sequence[FluxImage]) -> _Track 
     if len(lit) < _FEWEST:
         return None
     spans, images = [spans[index] for index in lit], [np.nan_to_num(images[index], nan=light[index]) for index in lit]
-    window = cv2.createHanningWindow(images[0].shape[::-1], cv2.CV_32F)
+    window = tapered(images[0].shape)
     flat = [window * (image - image.mean()) for image in images]
 
     def shifts(skip: int) -> FloatArray:

@@ -80,7 +80,7 @@ def _report(error: ErrorDetails, value: Any, where: str, root: Schema, spec: Wri
         spec.wrong(where, str(error["ctx"]["error"]))
     elif schema and (kind in EXPECTED or kind.endswith("_type")):
         number = kind in ("int_type", "float_type") and isinstance(value, str) and NUMBER.fullmatch(value)
-        got = f"the text {value!r}; leave the quotes out" if number else given(value)
+        got = f"the text {given(value)}; leave the quotes out" if number else given(value)
         spec.wrong(where, f"expected {expectation(schema, root)}, got {got}")
     else:
         spec.wrong(where, f"{error['msg'][:1].lower()}{error['msg'][1:]}, got {given(value)}")

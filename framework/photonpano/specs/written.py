@@ -156,7 +156,8 @@ def given(data: object) -> str:
             return f"a list of {len(data)}" if data else "an empty list"
         case dict():
             return "a mapping"
-    return str(data)
+    text = str(data)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def from_python(data: object, place: Place) -> WrittenSpec:
@@ -171,6 +172,10 @@ def from_python(data: object, place: Place) -> WrittenSpec:
 
 def _plain(data: object, where: str, spec: WrittenSpec) -> Any:
     match data:
+        case str() if any("\ud800" <= each <= "\udfff" for each in data):
+            spec.wrong(where, f"{data!a} is no text of UTF-8, which results cannot record; if it names a file, rename it")
+            spec.unreadable.add(where)
+            return None
         case None | bool() | str():
             return data
         case Integral():
@@ -178,7 +183,7 @@ def _plain(data: object, where: str, spec: WrittenSpec) -> Any:
         case Real():
             return float(data)
         case Path():
-            return str(data)
+            return _plain(str(data), where, spec)
         case list() | tuple():
             return [_plain(item, joined(where, index), spec) for index, item in enumerate(data)]
         case Mapping():

@@ -12,7 +12,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.reader import ReaderError
 
-from photonpano.specs.written import Place, WrittenSpec, joined
+from photonpano.specs.written import Place, WrittenSpec, given, joined
 
 if TYPE_CHECKING:
     from ruamel.yaml.error import StringMark
@@ -218,6 +218,6 @@ class _Reader:
             text.encode()  # refuses half of a surrogate pair, which JSON and file systems cannot hold
         except ValueError:
             expected = {"int": "an integer", "float": "a number"}.get(tag, "text")
-            self.unreadable(where, f"expected {expected}, got {text!a}")
+            self.unreadable(where, f"expected {expected}, got {given(text)}")
             return None
         return text

@@ -1,0 +1,179 @@
+"""Odd truths and run folders: each gets a finite score, or is refused with one sentence that names the file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from photonpano import PhotonpanoError, evaluate
+
+OUTCOMES = Path(__file__).with_suffix(".txt")
+"""What becomes of each: `NAME: SENTENCE`, or `NAME: a score`."""
+N_FRAMES = 120
+
+Change = Callable[[SimpleNamespace], Any]
+
+
+def true(name: str, change: Callable[[np.ndarray], Any]) -> Change:
+    """Return what changes an array of the truth."""
+    return lambda capture: capture.true.update({name: change(capture.true[name])})
+
+
+def found(name: str, change: Callable[[np.ndarray], Any]) -> Change:
+    """Return what changes an array of trajectory.npz."""
+    return lambda capture: capture.trajectory.update({name: change(capture.trajectory[name])})
+
+
+def image(name: str, change: Callable[[np.ndarray], Any]) -> Change:
+    """Return what changes the flux or the weight of the panorama."""
+    return lambda capture: setattr(capture, name, change(getattr(capture, name)))
+
+
+def written(name: str, content: str | bytes) -> Change:
+    """Return what writes a file of the run folder, after the others."""
+    data = content.encode() if isinstance(content, str) else content
+    return lambda capture: setattr(capture, "late", lambda: (capture.folder / name).write_bytes(data))
+
+
+def holed(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Return what gives one number another value."""
+
+    def change(values: np.ndarray) -> np.ndarray:
+        values = values.astype(np.result_type(values, np.float32))
+        values[len(values) // 2] = value
+        return values
+
+    return change
+
+
+HOMOGRAPHIES: Mapping[str, Callable[[np.ndarray], Any]] = {
+    "one NaN": holed(np.nan),
+    "one infinite": holed(np.inf),
+    "one of zeros": holed(0),
+    "huge": lambda values: values * 1e300,
+    "turned inside out": lambda values: -values,
+    "all alike": lambda values: np.broadcast_to(values[:1], values.shape),
+    "flat": lambda values: values @ np.diag([1.0, 0, 1]),
+    "whole numbers": lambda values: values.astype(int),
+    "complex": lambda values: values + 0j,
+    "words": lambda values: values.astype(str),
+    "objects": lambda values: values.astype(object),
+    "times": lambda values: values.astype(np.int64).astype("M8[s]"),
+    "none": lambda values: values[:0],
+    "one frame": lambda values: values[:1],
+    "one frame more": lambda values: np.concatenate([values, values[-1:]]),
+    "two dimensions": lambda values: values.reshape(N_FRAMES, 9),
+    "four dimensions": lambda values: values[None],
+}
+CASES: Mapping[str, Change] = {
+    **{f"truth, homographies: {name}": true("homographies", change) for name, change in HOMOGRAPHIES.items()},
+    **{
+        f"run, homographies: {name}": found("homographies", HOMOGRAPHIES[name])
+        for name in ("one NaN", "words", "none", "one frame")
+    },
+    "truth, frame_shape: floats": true("frame_shape", lambda _: np.array([60.0, 90.0])),
+    "truth, frame_shape: huge": true("frame_shape", lambda _: np.array([2**62, 2**62])),
+    "truth, frame_shape: one number": true("frame_shape", lambda _: np.array(60)),
+    "truth, frame_shape: words": true("frame_shape", lambda _: np.array(["60", "90"])),
+    "truth, scene: one NaN": true("scene", holed(np.nan)),
+    "truth, scene: infinite": true("scene", lambda values: values * np.inf),
+    "truth, scene: below zero": true("scene", lambda values: -values),
+    "truth, scene: one pixel": true("scene", lambda values: values[:1, :1]),
+    "truth, scene: no pixel": true("scene", lambda values: values[:0]),
+    "truth, scene: complex": true("scene", lambda values: values + 0j),
+    "truth, scene: bool": true("scene", lambda values: values > 0.5),
+    "truth, scene: alike": true("scene", lambda values: values * 0 + 1),
+    "truth, scene: huge": true("scene", lambda values: values.astype(float) * 1e300),
+    "run, canvas: NaN": found("canvas", holed(np.nan)),
+    "run, canvas: zeros": found("canvas", lambda values: 0 * values),
+    "run, canvas: far away": found("canvas", lambda values: values + 1e9 * np.eye(3)[[2, 1, 1]] * [0, 0, 1]),
+    "run, canvas: words": found("canvas", lambda values: values.astype(str)),
+    "run, located: one": found("located", lambda values: np.arange(len(values)) == 7),
+    "run, located: numbers": found("located", lambda values: values.astype(float)),
+    "run, located: words": found("located", lambda values: values.astype(str)),
+    "run, std_px: NaN": found("std_px", holed(np.nan)),
+    "run, std_px: infinite": found("std_px", lambda values: values * np.inf),
+    "run, std_px: below zero": found("std_px", lambda values: -values),
+    "run, std_px: zero": found("std_px", lambda values: 0 * values),
+    "run, std_px: fewer": found("std_px", lambda values: values[:7]),
+    "run, std_px: words": found("std_px", lambda values: values.astype(str)),
+    "run, frame_shape: others": found("frame_shape", lambda values: values[::-1]),
+    "run, frame_shape: below zero": found("frame_shape", lambda values: -values),
+    "panorama: NaN": image("flux", lambda values: values * np.nan),
+    "panorama: infinite": image("flux", lambda values: values * np.inf),
+    "panorama: below zero": image("flux", lambda values: -values),
+    "panorama: zero": image("flux", lambda values: 0 * values),
+    "panorama: whole numbers": image("flux", lambda values: np.nan_to_num(values * 255).astype(np.uint8)),
+    "panorama: one row": image("flux", lambda values: values[:1]),
+    "coverage: NaN": image("weight", lambda values: values * np.nan),
+    "coverage: below zero": image("weight", lambda values: -values),
+    "coverage: infinite": image("weight", lambda values: values + np.inf),
+    **{
+        f"run.json: {name}": written("run.json", content)
+        for name, content in {
+            "empty": "",
+            "null": "null",
+            "a list": "[]",
+            "no keys": "{}",
+            "a number": "1e999",
+            "no UTF-8": b'{"photonpano": "\xff"}',
+            "a spec of null": '{"photonpano": "0", "spec": null}',
+            "a spec of a list": '{"photonpano": "0", "spec": [], "files": {}}',
+            "files of a list": '{"photonpano": "0", "spec": {}, "files": []}',
+            "files of numbers": '{"photonpano": "0", "spec": {}, "files": {"trajectory.npz": 3}}',
+            "files without hashes": '{"photonpano": "0", "spec": {}, "files": {"trajectory.npz": {}}}',
+            "files elsewhere": '{"photonpano": "0", "spec": {}, "files": {"../truth.npz": {"bytes": 1, "sha256": "0"}}}',
+            "deep": '{"photonpano": ' + "[" * 10**5,
+        }.items()
+    },
+    "trajectory.npz: empty": written("trajectory.npz", b""),
+    "trajectory.npz: text": written("trajectory.npz", "frames"),
+    "panorama.tiff: empty": written("panorama.tiff", b""),
+    "panorama.tiff: endless": written("panorama.tiff", b"II*\0\x08\0\0\0" + bytes(2) + b"\x08\0\0\0"),
+    "coverage.tiff: cut": lambda capture: setattr(
+        capture,
+        "late",
+        lambda: (capture.folder / "coverage.tiff").write_bytes((capture.folder / "panorama.tiff").read_bytes()[:500]),
+    ),
+    "panorama.tiff: two pages": lambda capture: setattr(
+        capture, "late", lambda: tifffile.imwrite(capture.folder / "panorama.tiff", np.stack([capture.flux] * 2))
+    ),
+}
+
+
+def numbers_of(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        return [number for each in value.values() for number in numbers_of(each)]
+    if isinstance(value, list | tuple):
+        return [number for each in value for number in numbers_of(each)]
+    return [value] if isinstance(value, float) else []
+
+
+def expected() -> dict[str, str]:
+    return dict(line.split(" -> ", 1) for line in OUTCOMES.read_text(encoding="utf-8").splitlines())
+
+
+def test_every_case_has_an_outcome() -> None:
+    assert list(expected()) == list(CASES)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_odd_file_gets_a_score_or_one_sentence(name: str, capture: SimpleNamespace) -> None:
+    CASES[name](capture)
+    capture.write()
+    getattr(capture, "late", lambda: None)()
+    try:
+        score = evaluate(capture.folder, capture.truth, oracle=False)
+        ended = "a score"
+        assert not any(math.isnan(number) for number in numbers_of(asdict(score)))
+    except PhotonpanoError as error:
+        ended = str(error).replace(str(capture.truth.parent), "DIR")
+    assert ended == expected()[name]
