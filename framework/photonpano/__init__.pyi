@@ -22,6 +22,7 @@ from .contributions import LocatorContribution as LocatorContribution
 from .contributions import MergerContribution as MergerContribution
 from .contributions import Recognised as Recognised
 from .contributions import RefinerContribution as RefinerContribution
+from .contributions import RendererContribution as RendererContribution
 from .contributions import Requirement as Requirement
 from .contributions import ResamplerContribution as ResamplerContribution
 from .contributions import SourceContext as SourceContext
@@ -51,6 +52,7 @@ from .protocols import Merger as Merger
 from .protocols import PackedSource as PackedSource
 from .protocols import PanoramaView as PanoramaView
 from .protocols import Refiner as Refiner
+from .protocols import Renderer as Renderer
 from .protocols import Resampler as Resampler
 from .protocols import Source as Source
 from .protocols import Trajectory as Trajectory

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
 from photonpano.errors import CaptureUnreadError
 from photonpano.paths import given_path, refusal
-from photonpano.protocols import Interpolator, Locator, Merger, Refiner, Resampler, Source
+from photonpano.protocols import Interpolator, Locator, Merger, Refiner, Renderer, Resampler, Source
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
@@ -199,7 +199,7 @@ class SourceContribution(Contribution):
 
 @dataclass(frozen=True, kw_only=True)
 class StageContribution(Contribution):
-    """Offers a component that is built for a capture: of a stage of the levels, or a refiner.
+    """Offers a component that is built for a capture: of a stage of the levels, a refiner, or a renderer.
 
     Attributes:
         check: finds problems of a config with a capture, from its description; reads no data, imports nothing heavy.
@@ -252,3 +252,22 @@ class RefinerContribution(StageContribution):
 
     kind: ClassVar[str] = "refiner"
     build: Callable[[Any, StageContext], Refiner]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RendererContribution(StageContribution):
+    """Offers a renderer.
+
+    Attributes:
+        bytes_per_pixel: peak memory of rendering for a pixel of the canvas. The framework renders a canvas that exceeds the
+            memory of the run in tiles.
+    """
+
+    kind: ClassVar[str] = "renderer"
+    build: Callable[[Any, StageContext], Renderer]
+    bytes_per_pixel: int = 40
+
+    def __post_init__(self) -> None:
+        StageContribution.__post_init__(self)
+        if type(self.bytes_per_pixel) is not int or self.bytes_per_pixel < 1:
+            raise ValueError(f"{self.name}: bytes_per_pixel is a whole number of at least 1, got {self.bytes_per_pixel!r}")

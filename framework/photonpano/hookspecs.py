@@ -22,6 +22,7 @@ from photonpano.contributions import (
     LocatorContribution,
     MergerContribution,
     RefinerContribution,
+    RendererContribution,
     ResamplerContribution,
     SourceContribution,
 )
@@ -250,6 +251,57 @@ def photonpano_refiners() -> Iterable[RefinerContribution]:  # type: ignore[empt
                 summary="Corrects single spans that are far off",
                 config=JumpConfig,
                 build=lambda config, context: Jump(config.sigmas),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_renderers() -> Iterable[RendererContribution]:  # type: ignore[empty-body]
+    """Offer renderers: they render flux and weight on a canvas.
+
+    Example:
+        ```python
+        import numpy as np
+        from pydantic import Field
+
+        from photonpano import Config, FrameSpan, LinearlyCorrectedSource, Panorama, RendererContribution, hookimpl
+        from photonpano.geometry import apply
+
+
+        class NearestConfig(Config):
+            every: int = Field(1, ge=1, description="frames from one that is used to the next")
+
+
+        class Nearest:
+            def __init__(self, every):
+                self.every = every
+
+            def render(self, source, trajectory, span, canvas, tolerance_px, advance):
+                lit, weight = np.zeros(canvas.shape, np.float32), np.zeros(canvas.shape, np.float32)
+                y, x = np.nonzero(source.valid)
+                for frame in range(span.start, span.stop, self.every):
+                    counts = source.counts(FrameSpan(frame, frame + 1))
+                    if isinstance(source, LinearlyCorrectedSource):
+                        counts = source.corrected(counts, 1)
+                    to_canvas = canvas.transform @ trajectory.at([frame])[0]
+                    column, row = np.rint(apply(to_canvas, np.stack([x, y], axis=1))).astype(int).T
+                    inside = (column >= 0) & (column < canvas.width) & (row >= 0) & (row < canvas.height)
+                    at = row[inside], column[inside]
+                    np.add.at(weight, at, 1)
+                    np.add.at(lit, at, counts[y[inside], x[inside]])
+                advance(len(span))
+                mean = np.divide(lit, weight, out=np.full_like(lit, np.nan), where=weight > 0)
+                return Panorama(source.response.flux(mean, weight), weight, canvas.transform)
+
+
+        @hookimpl
+        def photonpano_renderers():
+            yield RendererContribution(
+                name="nearest-pixel",
+                summary="Adds each photon to the nearest pixel",
+                config=NearestConfig,
+                build=lambda config, context: Nearest(config.every),
             )
         ```
     """

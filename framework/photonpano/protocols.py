@@ -1,10 +1,10 @@
-"""The interfaces of the six components that plugins build."""
+"""The interfaces of the seven components that plugins build."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,12 +20,16 @@ from photonpano.values import (
     Homography,
     Located,
     NotLocated,
+    Panorama,
     Refined,
     Response,
     SpanResiduals,
     StreamInfo,
     VirtualExposure,
 )
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Canvas
 
 
 class Source(Protocol):
@@ -253,5 +257,41 @@ class Refiner(Protocol):
 
         Returns:
             None if the photons show nothing to correct.
+        """
+        ...
+
+
+class Renderer(Protocol):
+    """Renders the panorama: flux and weight on a canvas, from the frames and their motion."""
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Render the frames of a span on a canvas.
+
+        The framework chooses the canvas. One that exceeds the memory of the run is rendered in tiles, each with a call; what a
+        pixel shows should not depend on the tile that it lies in.
+
+        Convention:
+            Points are (x, y), integers are pixel centres. On the canvas, a pixel p of frame t lies at
+            `canvas.transform @ trajectory.at(t) @ p`.
+
+        Args:
+            source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected.
+            trajectory: frame pixels to reference pixels.
+            span: the frames to render.
+            canvas: the pixel grid.
+            tolerance_px: motion, in px of a frame, within which frames may be summed before they are warped.
+            advance: called with the number of frames that are done; over the whole call these add up to the frames of the span.
+
+        Returns:
+            Flux in photons per pixel of a frame per frame, whatever the scale of the canvas, and its weight, with
+            `canvas.transform` as canvas. Flux is NaN exactly where the weight is 0.
         """
         ...

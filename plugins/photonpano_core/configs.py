@@ -117,3 +117,7 @@ class InterpolatorConfig(Config):
         description="frames beyond the last located instant for which the velocity is kept before the motion stops; "
         "twice the mean distance of located instants by default",
     )
+
+
+class MergeConfig(Config):
+    """`merge`, the renderer, has no keys."""

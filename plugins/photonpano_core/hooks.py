@@ -8,6 +8,7 @@ from photonpano import (
     InterpolatorContribution,
     MergerContribution,
     RefinerContribution,
+    RendererContribution,
     ResamplerContribution,
     SourceContribution,
     hookimpl,
@@ -15,6 +16,7 @@ from photonpano import (
 from photonpano_core.configs import (
     GroupedConfig,
     InterpolatorConfig,
+    MergeConfig,
     MidpointConfig,
     PhotonMleConfig,
     RobustMergeConfig,
@@ -35,7 +37,7 @@ from photonpano_core.stratified import StratifiedResampler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from photonpano import Interpolator, Merger, Refiner, Resampler, StageContext, StreamInfo
+    from photonpano import Interpolator, Merger, Refiner, Renderer, Resampler, StageContext, StreamInfo
 
 Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
@@ -142,6 +144,17 @@ def photonpano_refiners() -> Iterator[RefinerContribution]:
     )
 
 
+@hookimpl
+def photonpano_renderers() -> Iterator[RendererContribution]:
+    """Offer the merge of all frames."""
+    yield RendererContribution(
+        name="merge",
+        summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
+        config=MergeConfig,
+        build=_build_merge,
+    )
+
+
 def _resampler(
     name: str,
     summary: str,
@@ -215,3 +228,10 @@ def _build_short_spans(config: ShortSpansConfig, context: StageContext) -> Refin
     from photonpano_core.short_spans import ShortSpansRefiner
 
     return ShortSpansRefiner(config, context.stream.frame_shape, context.stream.frame_rate_hz)
+
+
+def _build_merge(config: MergeConfig, context: StageContext) -> Renderer:
+    from photonpano.merging import MergeRenderer
+
+    del config
+    return MergeRenderer(context.threads)

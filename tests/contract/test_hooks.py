@@ -15,7 +15,7 @@ from photonpano import FrameSpan, Group, PluginError, hookspecs, registry, run
 from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.specs import parse_spec
-from photonpano.testing import RefinerConformance, ResamplerConformance
+from photonpano.testing import RefinerConformance, RendererConformance, ResamplerConformance
 
 pytestmark = pytest.mark.usefixtures("without_report")
 
@@ -27,6 +27,7 @@ KINDS = {
     "photonpano_locators": ("locator", "never-found"),
     "photonpano_interpolators": ("interpolator", "nearest"),
     "photonpano_refiners": ("refiner", "jump"),
+    "photonpano_renderers": ("renderer", "nearest-pixel"),
 }
 
 
@@ -124,6 +125,13 @@ class TestJump(RefinerConformance):
     """The example of a refiner keeps what refiners promise."""
 
     contribution = contributions_of(example_of("photonpano_refiners"))[0]
+    hook_module = "photonpano_core.hooks"
+
+
+class TestNearestPixel(RendererConformance):
+    """The example of a renderer keeps what renderers promise."""
+
+    contribution = contributions_of(example_of("photonpano_renderers"))[0]
     hook_module = "photonpano_core.hooks"
 
 

@@ -25,6 +25,7 @@ from photonpano import (
     NotLocated,
     Refined,
     RefinerContribution,
+    RendererContribution,
     ResamplerContribution,
     SourceContribution,
     hookimpl,
@@ -51,6 +52,7 @@ KINDS: Mapping[str, tuple[str, Any, str]] = {
     "locator": ("locate", LocatorContribution, "direct"),
     "interpolator": ("interpolate", InterpolatorContribution, "smoothing-spline"),
     "refiner": ("refine", RefinerContribution, "short-spans"),
+    "renderer": ("render", RendererContribution, "merge"),
 }
 """The section that chooses a kind, its contribution, and the component that the strange one is built around."""
 
@@ -206,6 +208,7 @@ PLACES: Mapping[str, tuple[str, Callable[[BaseException], Callable[[Any], Any]],
         "failed at level 1: ",
     ),
     "refine": ("refiner", lambda error: instead("refine", raising(error)), "failed at round 1: "),
+    "render": ("renderer", lambda error: instead("render", raising(error)), "failed at the panorama: "),
 }
 
 
@@ -612,6 +615,42 @@ REFINERS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
         AT_ROUND + "the summary is a text, got a NoneType",
     ),
 }
+
+
+def panorama_of(change: Callable[[Any], Mapping[str, Any]]) -> Callable[[Any], Any]:
+    """Return a renderer some of whose attributes are what `change` makes of a good panorama."""
+    return around("render", lambda found, *_: replace(found, **change(found)))
+
+
+AT_PANORAMA = "broke its contract at the panorama: "
+FINITE_WHERE_SEEN = "flux is finite where weight is positive, and NaN where weight is 0; at row "
+RENDERERS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
+    "flux alone": (around("render", lambda found, *_: found.flux), AT_PANORAMA + "expected a Panorama, got ndarray"),
+    "another shape": (
+        panorama_of(lambda found: {"flux": found.flux[1:]}),
+        AT_PANORAMA + "flux is (60, 91) of float32, got ",
+    ),
+    "whole numbers": (panorama_of(lambda found: {"weight": found.weight.astype(int)}), AT_PANORAMA + "weight is (60, 91) of f"),
+    "NaN where frames were seen": (
+        panorama_of(lambda found: {"flux": np.where(found.weight > 20, np.nan, found.flux)}),
+        AT_PANORAMA + FINITE_WHERE_SEEN,
+    ),
+    "infinite flux": (panorama_of(lambda found: {"flux": found.flux + np.inf}), AT_PANORAMA + FINITE_WHERE_SEEN),
+    "zeros where nothing was seen": (
+        panorama_of(lambda found: {"flux": np.nan_to_num(found.flux)}),
+        AT_PANORAMA + FINITE_WHERE_SEEN,
+    ),
+    "negative weight": (panorama_of(lambda found: {"weight": -found.weight}), AT_PANORAMA + FINITE_WHERE_SEEN),
+    "another canvas": (
+        panorama_of(lambda found: {"canvas": 2 * found.canvas}),
+        AT_PANORAMA + "the canvas of the panorama is the transform of the given canvas, got another one",
+    ),
+    "nothing seen": (
+        panorama_of(lambda found: {"flux": found.flux * np.nan, "weight": 0 * found.weight}),
+        AT_PANORAMA + "no pixel has a positive weight",
+    ),
+}
+"""What renderers return."""
 CASES = {
     f"{kind}: {name}": (kind, *case)
     for kind, cases in {
@@ -621,6 +660,7 @@ CASES = {
         "resampler": RESAMPLERS,
         "interpolator": INTERPOLATORS,
         "refiner": REFINERS,
+        "renderer": RENDERERS,
     }.items()
     for name, case in cases.items()
 }

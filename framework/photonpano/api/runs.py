@@ -12,7 +12,7 @@ from photonpano.evaluation import Evaluation
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.geometry import Canvas
 from photonpano.merging.panorama import render
-from photonpano.pipeline.components import open_source
+from photonpano.pipeline.components import build_renderer, open_source
 from photonpano.pipeline.run import run
 from photonpano.protocols import Trajectory
 from photonpano.record.contents import finish_run_folder, require_same_frames
@@ -53,7 +53,8 @@ def evaluate(
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             context = Context(thread_count(plan.run.threads), progress or Quiet())
-            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context)
+            renderer = build_renderer(plan, source, [])
+            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
 
         return evaluate_folder(run_folder, truth, along_truth)
 

@@ -26,6 +26,7 @@ class KindName(StrEnum):
     LOCATOR = "locator"
     INTERPOLATOR = "interpolator"
     REFINER = "refiner"
+    RENDERER = "renderer"
 
 
 _KIND_NAMES = ", ".join(KindName)

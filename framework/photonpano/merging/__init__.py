@@ -3,5 +3,17 @@
 from photonpano.merging.accumulate import PhotonSum, accumulate, divided
 from photonpano.merging.binning import binned_mean, binning_of
 from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
+from photonpano.merging.merge_renderer import MergeRenderer
 
-__all__ = ["Chunk", "CountsCache", "PhotonSum", "accumulate", "binned_mean", "binning_of", "chunks_of", "clipped", "divided"]
+__all__ = [
+    "Chunk",
+    "CountsCache",
+    "MergeRenderer",
+    "PhotonSum",
+    "accumulate",
+    "binned_mean",
+    "binning_of",
+    "chunks_of",
+    "clipped",
+    "divided",
+]

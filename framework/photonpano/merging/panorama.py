@@ -1,10 +1,9 @@
-"""Render the panorama: choose its canvas, divide it into tiles that fit into memory, merge all located frames on each."""
+"""Render the panorama: choose its canvas, divide it into tiles that fit into memory, render all located frames on each."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -15,13 +14,13 @@ from numpy.typing import NDArray
 from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Canvas, canvas_of, rescaling, translation
-from photonpano.merging import accumulate, chunks_of
+from photonpano.merging.merge_renderer import MergeRenderer
 from photonpano.photometry import tone_mapped
-from photonpano.protocols import Source, Trajectory
+from photonpano.protocols import Renderer, Source, Trajectory
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
 BYTES_PER_PIXEL = 40
-"""Peak memory of rendering, per pixel of a tile: sums, estimate and output, as measured in the tests."""
+"""Peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests."""
 MAX_EXCESS = 16
 """A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time."""
 
@@ -60,7 +59,14 @@ class Tile:
     canvas: Canvas
 
 
-def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int, int], scale: float, memory: int) -> Canvas:
+def plan_canvas(
+    trajectory: Trajectory,
+    span: FrameSpan,
+    frame_shape: tuple[int, int],
+    scale: float,
+    memory: int,
+    bytes_per_pixel: int = BYTES_PER_PIXEL,
+) -> Canvas:
     """Choose the canvas that holds every frame of a span, before anything of its size is allocated.
 
     Args:
@@ -69,6 +75,7 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
         frame_shape: (height, width) of a frame.
         scale: pixels of the canvas per pixel of the reference frame.
         memory: bytes that rendering may take.
+        bytes_per_pixel: bytes that rendering takes for a pixel of the canvas.
 
     Raises:
         CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
@@ -83,7 +90,7 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
             f"the motion turns so far away from the reference frame that a flat panorama cannot show it ({error}); "
             "choose a render.reference in the middle of the motion, or fewer frames"
         ) from error
-    excess = canvas.height * canvas.width * BYTES_PER_PIXEL / memory
+    excess = canvas.height * canvas.width * bytes_per_pixel / memory
     if excess > MAX_EXCESS:
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
         raise CanvasTooLargeError(
@@ -96,14 +103,14 @@ def plan_canvas(trajectory: Trajectory, span: FrameSpan, frame_shape: tuple[int,
     return canvas
 
 
-def tiles_of(canvas: Canvas, memory: int) -> tuple[tuple[Tile, ...], int]:
+def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL) -> tuple[tuple[Tile, ...], int]:
     """Divide the longer side of a canvas into tiles that are rendered one by one within the memory.
 
     Returns:
         The tiles, one if the whole canvas fits; and the factor by which a `Thumbnail` that fits beside a tile is smaller than
         the canvas. Tiles begin at multiples of that factor.
     """
-    fits = memory // BYTES_PER_PIXEL
+    fits = memory // bytes_per_pixel
     n_pixels = canvas.height * canvas.width
     if n_pixels <= fits:
         return (Tile(0, 0, canvas),), 1
@@ -126,22 +133,26 @@ def render(
     canvas: Canvas,
     tolerance_px: float,
     context: Context,
+    renderer: Renderer | None = None,
 ) -> Panorama:
-    """Merge the frames of a span on a canvas, with one maximum-likelihood estimate for each pixel.
+    """Render the frames of a span on a canvas that is not divided.
 
     Args:
         source: the capture.
         trajectory: frame pixels to reference pixels.
-        span: the frames to merge.
+        span: the frames to render.
         canvas: the pixel grid.
         tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
         context: threads and progress.
+        renderer: by default, it merges all frames.
     """
-    (panorama,) = render_tiles(source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
+    renderer = renderer or MergeRenderer(context.threads)
+    (panorama,) = render_tiles(renderer, source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
     return panorama
 
 
 def render_tiles(
+    renderer: Renderer,
     source: Source,
     trajectory: Trajectory,
     span: FrameSpan,
@@ -150,19 +161,13 @@ def render_tiles(
     context: Context,
 ) -> Iterator[Panorama]:
     """Render the tiles of a canvas, one after the other: see `render`."""
-    chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
-    with (
-        context.progress.stage("panorama", len(span) * len(tiles), "frames") as advance,
-        ThreadPoolExecutor(context.threads, thread_name_prefix="render") as pool,
-    ):
-
-        def rendered(grid: Canvas) -> Panorama:
-            photons = accumulate(source, chunks, grid.transform, grid.shape, advance, pool)
-            return Panorama(*photons.estimate(source.response), grid.transform)
-
+    # The panorama of the residuals is merged, and may lie on the same canvas as that of another renderer.
+    step = "tile" if isinstance(renderer, MergeRenderer) else "rendered tile"
+    with context.progress.stage("panorama", len(span) * len(tiles), "frames") as advance:
         homographies = trajectory.at(np.arange(span.start, span.stop))
         for tile in tiles:
-            yield context.checkpoints.once("tile", partial(rendered, tile.canvas), homographies, span, tile.canvas)
+            rendered = partial(renderer.render, source, trajectory, span, tile.canvas, tolerance_px, advance)
+            yield context.checkpoints.once(step, rendered, homographies, span, tile.canvas)
 
 
 class Thumbnail:
@@ -233,6 +238,7 @@ class RenderedPanorama:
 
 
 def render_panorama(
+    renderer: Renderer,
     source: Source,
     trajectory: Trajectory,
     span: FrameSpan,
@@ -240,37 +246,41 @@ def render_panorama(
     memory: int,
     write_tile: Callable[[Tile, Panorama, Canvas], object],
     context: Context,
+    bytes_per_pixel: int = BYTES_PER_PIXEL,
     ready: Panorama | None = None,
 ) -> RenderedPanorama:
     """Render the frames of a span, in tiles if the panorama exceeds the memory.
 
     Args:
+        renderer: renders each tile.
         source: the capture.
         trajectory: the motion, frame pixels to reference pixels.
-        span: the frames to merge.
+        span: the frames to render.
         options: scale, tolerance and white quantile.
         memory: bytes that rendering may take.
         write_tile: called with each tile, its flux and weight, and the whole canvas.
         context: threads and progress.
-        ready: the same frames, merged along the same motion; it is used if it lies on the same canvas.
+        bytes_per_pixel: bytes that the renderer takes for a pixel of the canvas.
+        ready: what the renderer would render of the same frames along the same motion; used if it lies on the same canvas.
 
     Raises:
         CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
         LocationError: frames reach the horizon of the reference plane.
     """
     start = time.perf_counter()
-    canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory)
-    tiles, reduction = tiles_of(canvas, memory)
+    canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory, bytes_per_pixel)
+    tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     gathered = Thumbnail(canvas, reduction)
     if ready is not None and len(tiles) == 1 and _lies_on(ready, canvas):
         rendered = iter([ready])
     else:
-        rendered = render_tiles(source, trajectory, span, tiles, options.tolerance_px, context)
+        rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
     for tile, part in zip(tiles, rendered, strict=True):
         write_tile(tile, part, canvas)
         gathered.add(tile, part)
     thumbnail = gathered.panorama
-    white_flux = float(np.quantile(thumbnail.flux[thumbnail.weight > 0], options.white_quantile)) or 1.0
+    lit = thumbnail.flux[thumbnail.weight > 0]
+    white_flux = (float(np.quantile(lit, options.white_quantile)) if lit.size else 0.0) or 1.0
     picture = tone_mapped(thumbnail.flux, white_flux)
     seconds = time.perf_counter() - start
     return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, gathered.coverage_share, seconds)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from photonpano.contributions import SourceContext, StageContext, install_command
+from photonpano.contributions import RendererContribution, SourceContext, StageContext, install_command
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
@@ -26,6 +26,7 @@ from photonpano.threads import thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
 
 if TYPE_CHECKING:
+    from photonpano.pipeline.renderers import AttributedRenderer
     from photonpano.residuals.refinement import NamedRefiner
 
 HALVED_LEVELS = 2
@@ -133,6 +134,24 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
         source.info, source.response, plan.run.seed, thread_count(plan.run.threads), decide=_recorder(decisions)
     )
     return tuple(NamedRefiner(choice.contribution.name, _built(choice, context), choice.label) for choice in plan.refine)
+
+
+def build_renderer(plan: Plan, source: Source, decisions: list[Decision]) -> AttributedRenderer:
+    """Build the renderer of a plan.
+
+    Args:
+        plan: which renderer.
+        source: the capture.
+        decisions: receives the decisions that it takes.
+    """
+    from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
+
+    choice, contribution = plan.renderer, plan.renderer.contribution
+    context = StageContext(
+        source.info, source.response, plan.run.seed, thread_count(plan.run.threads), decide=_recorder(decisions)
+    )
+    assert isinstance(contribution, RendererContribution)
+    return AttributedRenderer(_built(choice, context), choice.label, contribution.bytes_per_pixel)
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photonpano.context import Context
-from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
+from photonpano.merging.panorama import plan_canvas, render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
-from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.components import build_levels, build_renderer
 from photonpano.protocols import Source
 from photonpano.record.run_json import peak_memory_bytes
 from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
@@ -90,15 +90,18 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     results = _tried(plan, part, threads)
     seconds = {f"level {result.level.number}": sum(result.seconds.values()) * more for result in results}
     start = time.perf_counter()
-    canvas = plan_canvas(results[-1].trajectory, part.info.span, part.info.frame_shape, plan.render.scale, int(plan.run.memory))
+    renderer, trajectory, scale = build_renderer(plan, part, []), results[-1].trajectory, plan.render.scale
+    canvas = plan_canvas(
+        trajectory, part.info.span, part.info.frame_shape, scale, int(plan.run.memory), renderer.bytes_per_pixel
+    )
     with one_thread_inside():
-        render(part, results[-1].trajectory, part.info.span, canvas, plan.render.tolerance_px, Context(threads))
+        render(part, trajectory, part.info.span, canvas, plan.render.tolerance_px, Context(threads), renderer)
     seconds["panorama"] = (time.perf_counter() - start) * more
     sides = [
         round(side * plan.render.scale + (whole - side * plan.render.scale) * more)
         for side, whole in zip(part.info.frame_shape, canvas.shape, strict=True)
     ]
-    rendering = min(BYTES_PER_PIXEL * sides[0] * sides[1], int(plan.run.memory))
+    rendering = min(renderer.bytes_per_pixel * sides[0] * sides[1], int(plan.run.memory))
     memory = (peak_memory_bytes() or 0) + n_frames * BYTES_PER_FRAME + rendering
     return Forecast(span, threads, seconds, memory, (sides[0], sides[1]))
 

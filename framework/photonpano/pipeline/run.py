@@ -21,7 +21,7 @@ from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
-from photonpano.pipeline.components import build_refiners, open_source
+from photonpano.pipeline.components import build_refiners, build_renderer, open_source
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
@@ -114,9 +114,20 @@ def run(
         explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)
         verdict = judge(explained, found.results, decisions)
         motion = explained.motion
+        renderer = build_renderer(plan, source, decisions)
         panorama = render_panorama(
-            source, motion.trajectory, motion.span, plan.render, memory, folder.write_tile, context, explained.panorama
+            renderer,
+            source,
+            motion.trajectory,
+            motion.span,
+            plan.render,
+            memory,
+            folder.write_tile,
+            context,
+            renderer.bytes_per_pixel,
+            explained.panorama if renderer.merges else None,
         )
+        renderer.require_seen(panorama.coverage_share)
         observers.rendered(panorama.canvas, panorama.seconds)
         folder.write_results(panorama, motion)
         seconds = time.perf_counter() - start

@@ -155,6 +155,7 @@ def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
         yield from (("locate", choice) for choice in level.fallbacks)
         yield "interpolate", level.interpolate
     yield from (("refine", choice) for choice in plan.refine)
+    yield "render", plan.renderer
 
 
 def level_record(result: LevelResult) -> LevelRecord:

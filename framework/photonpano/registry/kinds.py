@@ -1,4 +1,4 @@
-"""The six kinds of components, and what each is called in hooks and in specs."""
+"""The seven kinds of components, and what each is called in hooks and in specs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from photonpano.contributions import (
     LocatorContribution,
     MergerContribution,
     RefinerContribution,
+    RendererContribution,
     ResamplerContribution,
     SourceContribution,
 )
@@ -47,6 +48,7 @@ KINDS: Mapping[str, Kind] = {
         Kind("locator", "locate", "photonpano_locators", LocatorContribution, ("describe", "register")),
         Kind("interpolator", "interpolate", "photonpano_interpolators", InterpolatorContribution, ("fit",)),
         Kind("refiner", "refine", "photonpano_refiners", RefinerContribution, ("refine",)),
+        Kind("renderer", "render", "photonpano_renderers", RendererContribution, ("render",)),
     )
 }
 """All kinds by name, in the order in which a run needs them."""

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from photonpano.specs.plan import Choice, Plan
     from photonpano.values import StreamInfo
 
-STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner"))
+STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner", "renderer"))
 """The sections of a spec that choose the components of a level, in the order of the loop."""
 MAX_COMPLAINTS = 100
 """Most problems of one component that are reported."""
 
 
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
-    """Check a plan against its capture: every stage of every level, the refiners, and the frame that the panorama lies in.
+    """Check a plan against its capture: all stages, refiners and the renderer, and the reference frame.
 
     Reads no data. What levels share is reported once.
 
@@ -33,6 +33,7 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         choices |= {f"levels.{index}.{stage}": getattr(level, stage) for stage in STAGES}
         choices |= {f"levels.{index}.locate.fallback.{rank}": choice for rank, choice in enumerate(level.fallbacks)}
     choices |= {f"refine.{index}": choice for index, choice in enumerate(plan.refine)}
+    choices["render"] = plan.renderer
     sentences: dict[tuple[str, str], str] = {}
     for where, choice in choices.items():
         for sentence in complaints(choice, info):

@@ -11,6 +11,7 @@ from photonpano.corrections import CORRECTIONS
 from photonpano.registry.kinds import KINDS
 from photonpano.registry.schema_text import TolerantJsonSchema
 from photonpano.specs.aliases import LocatorAlias
+from photonpano.specs.checks import STAGES
 from photonpano.specs.corrections import AUTO
 from photonpano.specs.resolution import (
     DEFAULT_FALLBACK,
@@ -22,7 +23,7 @@ from photonpano.specs.resolution import (
     UNTIL_CONVERGED,
     VERSION,
 )
-from photonpano.specs.settings import LevelSettings, OutputSettings
+from photonpano.specs.settings import LevelSettings, OutputSettings, RenderSettings
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -65,8 +66,9 @@ def json_schema(catalog: Catalog) -> Schema:
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
-    level["properties"] |= {name: schema for name, schema in overrides.items() if name in DEFAULTS}
+    level["properties"] |= {name: schema for name, schema in overrides.items() if name in STAGES}
     sections["source"]["required"] = ["use"]
+    rendering = _rendering(sections.pop("render"), definitions[_definition(schemas[RenderSettings])])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "photonpano pipeline spec",
@@ -88,6 +90,7 @@ def json_schema(catalog: Catalog) -> Schema:
                 ],
             },
             **{name: schemas[model] for name, model in SETTINGS.items()},
+            "render": rendering,
         },
         "$defs": definitions,
     }
@@ -128,6 +131,11 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
+
+
+def _rendering(component: Schema, settings: Schema) -> Schema:
+    """Return the schema of the section `render`: the keys that choose the renderer, beside the framework's own."""
+    return component | {"description": settings["description"], "properties": component["properties"] | settings["properties"]}
 
 
 def _item(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema]) -> Schema:

@@ -64,6 +64,7 @@ class Plan:
         levels: one plan for each level, in order.
         refine: the refiners that correct the motion after the last level, in order.
         until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
+        renderer: the component that renders the panorama.
         graph: which pairs are registered, and what happens when the graph is disconnected.
         render: the panorama.
         output: the run folder.
@@ -80,6 +81,7 @@ class Plan:
     corrections: tuple[Correction, ...]
     levels: tuple[LevelPlan, ...]
     refine: tuple[Choice, ...]
+    renderer: Choice
     until_converged: bool
     graph: GraphSettings
     render: RenderSettings

@@ -30,7 +30,13 @@ LEVELS = 3
 MAX_LEVELS = 8
 UNTIL_CONVERGED = "until-converged"
 """Instead of a number of levels: as many as the motion needs to converge, `MAX_LEVELS` at most."""
-DEFAULTS = {"resample": "midpoint", "merge": "photon-mle", "locate": "direct", "interpolate": "smoothing-spline"}
+DEFAULTS = {
+    "resample": "midpoint",
+    "merge": "photon-mle",
+    "locate": "direct",
+    "interpolate": "smoothing-spline",
+    "render": "merge",
+}
 """The components that a spec uses by default."""
 DEFAULT_FALLBACK = "opencv-sift"
 """The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks."""
@@ -49,6 +55,8 @@ MAX_LISTED = 16
 """The largest number of components in a list, such as fallbacks."""
 SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
+_CHOICE = ("use", "with")
+"""The keys that choose a component."""
 _AGAIN = "would lose the same pairs again"
 
 
@@ -120,8 +128,11 @@ class _Resolver:
         refine = [self.item(KIND_OF["refine"], item, f"refine.{index}") for index, item in enumerate(refiners)]
         written = self.levels(root.get("levels"))
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
-        settings: dict[str, Any] = {name: validate(model, root.get(name), name, spec) for name, model in SETTINGS.items()}
-        if source is None or spec.problems:
+        renderer = self.renderer(root.get("render"))
+        settings: dict[str, Any] = {
+            name: validate(model, _settings(name, root.get(name)), name, spec) for name, model in SETTINGS.items()
+        }
+        if source is None or renderer is None or spec.problems:
             return None
         until_converged = root.get("levels") == UNTIL_CONVERGED
         chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
@@ -134,11 +145,13 @@ class _Resolver:
             "levels": UNTIL_CONVERGED if until_converged else [_level(level, chosen) for level in levels if level],
             **{name: section.model_dump(mode="json") for name, section in settings.items()},
         }
+        document["render"] = _component(renderer) | document["render"]
         return Plan(
             source,
             corrections or (),
             tuple(filter(None, levels)),
             tuple(filter(None, refine)),
+            renderer,
             until_converged,
             **settings,
             document=document,
@@ -151,7 +164,8 @@ class _Resolver:
 
     def sections_of(self, root: dict[str, Any], refiners: list[Any]) -> dict[str, list[str]]:
         """Return the sections in which each key may stand, for the components that the spec chooses."""
-        keys = {f"{name}.with": self.keys_of(KIND_OF[name], _name(name, root.get(name))) for name in ("source", *STAGES)}
+        with_component = ("source", *STAGES, "render")
+        keys = {f"{name}.with": self.keys_of(KIND_OF[name], _name(name, root.get(name))) for name in with_component}
         for index, item in enumerate(refiners):
             where = f"refine.{index}.with" if isinstance(root.get("refine"), list) else "refine.with"
             keys[where] = self.keys_of(KIND_OF["refine"], _name("refine", {"use": item} if isinstance(item, str) else item))
@@ -189,6 +203,13 @@ class _Resolver:
             own = spec.places.keys() - {f"{where}.with"}
             spec.problems = old + [x for x in new if x.where in own or (x.where.removeprefix(where), x.message) not in reported]
         return _Stage(section, choice, fallbacks)
+
+    def renderer(self, data: Any) -> Choice | None:
+        """Resolve the component that `render` chooses, whose keys `use` and `with` stand beside the framework's."""
+        if data is not None and not isinstance(data, dict):
+            return None  # reported with the settings of the section
+        chosen = {"use": DEFAULTS["render"]} | {key: value for key, value in (data or {}).items() if key in _CHOICE}
+        return self.component(KIND_OF["render"], chosen, "render")
 
     def spelled_out(self, name: str, content: dict[str, Any], where: str, base: _Stage | None) -> dict[str, Any] | None:
         """Return a section with inherited keys, defaults and aliases filled in, and a list of fallbacks; None if that fails."""
@@ -345,6 +366,13 @@ class _Resolver:
         if settings is None or None in choices.values():
             return None
         return LevelPlan(**choices, fallbacks=selected["locate"].fallbacks, scale=settings.scale)
+
+
+def _settings(name: str, data: Any) -> Any:
+    """Return the framework's own keys of a section; in `render`, those of the renderer stand beside them."""
+    if name != "render" or not isinstance(data, dict):
+        return data
+    return {key: value for key, value in data.items() if key not in _CHOICE}
 
 
 def _name(section: str, data: Any) -> object:

@@ -6,6 +6,7 @@ from .interpolators import InterpolatorConformance as InterpolatorConformance
 from .locators import LocatorConformance as LocatorConformance
 from .mergers import MergerConformance as MergerConformance
 from .refiners import RefinerConformance as RefinerConformance
+from .renderers import RendererConformance as RendererConformance
 from .resamplers import ResamplerConformance as ResamplerConformance
 from .scenes import Scene as Scene
 from .sources import SourceConformance as SourceConformance

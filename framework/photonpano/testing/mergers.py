@@ -303,13 +303,13 @@ def _to_scene(frame: float) -> Homography:
 
 MOTION = KnownMotion(_to_scene)
 """Pixels of a frame of the moving camera to points of the scene."""
-_SCENE = Scene(seed=3)
+SCENE = Scene(seed=3)
 
 
 @cache
 def still_flux() -> FloatArray:
     """Return the flux that the still camera sees: (H, W)."""
-    return _SCENE.view(_STILL, SHAPE)
+    return SCENE.view(_STILL, SHAPE)
 
 
 @cache
@@ -322,7 +322,7 @@ def still_frames() -> NDArray[np.uint8]:
 @cache
 def moving_frames() -> NDArray[np.uint8]:
     """Return the frames of the moving camera."""
-    return read_only(recorded(_SCENE, MOTION, N_FRAMES, SHAPE, seed=5))
+    return read_only(recorded(SCENE, MOTION, N_FRAMES, SHAPE, seed=5))
 
 
 def dead_pixels() -> BoolArray:
@@ -334,7 +334,7 @@ def dead_pixels() -> BoolArray:
 
 def view_at(instant: float) -> FloatArray:
     """Return the flux that the moving camera sees at an instant."""
-    return _SCENE.view(MOTION.at([instant])[0], SHAPE)
+    return SCENE.view(MOTION.at([instant])[0], SHAPE)
 
 
 def displacement_and_contrast(exposure: VirtualExposure, known: FloatArray) -> tuple[FloatArray, float]:

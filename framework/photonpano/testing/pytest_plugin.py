@@ -12,7 +12,8 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-for _name in ("conformance", "stages", "sources", "resamplers", "mergers", "locators", "interpolators", "refiners"):
+_KINDS = ("sources", "resamplers", "mergers", "locators", "interpolators", "refiners", "renderers")
+for _name in ("conformance", "stages", *_KINDS):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 
 

@@ -1,4 +1,4 @@
-"""Checks of components of stages, and of refiners: they are built before frames are read, and accept read-only inputs."""
+"""Checks of all components but sources: they are built before frames are read, and accept read-only inputs."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from photonpano.testing import (
     InterpolatorConformance,
     MergerConformance,
     RefinerConformance,
+    RendererConformance,
     ResamplerConformance,
     SourceConformance,
 )
@@ -138,3 +139,7 @@ class TestSmoothingSpline(InterpolatorConformance):
 
 class TestShortSpans(RefinerConformance):
     contribution = CATALOG.find("refiner", "short-spans").contribution
+
+
+class TestMerge(RendererConformance):
+    contribution = CATALOG.find("renderer", "merge").contribution

@@ -12,6 +12,7 @@ from photonpano import (
     MergerContribution,
     Recognised,
     RefinerContribution,
+    RendererContribution,
     Requirement,
     ResamplerContribution,
     SourceContribution,
@@ -91,6 +92,14 @@ class DriftConfig(Config):
     knots: int = Field(4, ge=2, description="of the spline")
 
 
+class Plain(Config):
+    """No keys."""
+
+
+class SharpConfig(Config):
+    rounds: int = Field(8, ge=1, le=99, description="number of rounds")
+
+
 class MoodyConfig(Config):
     mood: str = ""
 
@@ -113,6 +122,10 @@ def npy(path):
 
 def too_few_spans(config, info):
     return [f"a capture of {info.n_frames} frames has no two spans"] if 2 * config.span_frames > info.n_frames else []
+
+
+def too_small(config, info):
+    return [f"{config.rounds} rounds are too many for frames of {info.height} rows"] if config.rounds > info.height else []
 
 
 def too_few_frames(config, info):
@@ -143,6 +156,8 @@ CONTRIBUTIONS = [
     InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
     RefinerContribution(name="short-spans", summary="Toy", config=SpansConfig, build=unbuilt, check=too_few_spans),
     RefinerContribution(name="drift", summary="Toy", config=DriftConfig, build=unbuilt),
+    RendererContribution(name="merge", summary="Toy", config=Plain, build=unbuilt),
+    RendererContribution(name="sharp", summary="Toy", config=SharpConfig, build=unbuilt, check=too_small),
 ]
 TWICE = LocatorContribution(name="twice", summary="Toy", config=DirectConfig, build=unbuilt)
 

@@ -34,7 +34,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
     document = plan.document
     rest = {
         "refine": [_component(choice) for choice in plan.refine],
-        "render": document["render"],
+        "render": {**document["render"], **_component(plan.renderer), "code": _code([plan.renderer])},
         "memory": int(plan.run.memory),
     }
     found: Fingerprint = _plain(

@@ -1,0 +1,38 @@
+"""Merge all frames on a canvas: one maximum-likelihood estimate for each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+from photonpano.merging.accumulate import accumulate
+from photonpano.merging.chunks import chunks_of
+from photonpano.protocols import Source, Trajectory
+from photonpano.values import FrameSpan, Panorama
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Canvas
+
+
+class MergeRenderer:
+    """Warps the photons of all frames to the canvas, and estimates the flux of each pixel once (paper, equation 3)."""
+
+    def __init__(self, threads: int) -> None:
+        """Take the number of threads that warp; the result does not depend on it."""
+        self._threads = threads
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Merge the frames of a span on a canvas: see `Renderer`."""
+        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
+        with ThreadPoolExecutor(self._threads, thread_name_prefix="render") as pool:
+            photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance, pool)
+        return Panorama(*photons.estimate(source.response), canvas.transform)

@@ -1,0 +1,90 @@
+"""Renderers of plugins: their errors name the plugin, and what they return is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonpano.geometry import Canvas
+from photonpano.merging import MergeRenderer
+from photonpano.motion.attribution import BrokenContract, attributing, shown
+from photonpano.protocols import Renderer, Source, Trajectory
+from photonpano.values import FrameSpan, Panorama
+
+
+@dataclass(frozen=True, slots=True)
+class AttributedRenderer:
+    """A renderer whose errors name its plugin, and whose panoramas are checked.
+
+    Attributes:
+        component: the renderer.
+        origin: who provides it, such as "renderer 'merge' of photonpano 0.1.0".
+        bytes_per_pixel: peak memory of rendering for a pixel of the canvas.
+    """
+
+    component: Renderer
+    origin: str
+    bytes_per_pixel: int
+
+    @property
+    def merges(self) -> bool:
+        """Whether it renders what the residuals were measured against: the merge of all frames."""
+        return isinstance(self.component, MergeRenderer)
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Render the frames of a span on a canvas.
+
+        Raises:
+            PluginError: the renderer failed, or broke its contract.
+        """
+        with attributing(self.origin, "the panorama"):
+            return require_panorama(self.component.render(source, trajectory, span, canvas, tolerance_px, advance), canvas)
+
+    def require_seen(self, coverage_share: float) -> None:
+        """Refuse a panorama of which nothing was seen, although frames were located.
+
+        Raises:
+            PluginError: the renderer broke its contract.
+        """
+        with attributing(self.origin, "the panorama"):
+            if not coverage_share:
+                raise BrokenContract("no pixel has a positive weight")
+
+
+def require_panorama(found: object, canvas: Canvas) -> Panorama:
+    """Return what a renderer returned, in float32, once its type, shapes and values are checked.
+
+    Args:
+        found: what it returned.
+        canvas: the canvas that it was given.
+
+    Raises:
+        BrokenContract: it is no panorama on this canvas, or flux is not finite exactly where the weight is positive.
+    """
+    if not isinstance(found, Panorama):
+        raise BrokenContract(f"expected a Panorama, got {type(found).__name__}")
+    for name in ("flux", "weight"):
+        image = getattr(found, name)
+        if not isinstance(image, np.ndarray) or image.dtype.kind != "f" or image.shape != canvas.shape:
+            raise BrokenContract(f"{name} is {canvas.shape} of float32, got {shown(image)}")
+    if not np.array_equal(np.asarray(found.canvas), canvas.transform):
+        raise BrokenContract("the canvas of the panorama is the transform of the given canvas, got another one")
+    flux, weight = (np.ascontiguousarray(image, np.float32) for image in (found.flux, found.weight))
+    wrong = (np.isfinite(flux) != (weight > 0)) | (np.isinf(flux)) | ~(weight >= 0) | ~np.isfinite(weight)
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        raise BrokenContract(
+            "flux is finite where weight is positive, and NaN where weight is 0; "
+            f"at row {row}, column {column} flux is {flux[row, column]:g} and weight {weight[row, column]:g}"
+        )
+    return Panorama(flux, weight, canvas.transform)
