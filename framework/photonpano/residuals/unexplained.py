@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from photonpano.geometry import corners
@@ -23,9 +24,11 @@ _MISFIT = 3.0
 _STANDS_OUT = 30.0
 """A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
 200,000 spans."""
+_BOUND_SPANS, _NEAR_SPANS = 3, 1.0
+"""The measured steps of three spans bound the error of frames that are at most one span away from one."""
 
-_BOUND_SPANS = 3
-"""The measured steps of this many spans bound the error of a frame."""
+_DARK = -0.5
+"""Spans that are darker than predicted by half of the light or more show too little to be measured."""
 
 
 def residual_ratio(residuals: Residuals) -> float:
@@ -86,15 +89,23 @@ def bounded_std_px(std_px: FloatArray, residuals: Residuals) -> FloatArray:
         residuals: of the motion.
     """
     steps, variances = _series(residuals)
-    known = np.isfinite(variances).all(axis=1)
+    known = np.isfinite(variances).all(axis=1) & (residuals.gains()[0] > _DARK)
     if known.sum() < _BOUND_SPANS:
         return std_px
     squares = np.pad((steps[known] ** 2 + variances[known]).sum(axis=1), _BOUND_SPANS // 2, mode="edge")
     local = sliding_window_view(squares, _BOUND_SPANS).mean(axis=1)
-    measured = np.interp(np.arange(len(std_px)), residuals.instants[known], local)
+    frames, instants = np.arange(len(std_px)), residuals.instants[known]
+    measured = np.interp(frames, instants, local)
+    measured[_distance_to(instants, frames) > _NEAR_SPANS * np.median(np.diff(residuals.instants))] = np.inf
     reach = max(1, int(residuals.frames_seen / 4))
     surest = minimum_filter1d(std_px**2 + measured, 2 * reach + 1, mode="nearest")
     return np.asarray(np.minimum(std_px, np.where(np.isfinite(std_px), np.sqrt(surest + measured), np.inf)))
+
+
+def _distance_to(instants: FloatArray, frames: NDArray[np.integer]) -> FloatArray:
+    """Return the distance of each frame to the nearest instant, in frames."""
+    after = np.searchsorted(instants, frames).clip(1, len(instants) - 1)
+    return np.asarray(np.minimum(abs(frames - instants[after - 1]), abs(frames - instants[after])))
 
 
 def standing_out(residuals: Residuals) -> BoolArray:

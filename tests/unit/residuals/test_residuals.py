@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -77,6 +78,17 @@ def test_bounded_std_px_at_an_extrapolated_end_is_what_the_photons_allow() -> No
 def test_bounded_std_px_keeps_the_error_that_photons_show() -> None:
     found = residuals_of(capture(0.4))
     assert bounded_std_px(np.full(FRAMES, 10.0), found).min() == 10
+
+
+def test_bounded_std_px_of_frames_that_show_nothing_stays_as_it_was() -> None:
+    found = residuals_of(capture())
+    dark = (found.instants > 400) & (found.instants < 600)
+    gradient = found.gradient.copy()
+    gradient[dark, -1] = -found.normal[dark, -1, -1]
+    frames = np.arange(FRAMES)
+    bounded = bounded_std_px(np.where((frames > 450) & (frames < 640), 10.0, 0.1), replace(found, gradient=gradient))
+    assert bounded[460:580].min() == 10
+    assert bounded[630:].max() < 1
 
 
 def test_scatter_of_steps_is_their_information() -> None:
