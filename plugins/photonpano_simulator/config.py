@@ -18,6 +18,22 @@ class StreetScene(Config):
     seed: int = Field(0, ge=0, description="another seed is another street")
 
 
+class NightScene(Config):
+    """The street at night: lamps, lit windows, and shadows in between."""
+
+    kind: Literal["night"] = Field("night", description="the built-in scene at night")
+    width: int = Field(2048, ge=64, le=16384, description="in px; a wider street has more houses and lamps")
+    height: int = Field(1365, ge=64, le=16384, description="in px; a higher street is the same one, larger")
+    seed: int = Field(0, ge=0, description="another seed is another street")
+    range_db: float = Field(
+        120.0,
+        ge=20,
+        le=200,
+        description="flux of the brightest pixel divided by that of the darkest, in dB: 20 dB are a factor of ten. The lamps "
+        "take most of the mean flux",
+    )
+
+
 class PhotoScene(Config):
     """A photograph: sRGB of 8 or 16 bits, undone to linear, of which the luminance is kept."""
 
@@ -222,7 +238,9 @@ class FrameRange(Config):
 class SimulationConfig(Config):
     """What simulations of all cameras share."""
 
-    scene: Annotated[StreetScene | PhotoScene, Field(discriminator="kind")] = Field(StreetScene(), description="the scene")
+    scene: Annotated[StreetScene | NightScene | PhotoScene, Field(discriminator="kind")] = Field(
+        StreetScene(), description="the scene"
+    )
     path: Annotated[PanPath | ScanPath | LoopPath | SplinePath | HandShakePath | FilePath, Field(discriminator="kind")] = Field(
         PanPath(), description="the path of the camera"
     )

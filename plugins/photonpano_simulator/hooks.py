@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from photonpano import InputError, SourceContribution, hookimpl
 from photonpano.reading import missing_file
-from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig, StreetScene
+from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -38,7 +38,7 @@ def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
         delivered(config)
     except InputError as error:
         problems.append(str(error))
-    if isinstance(config.scene, StreetScene) and not isinstance(config.path, FilePath):
+    if not isinstance(config.scene, PhotoScene) and not isinstance(config.path, FilePath):
         from photonpano_simulator.paths import camera_path
 
         # The shake depends on the seed of the run, which is not known yet.

@@ -1,4 +1,4 @@
-"""Scenes: the flux of a photograph, or of the built-in street."""
+"""Scenes: the flux of a photograph, or of the built-in street by day or at night."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
 from photonpano.reading import look_first, read_picture
-from photonpano_simulator.config import PhotoScene, StreetScene
+from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
 from photonpano_simulator.street import street
+from photonpano_simulator.street.night import night
 
 _LUMINANCE = (0.0722, 0.7152, 0.2126)
 """Luminance of blue, green and red, in the order of OpenCV (IEC 61966-2-1)."""
@@ -20,7 +21,7 @@ _LARGEST = 16384
 """Largest side of a scene, px. Warps of OpenCV refuse a side of 32768 px."""
 
 
-def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float32]:
+def scene_flux(scene: StreetScene | NightScene | PhotoScene, flux: float) -> NDArray[np.float32]:
     """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame, with the mean `flux`.
 
     Raises:
@@ -28,6 +29,8 @@ def scene_flux(scene: StreetScene | PhotoScene, flux: float) -> NDArray[np.float
     """
     if isinstance(scene, StreetScene):
         linear = srgb_to_linear(street((scene.height, scene.width), scene.seed))
+    elif isinstance(scene, NightScene):
+        linear = night((scene.height, scene.width), scene.seed, scene.range_db)
     else:
         linear = _photo(scene.file, scene.width)
     mean = float(linear.mean(dtype=np.float64))

@@ -57,3 +57,15 @@ def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: flo
     low, high = np.floor(low + 1e-6), np.ceil(high - 1e-6)
     width, height = np.ceil((high - low + 1) * scale - 1e-6).astype(int)
     return Canvas(int(height), int(width), rescaling(scale) @ translation(-low[0], -low[1]))
+
+
+def canvas_of_box(box: tuple[int, int, int, int], scale: float) -> Canvas:
+    """Return the canvas of a box of the reference plane.
+
+    Args:
+        box: x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1.
+        scale: pixels of the canvas per pixel of the reference frame.
+    """
+    x0, y0, x1, y1 = box
+    width, height = (int(np.ceil(side * scale - 1e-6)) for side in (x1 - x0, y1 - y0))
+    return Canvas(height, width, rescaling(scale) @ translation(-x0, -y0))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from photonpano.merging.accumulate import accumulate
 from photonpano.merging.chunks import chunks_of
+from photonpano.photometry import debiased
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import FrameSpan, Panorama
 
@@ -35,4 +36,5 @@ class MergeRenderer:
         chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
         with ThreadPoolExecutor(self._threads, thread_name_prefix="render") as pool:
             photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance, pool)
-        return Panorama(*photons.estimate(source.response), canvas.transform)
+        flux, weight = photons.estimate(source.response)
+        return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)

@@ -1,8 +1,10 @@
 """Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
 from photonpano.photometry.contrast import signal_to_noise
+from photonpano.photometry.noise import FluxRange, debiased, flux_std, measurable_range, saturated
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
-from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, IntensityResponse
+from photonpano.photometry.pictures import Tone, picture_of
+from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, Factor, IntensityResponse
 from photonpano.photometry.similarity import (
     Similarity,
     autocorrelation,
@@ -17,14 +19,22 @@ __all__ = [
     "BinaryResponse",
     "BinarySumResponse",
     "BitOrder",
+    "Factor",
+    "FluxRange",
     "IntensityResponse",
     "Similarity",
+    "Tone",
     "autocorrelation",
+    "debiased",
+    "flux_std",
     "linear_to_srgb",
+    "measurable_range",
     "noise_free_correlation",
     "packed_along_width",
     "packed_counts",
+    "picture_of",
     "reversed_bits",
+    "saturated",
     "signal_to_noise",
     "similarity_of",
     "srgb_to_linear",

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+Factor: TypeAlias = "NDArray[np.floating] | float"
+"""One number for all pixels, or one for each."""
+_LEAST_DARK = 0.75
+"""A pixel with fewer dark frames was lit in all: half a dark frame is what `flux` assumes then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +32,34 @@ class BinaryResponse:
         """Return the maximum-likelihood flux `-ln(1 - mean_count)` (equation 3), at most `ln(2 frames)`."""
         ceiling = 1 - 0.5 / np.maximum(frames, 1)
         return np.asarray(-np.log1p(-np.clip(mean_count, 0, ceiling)), dtype=np.float32)
+
+    def debiased(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Remove the bias of maximum-likelihood flux, which is too high where few frames are dark.
+
+        Half a dark frame is added: `-ln((n - k) / n)` of k counts in n frames becomes `-ln((n - k + 1/2) / (n + 1/2))`. With 5
+        dark frames, the bias falls from 26 % of the standard deviation to 1 %. A pixel that is lit in all frames gets
+        `ln(2 n + 1)`, a lower bound.
+        """
+        frames = np.maximum(frames, 1)
+        lit = -np.expm1(-flux)
+        lit = np.where((1 - lit) * frames < _LEAST_DARK, 1, lit)
+        return np.asarray(-np.log1p(-lit * (frames / (frames + 0.5))), dtype=np.float32)
+
+    def flux_std(
+        self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
+    ) -> NDArray[np.float32]:
+        """Return the standard deviation of flux estimated from `frames` frames: see `photonpano.photometry.flux_std`.
+
+        Without corrections it is `sqrt((exp(flux) - 1) / frames)`. One and a half lit frames and a dark one are added, so that
+        95 % of estimates lie within two standard deviations also where there are few of these, and it is positive where there
+        are none.
+        """
+        frames = np.maximum(np.asarray(frames, np.float64), 1)
+        dark = np.exp(-np.asarray(flux, np.float64))
+        raw_dark = np.clip((dark - 1 + slope + offset) / slope, 0, 1)
+        lit, unlit = frames * (1 - raw_dark) + 1.5, frames * raw_dark + 1
+        spread = np.sqrt(lit * unlit / frames) / (frames + 2.5)
+        return np.asarray(slope * spread / (dark + 0.5 / frames), dtype=np.float32)
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `arcsin(sqrt((k + 3/8) / (n + 3/4)))` of k counts in n frames, from 0 to pi/2 (Anscombe 1948).
@@ -61,6 +95,17 @@ class BinarySumResponse:
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the maximum-likelihood flux `-n ln(1 - mean_count / n)`, at most `n ln(2 n frames)`."""
         return np.asarray(self.n * BinaryResponse().flux(mean_count / np.float32(self.n), self.n * frames), dtype=np.float32)
+
+    def debiased(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
+        """Remove the bias of maximum-likelihood flux, as `BinaryResponse` does."""
+        return np.asarray(self.n * BinaryResponse().debiased(flux / np.float32(self.n), self.n * frames), dtype=np.float32)
+
+    def flux_std(
+        self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
+    ) -> NDArray[np.float32]:
+        """Return the standard deviation of flux estimated from `frames` sums: see `photonpano.photometry.flux_std`."""
+        share = BinaryResponse().flux_std(flux / np.float32(self.n), self.n * frames, slope, np.asarray(offset) / self.n)
+        return np.asarray(self.n * share, dtype=np.float32)
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the stabilised flux of `BinaryResponse` for all binary frames, from 0 to pi/2."""
@@ -103,6 +148,18 @@ class IntensityResponse:
         del frames
         level = np.minimum(mean_count, self.saturation_level)
         return np.asarray((level - self.black_level) * self.photons_per_level, dtype=np.float32)
+
+    def flux_std(
+        self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
+    ) -> NDArray[np.float32]:
+        """Return the standard deviation of flux estimated from `frames` frames: see `photonpano.photometry.flux_std`.
+
+        Without corrections it is `sqrt((flux + read_noise^2) / frames)`.
+        """
+        level = np.asarray(flux, np.float64) / self.photons_per_level + self.black_level
+        raw = ((level - offset) / slope - self.black_level) * self.photons_per_level
+        variance = np.maximum(raw, 0) + self.read_noise**2
+        return np.asarray(slope * np.sqrt(variance / np.maximum(frames, 1)), dtype=np.float32)
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return `sqrt(flux + read_noise^2 + 3 / (8 n))` of n frames: the generalised Anscombe transform.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import InputError
-from photonpano_simulator.config import PhotoScene, StreetScene
+from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
 from photonpano_simulator.scenes import scene_flux
 
 
@@ -17,12 +17,20 @@ def written(path: Path, image: np.ndarray) -> Path:
 
 
 def test_mean_of_the_scene_is_the_flux(photo: Path) -> None:
-    for scene in (PhotoScene(file=photo), StreetScene(width=320, height=240)):
+    for scene in (PhotoScene(file=photo), StreetScene(width=320, height=240), NightScene(width=320, height=240)):
         flux = scene_flux(scene, 0.3)
         assert flux.dtype == np.float32
         assert flux.mean(dtype=np.float64) == pytest.approx(0.3, rel=1e-5)
         assert flux.min() >= 0
     assert scene_flux(StreetScene(width=320, height=240), 0.3).shape == (240, 320)
+
+
+@pytest.mark.parametrize("range_db", [60.0, 120.0])
+def test_night_has_the_given_range_and_most_of_it_is_dark(range_db: float) -> None:
+    flux = scene_flux(NightScene(width=320, height=240, range_db=range_db), 0.1)
+    assert 20 * np.log10(flux.max() / flux.min()) == pytest.approx(range_db, abs=0.1)
+    assert np.median(flux) < 1e-2 * flux.max()
+    assert not np.array_equal(flux, scene_flux(NightScene(width=320, height=240, range_db=range_db, seed=1), 0.1))
 
 
 @pytest.mark.parametrize(("bits", "step"), [(np.uint8, 1), (np.uint16, 257)])

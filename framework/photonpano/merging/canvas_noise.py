@@ -1,0 +1,160 @@
+"""The noise of a panorama: its standard deviation and its saturated pixels, with the corrections of the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from photonpano.geometry import Canvas, rescaling
+from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
+from photonpano.protocols import LinearlyCorrectedSource, Source, Trajectory
+from photonpano.values import BoolArray, FluxImage, FrameSpan, Response
+
+_INSTANTS = 64
+"""Largest number of instants at which the corrections of the sensor are laid on the canvas."""
+_LARGEST_PX = 1024
+"""Longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels."""
+_BLOCK = 2**18
+"""Values of a tile that are looked at at once."""
+_EVEN = 1e-4
+"""Corrections that differ by less than this are one number."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CanvasNoise:
+    """What the noise on a canvas depends on, beside flux and weight.
+
+    A correction multiplies the counts of a pixel by `slope` and adds `offset` for each frame: see `flux_std`.
+
+    Attributes:
+        response: the response of the camera.
+        slope: one number, or a map (h, w) of the canvas, coarser by `reduction`.
+        offset: as `slope`.
+        reduction: pixels of the canvas per pixel of the maps, along each side.
+    """
+
+    response: Response
+    slope: Factor = 1.0
+    offset: Factor = 0.0
+    reduction: float = 1.0
+
+    @classmethod
+    def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
+        """Lay the corrections of a source on a canvas, as they are on average over the frames that see each place.
+
+        Args:
+            source: the capture.
+            trajectory: frame pixels to reference pixels.
+            span: the frames that are rendered.
+            canvas: the pixel grid.
+        """
+        if not isinstance(source, LinearlyCorrectedSource):
+            return cls(source.response)
+        none = np.zeros(source.info.frame_shape, np.uint32)
+        offset = np.asarray(source.corrected(none, 1), np.float32)
+        slope = np.asarray(source.corrected(none + 1, 1) - offset, np.float32)
+        valid = source.valid
+        means = float(slope[valid].mean()), float(offset[valid].mean())
+        if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
+            return cls(source.response, *means)
+        reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
+        height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
+        to_map = rescaling(1 / reduction) @ canvas.transform
+        share, sums = np.zeros((height, width), np.float32), np.zeros((2, height, width), np.float32)
+        instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
+        for homography in trajectory.at(instants):
+
+            def laid(image: FluxImage, transform: FluxImage = to_map @ homography) -> FluxImage:
+                return np.asarray(cv2.warpPerspective(image, transform, (width, height)), np.float32)
+
+            share += laid(valid.astype(np.float32))
+            for total, image in zip(sums, (slope, offset), strict=True):
+                total += laid(np.where(valid, image, np.float32(0)))
+        on_slope, on_offset = (
+            np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
+            for total, mean in zip(sums, means, strict=True)
+        )
+        return cls(source.response, on_slope, on_offset, reduction)
+
+    def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
+        """Return the standard deviation of the flux of a part of the canvas.
+
+        Args:
+            flux: (h, w) or (h, w, 3).
+            weight: the same shape.
+            top: first row of the part.
+            left: first column.
+        """
+        slope, offset = (self._part(each, flux, top, left) for each in (self.slope, self.offset))
+        return flux_std(flux, weight, self.response, slope, offset)
+
+    def saturated(self, flux: FluxImage, weight: FluxImage) -> BoolArray:
+        """Return the pixels that were lit in every frame."""
+        return saturated(flux, weight, self.response)
+
+    def measurable(self, frames: float) -> FluxRange | None:
+        """Return the range of flux that a number of frames measures, with corrections as they are on average."""
+        return measurable_range(frames, self.response, float(np.mean(self.slope)), float(np.mean(self.offset)))
+
+    def _part(self, factor: Factor, flux: FluxImage, top: int, left: int) -> Factor:
+        if not isinstance(factor, np.ndarray):
+            return factor
+        rows, columns = (
+            np.minimum(((first + np.arange(length)) / self.reduction).astype(int), side - 1)
+            for first, length, side in zip((top, left), flux.shape, factor.shape, strict=False)
+        )
+        part = factor[np.ix_(rows, columns)]
+        return part if flux.ndim == 2 else part[..., None]
+
+
+@dataclass(slots=True)
+class DynamicRange:
+    """The range of flux in a panorama, gathered tile by tile.
+
+    Attributes:
+        noise: of its canvas.
+        low: the lowest flux that exceeds its standard deviation; infinite before there is one.
+        high: the highest.
+        n_saturated: number of values of pixels that were lit in every frame.
+        n_seen: number of values of pixels that were seen.
+        frames: frames that saw each value, added up.
+    """
+
+    noise: CanvasNoise
+    low: float = float("inf")
+    high: float = 0.0
+    n_saturated: int = 0
+    n_seen: int = 0
+    frames: float = 0.0
+
+    def add(self, flux: FluxImage, weight: FluxImage, top: int, left: int) -> None:
+        """Add a tile, row by row so that it takes little memory."""
+        step = max(1, _BLOCK // max(1, flux[0].size)) if len(flux) else 1
+        for row in range(0, len(flux), step):
+            part, frames = flux[row : row + step], weight[row : row + step]
+            std = self.noise.std(part, frames, top + row, left)
+            with np.errstate(invalid="ignore"):
+                measured = part[part >= std]
+            if measured.size:
+                self.low, self.high = min(self.low, float(measured.min())), max(self.high, float(measured.max()))
+            self.n_saturated += int(np.count_nonzero(self.noise.saturated(part, frames)))
+            self.n_seen += int(np.count_nonzero(frames > 0))
+            self.frames += float(frames.sum(dtype=np.float64))
+
+    @property
+    def decibels(self) -> float | None:
+        """Ratio of the highest and the lowest flux that exceed their standard deviation; None if none does."""
+        return FluxRange(self.low, self.high).decibels if 0 < self.low <= self.high else None
+
+    @property
+    def measurable_decibels(self) -> float | None:
+        """Range of flux that the mean number of frames over a pixel measures; None if none is measured."""
+        found = self.noise.measurable(self.frames / self.n_seen) if self.n_seen else None
+        return None if found is None else found.decibels
+
+    @property
+    def saturated_share(self) -> float:
+        """Share of the seen values that were lit in every frame."""
+        return self.n_saturated / max(1, self.n_seen)
