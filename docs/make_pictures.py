@@ -37,7 +37,7 @@ from photonpano.merging.panorama import plan_canvas, render
 from photonpano.photometry import BinaryResponse, tone_mapped
 from photonpano.report.residual_figures import spectrum_over_noise
 from photonpano.residuals.measure import measure
-from photonpano.residuals.prediction import Prediction
+from photonpano.residuals.prediction import Predictions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -338,7 +338,7 @@ def tremor(folder: Path, cube: Path) -> Picture:
             trajectory = motion(in_folder(folder, f"tremor {name}"))
             canvas = plan_canvas(trajectory, span, shape, 1.0, 2**30)
             panorama = render(source, trajectory, span, canvas, 0.25, Context())
-            residuals = measure(source, span, Prediction.of(panorama, source.response, trajectory, shape), Context())
+            residuals = measure(span, Predictions.of(source, panorama, trajectory, shape), Context())
             frequencies, power = spectrum_over_noise(residuals)
             panel.semilogy(96_800 * frequencies, power, color=colour, linewidth=1.2, label=f"{name} the refiner short-spans")
     panel.axhline(1, color="0.5", linewidth=0.8, linestyle="--")

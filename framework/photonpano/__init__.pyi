@@ -43,6 +43,7 @@ from .pipeline.components import open_source as open_source
 from .pipeline.forecast import Forecast as Forecast
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run
+from .protocols import ColouredSource as ColouredSource
 from .protocols import Interpolator as Interpolator
 from .protocols import KeepsHypotheses as KeepsHypotheses
 from .protocols import KnowsTruth as KnowsTruth
@@ -56,12 +57,14 @@ from .protocols import Renderer as Renderer
 from .protocols import Resampler as Resampler
 from .protocols import Source as Source
 from .protocols import Trajectory as Trajectory
+from .protocols import WeightedSource as WeightedSource
 from .registry import Catalog as Catalog
 from .registry import discover as discover
 from .specs import Plan as Plan
 from .specs import capture_plan as capture_plan
 from .specs import load_spec as load_spec
 from .specs import parse_spec as parse_spec
+from .values import Bayer as Bayer
 from .values import BoolArray as BoolArray
 from .values import CaptureSummary as CaptureSummary
 from .values import Counts as Counts

@@ -102,6 +102,38 @@ class LinearlyCorrectedSource(Source, Protocol):
 
 
 @runtime_checkable
+class WeightedSource(Source, Protocol):
+    """A source whose pixels carry different amounts of information, as those behind filters of different colours do."""
+
+    def weights(self) -> FluxImage:
+        """Return how many frames of the best pixel a frame of each pixel is worth: (H, W) float32, above 0 and at most 1.
+
+        Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
+        """
+        ...
+
+
+@runtime_checkable
+class ColouredSource(Source, Protocol):
+    """A source behind a colour filter array. By itself it is grey: its corrected sums are those of pixels of one colour.
+
+    Motion is estimated from this grey source, and the panorama is rendered from the sources of its colours.
+    """
+
+    def colours(self) -> Mapping[str, Source]:
+        """Return a source for each colour: the same frames, in which only the pixels behind filters of this colour are valid.
+
+        Returns:
+            Sources of "red", "green", "blue", and if there are pixels without filter, "clear", in this order.
+        """
+        ...
+
+    def clear_mix(self) -> FloatArray:
+        """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
+        ...
+
+
+@runtime_checkable
 class KnowsTruth(Protocol):
     """A source with ground truth, such as a simulator: a `Source` with one more method.
 
@@ -116,7 +148,8 @@ class KnowsTruth(Protocol):
 
         Returns:
             `homographies` (T, 3, 3) float64, one for each frame, h33 = 1; `scene` (Hs, Ws) float32, the flux that is detected,
-            in photons per pixel per frame, without dark counts; `frame_shape` (2,), height and width of a frame.
+            in photons per pixel per frame, without dark counts, or (Hs, Ws, 3) of red, green and blue pixels; `frame_shape`
+            (2,), height and width of a frame.
         """
         ...
 

@@ -8,8 +8,8 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
-from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
+from photonpano.protocols import ColouredSource, KnowsTruth, LinearlyCorrectedSource, PackedSource, Source, WeightedSource
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Response, StreamInfo
 
 ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
 WrapperT = TypeVar("WrapperT", bound="SourceWrapper")
@@ -31,8 +31,8 @@ class Closing:
 class SourceWrapper(Closing):
     """A source around another source, to which it passes every call. Subclasses override what they change.
 
-    The optional methods `packed`, `corrected` and `truth` come from the classes `PackedWrapper`, `LinearlyCorrectedWrapper` and
-    `TruthWrapper`: see `with_capabilities`.
+    The optional methods `packed`, `corrected`, `weights`, `colours` and `truth` come from the classes `PackedWrapper`,
+    `LinearlyCorrectedWrapper`, `WeightedWrapper`, `ColouredWrapper` and `TruthWrapper`: see `with_capabilities`.
 
     Attributes:
         wrapped: the other source.
@@ -73,6 +73,10 @@ class SourceWrapper(Closing):
         del shape
         return method(span)
 
+    def around(self, source: Source) -> Source:
+        """Return the same wrapper around the source of one colour; a wrapper of a `ColouredSource` has to know how."""
+        raise NotImplementedError(f"{type(self).__name__} does not wrap sources in colour")
+
 
 class PackedWrapper(SourceWrapper):
     """A wrapper of a `PackedSource`."""
@@ -95,6 +99,26 @@ class LinearlyCorrectedWrapper(SourceWrapper):
         return self.wrapped.corrected(counts, n_frames)
 
 
+class WeightedWrapper(SourceWrapper):
+    """A wrapper of a `WeightedSource`."""
+
+    def weights(self) -> FluxImage:
+        """Return what a frame of each pixel is worth: see `WeightedSource`."""
+        return cast("WeightedSource", self.wrapped).weights()
+
+
+class ColouredWrapper(SourceWrapper):
+    """A wrapper of a `ColouredSource`, whose sources it wraps as well."""
+
+    def colours(self) -> Mapping[str, Source]:
+        """Return a source for each colour: see `ColouredSource`."""
+        return {name: self.around(each) for name, each in cast("ColouredSource", self.wrapped).colours().items()}
+
+    def clear_mix(self) -> FloatArray:
+        """Return the flux of a clear pixel: see `ColouredSource`."""
+        return cast("ColouredSource", self.wrapped).clear_mix()
+
+
 class TruthWrapper(SourceWrapper):
     """A wrapper of a source that `KnowsTruth`."""
 
@@ -106,13 +130,19 @@ class TruthWrapper(SourceWrapper):
 def capabilities_of(source: Source) -> list[type[SourceWrapper]]:
     """Return the classes with which a wrapper gets the optional methods that a source has."""
     known: Any = source
-    wrappers = {PackedSource: PackedWrapper, LinearlyCorrectedSource: LinearlyCorrectedWrapper, KnowsTruth: TruthWrapper}
+    wrappers = {
+        PackedSource: PackedWrapper,
+        LinearlyCorrectedSource: LinearlyCorrectedWrapper,
+        WeightedSource: WeightedWrapper,
+        ColouredSource: ColouredWrapper,
+        KnowsTruth: TruthWrapper,
+    }
     return [wrapper for protocol, wrapper in wrappers.items() if isinstance(known, protocol)]
 
 
 def with_capabilities(wrapper: type[WrapperT], capabilities: list[type[SourceWrapper]]) -> type[WrapperT]:
     """Return a subclass of a wrapper that inherits from these classes too.
 
-    `isinstance` with `PackedSource`, `LinearlyCorrectedSource` or `KnowsTruth` is then decided by the class of an object.
+    `isinstance` with `PackedSource` and the other protocols is then decided by the class of an object.
     """
     return type(wrapper.__name__, (*capabilities, wrapper), {})

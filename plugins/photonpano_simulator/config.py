@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from photonpano import Config, SpecPath
+from photonpano import Bayer, Config, SpecPath
 
 
 class StreetScene(Config):
@@ -35,7 +35,7 @@ class NightScene(Config):
 
 
 class PhotoScene(Config):
-    """A photograph: sRGB of 8 or 16 bits, undone to linear, of which the luminance is kept."""
+    """A photograph: sRGB of 8 or 16 bits, undone to linear. A sensor without colour filters sees its luminance."""
 
     kind: Literal["photo"] = Field("photo", description="a photograph")
     file: SpecPath = Field(description="an image file that OpenCV reads, such as JPEG, PNG or TIFF")
@@ -180,6 +180,12 @@ class Sensor(Config):
         description="standard deviation of the sensitivity of the pixels, relative to its mean; it does not change with time",
     )
     dirt: Dirt | None = Field(None, description="specks on the window of the sensor; none by default")
+    filters: Bayer | SpecPath | None = Field(
+        None,
+        description="colour filters before the pixels: rggb, bggr, grbg or gbrg for a Bayer array, or a file as that of the "
+        "correction colour-filter; none by default. The scene is then in colour, and flux is that of clear pixels, which see "
+        "the sum of red, green and blue",
+    )
 
 
 class IntensitySensor(Config):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from photonpano import InputError, SourceContribution, hookimpl
@@ -29,6 +30,8 @@ def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
     from photonpano_simulator.delivery import delivered
 
     files = [config.sensor.dark_rates, config.sensor.hot_pixels] if isinstance(config.sensor, Sensor) else []
+    if isinstance(config.sensor, Sensor) and isinstance(config.sensor.filters, Path):
+        files.append(config.sensor.filters)
     if isinstance(config.scene, PhotoScene):
         files.append(config.scene.file)
     if isinstance(config.path, FilePath):

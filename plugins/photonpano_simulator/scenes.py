@@ -12,7 +12,7 @@ from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
 from photonpano.reading import look_first, read_picture
 from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
-from photonpano_simulator.street import street
+from photonpano_simulator.street import paint, street
 from photonpano_simulator.street.night import night
 
 _LUMINANCE = (0.0722, 0.7152, 0.2126)
@@ -21,8 +21,15 @@ _LARGEST = 16384
 """Largest side of a scene, px. Warps of OpenCV refuse a side of 32768 px."""
 
 
-def scene_flux(scene: StreetScene | NightScene | PhotoScene, flux: float) -> NDArray[np.float32]:
+def scene_flux(
+    scene: StreetScene | NightScene | PhotoScene, flux: float, in_colour: bool = False
+) -> NDArray[np.float32]:
     """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame, with the mean `flux`.
+
+    Args:
+        scene: a photograph, or a drawing, which is painted in colour.
+        flux: the mean; in colour, that of the sum of red, green and blue.
+        in_colour: whether to return red, green and blue: (Hs, Ws, 3).
 
     Raises:
         InputError: the photograph cannot be used.
@@ -32,16 +39,18 @@ def scene_flux(scene: StreetScene | NightScene | PhotoScene, flux: float) -> NDA
     elif isinstance(scene, NightScene):
         linear = night((scene.height, scene.width), scene.seed, scene.range_db)
     else:
-        linear = _photo(scene.file, scene.width)
-    mean = float(linear.mean(dtype=np.float64))
+        linear = _photo(scene.file, scene.width, in_colour)
+    if in_colour and not isinstance(scene, PhotoScene):
+        linear = linear[..., None] * paint((scene.height, scene.width), scene.seed)
+    mean = float(linear.mean(dtype=np.float64)) * (3 if in_colour else 1)
     if mean == 0 and isinstance(scene, PhotoScene):
         raise InputError(f"{scene.file} is black: no flux can be made of it; take another photograph")
     linear *= np.float32(flux / mean)
     return linear
 
 
-def _photo(path: Path, width: int | None) -> NDArray[np.float32]:
-    """Return the linear luminance of a photograph, from 0 to 1."""
+def _photo(path: Path, width: int | None, in_colour: bool) -> NDArray[np.float32]:
+    """Return the linear luminance of a photograph, from 0 to 1; or its linear red, green and blue, (H, W, 3)."""
     otherwise = "is not an image that OpenCV reads; save it as PNG or JPEG"
     look_first(path, "cv2:imread")
     image = read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
@@ -49,16 +58,20 @@ def _photo(path: Path, width: int | None) -> NDArray[np.float32]:
         raise InputError(f"{path} holds {image.dtype} values; a photograph has 8 or 16 bits: save it as PNG")
     # Convert a table of all grey levels, and not every pixel.
     linear_of = srgb_to_linear(np.linspace(0, 1, 256**image.dtype.itemsize, dtype=np.float32))
-    linear: NDArray[np.float32] = np.zeros(image.shape[:2], np.float32)
-    for channel, share in enumerate(_LUMINANCE):
-        linear += (np.float32(share) * linear_of)[image[..., channel]]
+    linear: NDArray[np.float32]
+    if in_colour:
+        linear = linear_of[image[..., ::-1]]
+    else:
+        linear = np.zeros(image.shape[:2], np.float32)
+        for channel, share in enumerate(_LUMINANCE):
+            linear += (np.float32(share) * linear_of)[image[..., channel]]
     if width is not None:
         height = max(1, round(linear.shape[0] * width / linear.shape[1]))
         shrinks = width < linear.shape[1]
         linear = cv2.resize(linear, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR).astype(
             np.float32
         )
-    if max(linear.shape) > _LARGEST:
+    if max(linear.shape[:2]) > _LARGEST:
         raise InputError(
             f"{path} is {linear.shape[1]}x{linear.shape[0]} px; set scene.width so that no side exceeds {_LARGEST} px"
         )

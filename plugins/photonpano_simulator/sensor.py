@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import InputError
+from photonpano import Bayer, InputError
 from photonpano.photometry import BinaryResponse
-from photonpano.reading import read_array
-from photonpano_simulator.config import Dirt, Sensor
+from photonpano.reading import COLOURS, bayer_array, read_array, read_filter_array
+from photonpano_simulator.config import Dirt, IntensitySensor, Sensor
 
 _MINUS_RANGE = np.float32(2.0**8 - 2.0**32)
 """The range of the draws, negated: 2^32 - 2^8 is the largest number below 2^32 that float32 represents."""
@@ -88,6 +88,31 @@ class SpadSensor:
         n_pixels = flux.size
         draws = rng.integers(0, 2**64, -(-n_pixels // 2), dtype=np.uint64).view(np.uint32)[:n_pixels]
         return draws.reshape(flux.shape) < threshold
+
+
+def bayer_of(config: Sensor | IntensitySensor) -> Bayer | None:
+    """Return the Bayer array before the pixels; None for other filters."""
+    filters = config.filters if isinstance(config, Sensor) else None
+    return None if isinstance(filters, Path) else filters
+
+
+def filter_array(config: Sensor, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
+    """Return what each pixel sees of red, green and blue, 1 or 0: (H, W, 3); None for a sensor without colour filters.
+
+    Raises:
+        InputError: the file of the filters cannot be used.
+    """
+    if config.filters is None:
+        return None
+    if isinstance(config.filters, Path):
+        places = read_filter_array(config.filters)
+        if places.shape != frame_shape:
+            raise InputError(
+                f"{config.filters} has the shape {places.shape}; sensor.filters needs that of the frame, {frame_shape}"
+            )
+    else:
+        places = bayer_array(config.filters, frame_shape)
+    return (np.array(list(COLOURS.values())) / 255).astype(np.float32)[places]
 
 
 def _gains(config: Sensor, frame_shape: tuple[int, int], seed: int) -> NDArray[np.float32]:

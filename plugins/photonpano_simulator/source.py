@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from photonpano import FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import apply, corner_displacements, corners, inverse
 from photonpano.reading import Closing
-from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, SimulatorConfig
+from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
 from photonpano_simulator.delivery import delivered
 from photonpano_simulator.intensity import IntensityCamera
 from photonpano_simulator.lens import distorts, pixel_grid, transmission, undistorted
 from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.paths import camera_path, scene_motion
 from photonpano_simulator.scenes import scene_flux
-from photonpano_simulator.sensor import Draw, SpadSensor, generator
+from photonpano_simulator.sensor import Draw, SpadSensor, bayer_of, filter_array, generator
 
 
 class SimulatorSource(Closing):
@@ -32,8 +32,10 @@ class SimulatorSource(Closing):
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> None:
         self._seed = context.seed if config.seed is None else config.seed
         flux = config.flux * config.sensor.quantum_efficiency
-        self._scene = scene_flux(config.scene, flux)
-        height, width = self._scene.shape
+        filters = filter_array(config.sensor, config.frame_shape) if isinstance(config.sensor, Sensor) else None
+        self._filters = filters
+        self._scene = scene_flux(config.scene, flux, in_colour=filters is not None)
+        height, width = self._scene.shape[:2]
         self._homographies = camera_path(config, (height, width), self._seed)
         self._taken = delivered(config)
         self._lens = config.lens
@@ -51,7 +53,7 @@ class SimulatorSource(Closing):
         self._gains = transmission(config.lens, config.frame_shape) * self._sensor.gains
         self._is_uniform = bool(np.all(self._gains == 1)) and config.drift == 1
         kind, bits = self._sensor.kind, self._sensor.bits
-        self.info = StreamInfo(len(self._taken), *config.frame_shape, config.frame_rate_hz, kind, bits)
+        self.info = StreamInfo(len(self._taken), *config.frame_shape, config.frame_rate_hz, kind, bits, bayer_of(config.sensor))
         self.response = self._sensor.response
         self.valid: NDArray[np.bool_] = self._sensor.valid
         self.valid.flags.writeable = False
@@ -83,7 +85,9 @@ class SimulatorSource(Closing):
         Returns:
             `homographies` (T, 3, 3) float64, those of a lens without distortion; `scene` (Hs, Ws) float32, the flux that is
             detected, in photons per pixel per frame period, without dark counts; `frame_shape` (2,); `frame_rate_hz` ();
-            `seed` (); of a single-photon camera also `dark_rates` (H, W) float32, dark counts per frame period, and
+            `seed` (); of a sensor with colour filters, `scene` is (Hs, Ws, 3), of red, green and blue pixels, and `filters`
+            (H, W, 3) uint8 what each pixel sees, 255 or 0; of a single-photon camera also `dark_rates` (H, W) float32, dark
+            counts per frame period, and
             `hot_pixels` (H, W) bool. Captures that are disturbed have more: `distortion` (2,), k1 and k2 of the lens, and
             `undistorted_corners` (4, 2), where a lens without distortion images the corners of the frame; `gains` (H, W)
             float32, vignetting, sensitivity and dirt; `light` (T,), relative to the first frame; `taken` (T,), the index of
@@ -97,6 +101,8 @@ class SimulatorSource(Closing):
             "seed": np.array(self._seed),
             **self._sensor.truth(),
         }
+        if self._filters is not None:
+            truth["filters"] = (255 * self._filters).astype(np.uint8)
         if self._points is not None:
             truth["distortion"] = np.array([self._lens.k1, self._lens.k2])
             truth["undistorted_corners"] = undistorted(self._lens, corners(self.info.frame_shape), self.info.frame_shape)
@@ -144,4 +150,6 @@ class SimulatorSource(Closing):
                 np.float32
             )
             view = cv2.remap(self._scene, x, y, cv2.INTER_LINEAR, borderMode=border)
+        if self._filters is not None:
+            view = (view * self._filters).sum(axis=-1)
         return view.astype(np.float32, copy=False)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons, saturated_share, summarise
-from photonpano.corrections import CorrectedSource, HotPixels, without_still_pixels
+from photonpano.corrections import CorrectedSource, FilteredSource, HotPixels, without_still_pixels
 from photonpano.errors import InputError
 from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.protocols import Source
@@ -104,7 +104,7 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
         with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
-        decisions = marked.decisions if isinstance(marked, CorrectedSource) else ()
+        decisions = marked.decisions if isinstance(marked, CorrectedSource | FilteredSource) else ()
         decided = {each.what: each for each in decisions}
         found = CaptureInfo(
             source=plan.source.contribution.name,
@@ -122,8 +122,8 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             unused_share=1 - float(read.valid.mean()),
             hot_share=float(hot[read.valid].mean()),
             still_share=float(still[read.valid].mean()),
-            standing_share=float(decided["standing_share"].value) if decided else 0.0,
-            still_how=decided["still_pixels"].reason if decided else "not measured",
+            standing_share=float(decided["standing_share"].value) if "standing_share" in decided else 0.0,
+            still_how=decided["still_pixels"].reason if "still_pixels" in decided else "not measured",
             saturated_share=saturated_share(source),
             group_size=size,
             group_size_reason=reason,

@@ -11,6 +11,7 @@ from photonpano.context import Context, Progress, Quiet
 from photonpano.evaluation import Evaluation
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.geometry import Canvas
+from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render
 from photonpano.pipeline.components import build_renderer, open_source
 from photonpano.pipeline.run import run
@@ -54,7 +55,8 @@ def evaluate(
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             context = Context(thread_count(plan.run.threads), progress or Quiet())
             renderer = build_renderer(plan, source, [])
-            return render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
+            images = render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
+            return composed(images, source)
 
         return evaluate_folder(run_folder, truth, along_truth)
 

@@ -46,7 +46,7 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
 
     Args:
         path: a new or empty folder for PNGs; a file that ends in .mp4 or .webp for a film.
-        pictures: (H, W) uint8 each.
+        pictures: (H, W) uint8 each, or (H, W, 3), red first.
         names: of the PNGs, without suffix, as many as there are pictures.
         fps: pictures per second of a film.
 
@@ -65,7 +65,7 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
 
 
 def _png(picture: Picture) -> bytes:
-    encoded, png = cv2.imencode(".png", picture)
+    encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
     if not encoded:
         raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
     return png.tobytes()
@@ -75,14 +75,18 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
     """Write H.264, whose sides must be even: an odd row or column at the end is doubled."""
     import av
 
-    frames = (np.pad(picture, [(0, side % 2) for side in picture.shape], mode="edge") for picture in pictures)
+    frames = (
+        np.pad(picture, [(0, side % 2) for side in picture.shape[:2]] + [(0, 0)] * (picture.ndim - 2), mode="edge")
+        for picture in pictures
+    )
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": _CRF})
         stream.pix_fmt = "yuv420p"
         for number, frame in enumerate(frames):
             if number == 0:
-                stream.height, stream.width = frame.shape
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+                stream.height, stream.width = frame.shape[:2]
+            layout = "gray" if frame.ndim == 2 else "rgb24"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=layout)))
         container.mux(stream.encode())
 
 

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.merging import Chunk, accumulate
+from photonpano.merging.colour import composed, in_colours
 from photonpano.photometry import tone_mapped
 from photonpano.protocols import Source
 from photonpano.threads import in_order
-from photonpano.values import FluxImage, FrameSpan, StreamInfo
+from photonpano.values import FluxImage, FrameSpan, Panorama, StreamInfo
 
 _WHITE_EXPOSURES = 16
 """The white flux is a quantile of 16 exposures all over the capture."""
@@ -50,20 +51,27 @@ def white_flux(source: Source, spans: Sequence[FrameSpan], quantile: float, thre
 
 
 def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: int = 1) -> Iterator[NDArray[np.uint8]]:
-    """Yield the picture of each exposure, in order: (H, W) uint8, and a strip below it for the label."""
+    """Yield the picture of each exposure, in order: (H, W) or (H, W, 3) uint8, and a strip below it for the label."""
 
     def picture(span: FrameSpan) -> NDArray[np.uint8]:
         image = tone_mapped(_exposure(source, span), style.white_flux, srgb=style.srgb)
-        return np.vstack([image, _label(span, source.info)]) if style.label else image
+        if not style.label:
+            return image
+        label = _label(span, source.info)
+        return np.vstack([image, label if image.ndim == 2 else np.repeat(label[..., None], 3, axis=-1)])
 
     return in_order(picture, spans, threads)
 
 
 def _exposure(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the flux of the sum of some frames: (H, W), NaN where a pixel is masked."""
+    """Return the flux of the sum of some frames: (H, W), NaN where a pixel is masked; (H, W, 3) behind a filter array."""
     still = Chunk(span, np.eye(3))
-    flux, _ = accumulate(source, [still], np.eye(3), source.info.frame_shape).estimate(source.response)
-    return flux
+
+    def merged(each: Source) -> Panorama:
+        photons = accumulate(each, [still], np.eye(3), each.info.frame_shape)
+        return Panorama(*photons.estimate(each.response), np.eye(3))
+
+    return composed(in_colours(source, merged), source).flux
 
 
 def _label(span: FrameSpan, info: StreamInfo) -> NDArray[np.uint8]:

@@ -1,5 +1,7 @@
 """Corrections of sensors: applied to frames in the order of a list, before any other stage."""
 
+from photonpano.corrections.colour_filter import ColourFilter
+from photonpano.corrections.colours import FilteredSource
 from photonpano.corrections.dark import DarkCounts, DarkFrames, measure_dark, read_dark, write_dark
 from photonpano.corrections.geometry import (
     TURNS,
@@ -11,7 +13,7 @@ from photonpano.corrections.geometry import (
     SwapColumns,
 )
 from photonpano.corrections.hot_pixels import HotPixels, hot_in_the_dark
-from photonpano.corrections.masks import ColourFilter, Mask
+from photonpano.corrections.masks import Mask
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import CorrectedSource, corrected_source
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
@@ -33,6 +35,7 @@ __all__ = [
     "Correction",
     "DarkCounts",
     "DarkFrames",
+    "FilteredSource",
     "HotPixels",
     "StillPixels",
     "Vignette",

@@ -24,8 +24,10 @@ THRESHOLD = 10.0
 """Default threshold, in robust standard deviations: it finds a few percent of the pixels of real sensors."""
 _SPANS, _SPAN_FRAMES = 16, 256
 """16 spans of 256 frames are summed all over the capture, which blurs the scene."""
-_REACH = 2
-"""Neighbourhood radius, px."""
+_REACH, _LONGEST_REACH = 2, 5
+"""Neighbourhood radius, px; the longer one is for colours of which a filter array has few pixels."""
+_ENOUGH = 6.5
+"""Known neighbours, on average, from which on the neighbourhood is not widened."""
 _LINE_SHARE = 1 / 6
 """A pixel is hot if it is brighter than the top 1/6 of its neighbours by the threshold. A straight edge or a line of the scene
 makes at least 1/6 of them bright, at the border of the frame as well. Where many pixels are hot, it is the share of the
@@ -103,8 +105,9 @@ def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[Boo
     response, frames = source.response, float(seen)
     image = response.stabilised(response.flux(np.asarray(counts / seen, np.float32), frames), frames)
     usable = pixels.valid & ~pixels.interpolated
-    image = np.where(usable, image.ravel()[pixels.index], np.float32(np.nan))
-    return outliers(image, float(np.max(response.stabilised_std(frames))), threshold), seen
+    image, noise_std = image.ravel()[pixels.index], float(np.max(response.stabilised_std(frames)))
+    found = [outliers(np.where(usable & part, image, np.float32(np.nan)), noise_std, threshold) for part in pixels.alike()]
+    return np.asarray(np.logical_or.reduce(found)), seen
 
 
 def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
@@ -118,7 +121,7 @@ def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
     Returns:
         (H, W) bool, False at unknown pixels.
     """
-    around = sorted_neighbours(image)
+    around = sorted_neighbours(image, reach_of(image))
     differences = np.abs(image - brightest(around, 0.5))
     known = differences[np.isfinite(differences)]
     if not known.size:
@@ -130,10 +133,19 @@ def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
     return np.asarray(outside > limit)
 
 
-def sorted_neighbours(image: FluxImage) -> FluxImage:
-    """Return the neighbours of each pixel within 2 px, in ascending order: (H, W, 24); the unknown ones, NaN, come last."""
-    side = 2 * _REACH + 1
-    padded = np.pad(image, _REACH, constant_values=np.nan)
+def reach_of(image: FluxImage) -> int:
+    """Return the radius, in px, within which a pixel has neighbours enough: 2, or more where most pixels are unknown."""
+    known = float(np.isfinite(image).mean())
+    reach = _REACH
+    while reach < _LONGEST_REACH and ((2 * reach + 1) ** 2 - 1) * known < _ENOUGH:
+        reach += 1
+    return reach
+
+
+def sorted_neighbours(image: FluxImage, reach: int = _REACH) -> FluxImage:
+    """Return the neighbours of each pixel within `reach` px in ascending order, (H, W, N); unknown ones, NaN, come last."""
+    side = 2 * reach + 1
+    padded = np.pad(image, reach, constant_values=np.nan)
     windows = sliding_window_view(padded, (side, side)).reshape(*image.shape, side * side)
     return np.sort(np.delete(windows, side * side // 2, axis=-1), axis=-1)
 
@@ -142,7 +154,7 @@ def brightest(around: FluxImage, share: float) -> FluxImage:
     """Return, for each pixel, the value that the brightest share of its neighbours reach; NaN where fewer than 6 are known.
 
     Args:
-        around: (H, W, 24), from `sorted_neighbours`.
+        around: (H, W, N), from `sorted_neighbours`.
         share: fraction of the neighbours.
     """
     known = _n_known(around)

@@ -31,18 +31,20 @@ class Pixels:
         valid: False for pixels that must not be used.
         interpolated: True for pixels that are replaced by their neighbours.
         dark_rates: float32, dark counts per frame to subtract: photons of binary frames, grey values of others.
+        colour: int8, the place in `COLOURS` of the colour that each pixel sees; -1 where all pixels are treated alike.
     """
 
     index: Index
     valid: BoolArray
     interpolated: BoolArray
     dark_rates: FluxImage
+    colour: NDArray[np.int8]
 
     @classmethod
     def as_read(cls, valid: BoolArray) -> Pixels:
         """Return the pixels of a source without corrections."""
         nothing = np.zeros(valid.shape, np.bool_)
-        return cls(numbered(valid.shape), valid, nothing, np.zeros(valid.shape, np.float32))
+        return cls(numbered(valid.shape), valid, nothing, np.zeros(valid.shape, np.float32), np.full(valid.shape, -1, np.int8))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -58,7 +60,12 @@ class Pixels:
             self.valid.ravel()[order] & ~missing,
             self.interpolated.ravel()[order] & ~missing,
             np.where(missing, np.float32(0), self.dark_rates.ravel()[order]),
+            np.where(missing, np.int8(-1), self.colour.ravel()[order]),
         )
+
+    def alike(self) -> list[BoolArray]:
+        """Return masks of the pixels that may be compared with each other, since they see one colour: (H, W) each."""
+        return [self.colour == each for each in np.unique(self.colour)]
 
     def without(self, bad: BoolArray) -> Pixels:
         """Return the pixels with more of them masked."""

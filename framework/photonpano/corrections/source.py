@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.corrections.colour_filter import ColourFilter
+from photonpano.corrections.colours import FilteredSource, filtered
 from photonpano.corrections.geometry import Rearrangement
 from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pixels, numbered
 from photonpano.errors import InputError
@@ -56,11 +58,11 @@ def apply_corrections(
 
 def corrected_source(
     source: Source, corrections: Sequence[Correction], blame: Callable[[int, str], Exception] | None = None
-) -> CorrectedSource:
+) -> CorrectedSource | FilteredSource:
     """Return a source with corrections.
 
     It has `packed` if the source has, `truth` if the source has and no pixel is moved, and `corrected` if a correction changes
-    sums of frames.
+    sums of frames. It is a `ColouredSource` if a correction keeps all colours.
 
     Args:
         source: the capture as it is read; closing the corrected source closes it.
@@ -75,7 +77,11 @@ def corrected_source(
         capabilities.append(TruthWrapper)
     if any(correction.changes_sums for correction in corrections):
         capabilities.append(_CorrectedSums)
-    return with_capabilities(CorrectedSource, capabilities)(source, corrections, blame)
+    corrected = with_capabilities(CorrectedSource, capabilities)(source, corrections, blame)
+    in_colour = any(isinstance(correction, ColourFilter) and correction.in_colour for correction in corrections)
+    if not in_colour:
+        return corrected
+    return filtered(corrected, lambda: corrected.estimate().colour, corrected.decisions)
 
 
 class CorrectedSource(SourceWrapper):
@@ -97,7 +103,7 @@ class CorrectedSource(SourceWrapper):
         self._estimate: _Estimate | None = None
         self._lock = Lock()
         self.decisions: list[Decision] = []
-        self._info = replace(source.info, height=index.shape[0], width=index.shape[1])
+        self._info = replace(source.info, height=index.shape[0], width=index.shape[1], bayer=None)
 
     @property
     def info(self) -> StreamInfo:
@@ -185,6 +191,7 @@ class _Estimate:
         filled: (P,) numbers of the pixels that are replaced by their neighbours.
         neighbours: (P, 8) numbers of the neighbours of each.
         weights: (P, 8) float32, weights of the neighbours; each row sums to 1.
+        colour: (H, W) int8, see `Pixels`.
     """
 
     valid: BoolArray
@@ -193,6 +200,7 @@ class _Estimate:
     filled: Index
     neighbours: Index
     weights: FluxImage
+    colour: NDArray[np.int8]
 
     @classmethod
     def of(cls, pixels: Pixels, binary: bool) -> _Estimate:
@@ -206,7 +214,8 @@ class _Estimate:
         valid.ravel()[filled[lonely]] = False
         valid.flags.writeable = False
         filled, neighbours, weights = filled[~lonely], neighbours[~lonely], weights[~lonely]
-        return cls(valid, gain, offset, filled, neighbours, weights / weights.sum(axis=1, keepdims=True))
+        weights = weights / weights.sum(axis=1, keepdims=True)
+        return cls(valid, gain, offset, filled, neighbours, weights, pixels.colour)
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
         """Correct a sum of frames: see `LinearlyCorrectedSource`."""

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from photonpano.corrections.hot_pixels import brightest, outliers, sorted_neighbours
+from photonpano.corrections.colour_filter import ColourFilter
+from photonpano.corrections.hot_pixels import brightest, outliers, reach_of, sorted_neighbours
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import corrected_source
 from photonpano.protocols import LinearlyCorrectedSource
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from photonpano.corrections.pixels import Decide, Pixels
@@ -62,7 +65,7 @@ class StillPixels(Correction):
             return pixels
         spans = source.info.spread(_SPANS, n_frames)
         sums = np.stack([source.counts(span).ravel()[pixels.index].astype(np.uint8) for span in spans])
-        found = find_still(sums, n_frames, pixels.valid & ~pixels.interpolated)
+        found = find_still(sums, n_frames, pixels.valid & ~pixels.interpolated, pixels.alike())
         n_masked, n_pixels = int((found.mask & pixels.valid).sum()), int(pixels.valid.sum())
         decide("still_pixels", n_masked, f"{n_masked / max(n_pixels, 1):.2%} of {n_pixels} pixels {found.why}")
         decide("standing_share", found.share, _SHARE_OF)
@@ -72,11 +75,15 @@ class StillPixels(Correction):
 def without_still_pixels(source: Source) -> Source:
     """Return a source in which what stands still is masked.
 
-    A source of grey levels stays as it is, and one that corrects its sums itself, which cannot be corrected further.
+    A source of grey levels stays as it is, and one that corrects its sums itself, which cannot be corrected further. One that
+    gives the Bayer array before its pixels is seen in colour.
     """
-    if source.info.kind != "binary" or isinstance(source, LinearlyCorrectedSource):
+    corrections: list[Correction] = [] if source.info.bayer is None else [ColourFilter(keep="all")]
+    if source.info.kind == "binary":
+        corrections.append(StillPixels())
+    if not corrections or isinstance(source, LinearlyCorrectedSource):
         return source
-    return corrected_source(source, [StillPixels()])
+    return corrected_source(source, corrections)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +101,7 @@ class Still:
     why: str
 
 
-def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> Still:
+def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray] | None = None) -> Still:
     """Find what stands still while the rest of the frame moves.
 
     A pixel that sees one thing all the time varies by photon noise only; a pixel that the scene moves past varies by its
@@ -106,9 +113,12 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> Sti
         sums: (M, H, W) uint8, sums of binary frames at M times of the capture.
         n_frames: frames of a sum.
         usable: (H, W) bool, pixels to look at.
+        alike: (H, W) bool each, pixels that may be compared with each other, such as those of one colour; by default all. The
+            parts are those that most of the pixels show.
     """
-    single = _single_pixels(sums, n_frames, usable)
-    parts = _Parts.of(sums, n_frames, usable & ~single)
+    colours = [usable & part for part in alike] if alike else [usable]
+    single = np.logical_or.reduce([_single_pixels(sums, n_frames, part) for part in colours])
+    parts = _Parts.of(sums, n_frames, max(colours, key=np.count_nonzero) & ~single)
     standing = _continued(parts.standing, ~parts.moving)
     share = _share(standing, parts.moving & ~standing)
     if parts.moving.mean() < _LEAST_MOVING:
@@ -131,9 +141,14 @@ def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) ->
     mean = counts / np.float32(total)
     noise = _photon_noise(mean, n_frames, total)
     variance = sum((each / np.float32(n_frames) - mean) ** 2 for each in sums) / np.float32(n_spans - 1)
-    difference, more = (image - brightest(sorted_neighbours(_where(usable, image)), 0.5) for image in (mean, variance - noise))
+    difference, more = (_beyond_neighbours(_where(usable, image)) for image in (mean, variance - noise))
     chance = _SURE * np.sqrt(2 / (n_spans - 1)) * noise
     return np.asarray(found & (more < chance + _STEADY * difference**2) & ~_has_halo(np.nan_to_num(difference)))
+
+
+def _beyond_neighbours(image: FluxImage) -> FluxImage:
+    """Return the difference of each pixel from the median of its neighbours."""
+    return np.asarray(image - brightest(sorted_neighbours(image, reach_of(image)), 0.5))
 
 
 def _has_halo(difference: FluxImage) -> BoolArray:

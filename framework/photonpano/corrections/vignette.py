@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.geometry import apply, corner_displacements, inverse
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource
-from photonpano.source_wrapper import PackedWrapper, SourceWrapper, with_capabilities
+from photonpano.protocols import LinearlyCorrectedSource
+from photonpano.source_wrapper import (
+    ColouredWrapper,
+    PackedWrapper,
+    SourceWrapper,
+    WeightedWrapper,
+    capabilities_of,
+    with_capabilities,
+)
 from photonpano.values import Decision, FrameSpan
 
 if TYPE_CHECKING:
@@ -96,8 +103,8 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
 
 def divided_by(source: Source, vignette: Vignette) -> FlatSource:
     """Return a source whose corrected sums are those of a lens without vignette."""
-    capabilities: list[type[SourceWrapper]] = [PackedWrapper] if isinstance(source, PackedSource) else []
-    return with_capabilities(FlatSource, capabilities)(source, vignette)
+    known = PackedWrapper, WeightedWrapper, ColouredWrapper
+    return with_capabilities(FlatSource, [each for each in capabilities_of(source) if each in known])(source, vignette)
 
 
 class FlatSource(SourceWrapper):
@@ -109,10 +116,15 @@ class FlatSource(SourceWrapper):
 
     def __init__(self, source: Source, vignette: Vignette) -> None:
         super().__init__(source)
+        self._vignette = vignette
         power = 1 / vignette.gain
         dark = np.maximum(1 - vignette.mean, np.float32(1e-3))
         self._slope = np.asarray(power * dark ** (power - 1), np.float32)
         self._offset = np.asarray(1 - dark**power - self._slope * (1 - dark), np.float32)
+
+    def around(self, source: Source) -> FlatSource:
+        """See `SourceWrapper`."""
+        return divided_by(source, self._vignette)
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
         """Take everything but the flux out of a sum of frames: see `LinearlyCorrectedSource`."""

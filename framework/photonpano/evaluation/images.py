@@ -41,22 +41,29 @@ class ImageScore:
 
 
 def covered(weight: FluxImage) -> BoolArray:
-    """Return which pixels were seen in enough frames to be compared: see `MIN_COVERAGE`.
+    """Return which pixels were seen in enough frames to be compared, (H, W): see `MIN_COVERAGE`.
 
     Args:
-        weight: (H, W), number of frames in which each pixel was seen.
+        weight: (H, W), number of frames in which each pixel was seen; of (H, W, 3), the sum over the colours counts.
     """
+    weight = weight if weight.ndim == 2 else weight.sum(axis=-1)
     seen = weight > 0
     if not seen.any():
         return seen
     return np.asarray(weight >= MIN_COVERAGE * np.median(weight[seen])) & seen
 
 
+def known(image: FluxImage) -> BoolArray:
+    """Return where an image, (H, W) or (H, W, 3), is finite, in all colours: (H, W)."""
+    finite = np.isfinite(image)
+    return finite if finite.ndim == 2 else np.asarray(finite.all(axis=-1))
+
+
 def white_flux(scene: FluxImage) -> float:
     """Return the flux that becomes white in a comparison: see `WHITE_QUANTILE`.
 
     Args:
-        scene: (H, W), true flux; NaN where unknown.
+        scene: (H, W) or (H, W, 3), true flux; NaN where unknown.
     """
     return float(np.nanquantile(scene, WHITE_QUANTILE))
 
@@ -65,9 +72,9 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
     """Compare a panorama with the truth.
 
     Args:
-        panorama: (H, W), flux.
-        truth: (H, W), true flux on the same pixels.
-        compared: (H, W), the pixels to compare; those where either image is not finite are left out.
+        panorama: (H, W), flux; or (H, W, 3), of which all colours count alike.
+        truth: true flux on the same pixels, of the same shape.
+        compared: (H, W), the pixels to compare; those where either image is not finite, in any colour, are left out.
         white: the flux that becomes 1 in sRGB, such as `white_flux` of the true scene. Brighter pixels are clipped to it.
 
     Raises:
@@ -78,10 +85,12 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
 
     if not white > 0:
         raise ValueError(f"white must be a positive flux, got {white}")
-    compared = compared & np.isfinite(panorama) & np.isfinite(truth)
+    if panorama.ndim == 2:
+        panorama, truth = panorama[..., None], truth[..., None]
+    compared = compared & known(panorama) & known(truth)
     if not compared.any():
         raise ValueError("no pixel is compared")
-    first, second = (np.where(compared, linear_to_srgb(image / white), np.float32(0)) for image in (panorama, truth))
+    first, second = (np.where(compared[..., None], linear_to_srgb(image / white), np.float32(0)) for image in (panorama, truth))
     squared = np.square(first[compared] - second[compared], dtype=np.float64).mean()
     # Windows that contain pixels that are not compared, or pixels beyond the border of the image, are left out.
     window = np.ones((2 * _SSIM_RADIUS + 1,) * 2, dtype=np.uint8)
@@ -90,7 +99,14 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
     if whole.any():
         similarity_of: Callable[..., Any] = structural_similarity
         _, similarity = similarity_of(
-            first, second, data_range=1.0, gaussian_weights=True, sigma=_SSIM_SIGMA, use_sample_covariance=False, full=True
+            first,
+            second,
+            data_range=1.0,
+            gaussian_weights=True,
+            sigma=_SSIM_SIGMA,
+            use_sample_covariance=False,
+            full=True,
+            channel_axis=-1,
         )
         ssim = float(similarity[whole].mean(dtype=np.float64))
     with np.errstate(divide="ignore"):
@@ -102,19 +118,25 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> Fl
     """Return the true scene on the canvas of a panorama, interpolated bilinearly; NaN outside of the scene.
 
     Args:
-        scene: (H, W), true flux on the true plane.
+        scene: (H, W), true flux on the true plane; or (H, W, 3).
         canvas: the pixel grid of the panorama, whose transform maps the estimated reference plane to it.
         alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
     """
     from scipy.ndimage import map_coordinates
 
     to_scene = alignment @ np.linalg.inv(canvas.transform)
-    image = np.empty(canvas.shape, dtype=np.float32)
+    image = np.empty((*canvas.shape, *scene.shape[2:]), dtype=np.float32)
     columns = np.arange(canvas.width)
     for top in range(0, canvas.height, _ROWS):
         rows = np.arange(top, min(top + _ROWS, canvas.height))
         points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         x, y = apply(to_scene, points).T
-        sampled = map_coordinates(scene, [y, x], order=1, mode="constant", cval=np.nan, output=np.float32)
-        image[rows] = sampled.reshape(len(rows), canvas.width)
+        for single, into in zip(_colours(scene), _colours(image), strict=True):
+            sampled = map_coordinates(single, [y, x], order=1, mode="constant", cval=np.nan, output=np.float32)
+            into[rows] = sampled.reshape(len(rows), canvas.width)
     return image
+
+
+def _colours(image: FluxImage) -> list[FluxImage]:
+    """Return views of the colours of an image; of a grey one, itself."""
+    return [image] if image.ndim == 2 else list(np.moveaxis(image, -1, 0))

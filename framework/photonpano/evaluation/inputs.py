@@ -23,7 +23,8 @@ class Truth:
     Attributes:
         homographies: (T, 3, 3), frame pixels to pixels of the scene; exact at the corners of the frame if the lens distorts.
         frame_shape: (height, width) of a frame.
-        scene: (H, W) float32, photons per pixel per frame; None if only the motion is known.
+        scene: (H, W) float32, photons per pixel per frame; (H, W, 3) of red, green and blue pixels; None if only the motion is
+            known.
     """
 
     homographies: FloatArray
@@ -106,13 +107,13 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
 
 
 def load_panorama(folder: Path) -> tuple[FluxImage, FluxImage]:
-    """Read flux and weight, (H, W) each, of the panorama of a run folder.
+    """Read flux and weight, (H, W) or (H, W, 3) each, of the panorama of a run folder.
 
     Raises:
         InputError: a file is missing or damaged, or the two differ in size.
     """
     flux, weight = (_read_tiff(folder / name) for name in ("panorama.tiff", "coverage.tiff"))
-    if flux.ndim != 2 or flux.shape != weight.shape:
+    if flux.ndim < 2 or flux.shape[2:] not in ((), (3,)) or flux.shape != weight.shape:
         raise InputError(
             f"{folder}: panorama.tiff and coverage.tiff must be images of one size, "
             f"got the shapes {flux.shape} and {weight.shape}"
@@ -147,8 +148,8 @@ def _read_archive(path: Path, content: str, required: tuple[str, ...], optional:
 
 def _scene(path: Path, scene: NDArray[Any]) -> FluxImage:
     """Return the true flux (H, W); NaN where it is unknown."""
-    if scene.ndim != 2 or not scene.size:
-        raise InputError(f"{path}: scene must be an image (height, width), got the shape {scene.shape}")
+    if scene.ndim < 2 or scene.shape[2:] not in ((), (3,)) or not scene.size:
+        raise InputError(f"{path}: scene must be an image (height, width) or (height, width, 3), got the shape {scene.shape}")
     with np.errstate(over="ignore"):
         flux = scene.astype(np.float32, copy=False)
     if np.isinf(flux).any():

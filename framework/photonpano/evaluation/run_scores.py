@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from photonpano.errors import InputError
-from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
+from photonpano.evaluation.images import ImageScore, covered, image_score, known, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory, inverse, normalised
@@ -77,9 +75,12 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     if not white > 0:
         raise InputError(f"{truth_path}: the scene is dark, so that the panorama cannot be compared with it")
     flux, weight = load_panorama(folder)
+    if flux.shape[2:] != truth.scene.shape[2:]:
+        kinds = ["grey" if image.ndim == 2 else "in colour" for image in (flux, truth.scene)]
+        raise InputError(f"{folder}: the panorama is {kinds[0]}, and the true scene of {truth_path} is {kinds[1]}")
     canvas = Canvas(flux.shape[0], flux.shape[1], run.canvas)
     true_image = true_panorama(truth.scene, canvas, motion.alignment)
-    compared = covered(weight) & np.isfinite(true_image) & np.isfinite(flux)
+    compared = covered(weight) & known(true_image) & known(flux)
     oracle = None
     if render is not None:
         true_motion = normalised(inverse(motion.alignment) @ truth.homographies)

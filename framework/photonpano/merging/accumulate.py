@@ -16,7 +16,7 @@ from photonpano.geometry import translation
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
-from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource
 from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
@@ -70,7 +70,8 @@ def accumulate(
         that their quotient is not biased at masks and borders.
 
     Args:
-        source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected.
+        source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected, and
+            pixels of a `WeightedSource` are weighted.
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
@@ -84,7 +85,7 @@ def accumulate(
     # the threads, since OpenCV rounds a warp by where it starts.
     n_parts = max(1, shape[0] // _PART_ROWS) if pool else 1
     parts = [total.rows(part) for part in divided(shape[0], n_parts)]
-    masked = None if source.valid.all() else source.valid.astype(np.float32)
+    masked = weights_of(source)
     corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
     footprints = footprints_of(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
     visible = [(chunk, at) for chunk, at in zip(chunks, footprints, strict=True) if at.rows and at.columns]
@@ -103,6 +104,13 @@ def accumulate(
             advance(len(chunk.span))
     deque(adding, maxlen=0)
     return total.result()
+
+
+def weights_of(source: Source) -> FluxImage | None:
+    """Return what a frame of each pixel is worth, 0 for a masked one: (H, W); None if it is 1 for all."""
+    if isinstance(source, WeightedSource):
+        return np.where(source.valid, source.weights(), np.float32(0))
+    return None if source.valid.all() else source.valid.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

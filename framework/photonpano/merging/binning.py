@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from photonpano.merging.accumulate import weights_of
 from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.values import FluxImage, FrameSpan
 
@@ -22,7 +23,8 @@ def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
     binning = binning_of(source)
     height, width = (side // binning * binning for side in source.info.frame_shape)
     size = (width // binning, height // binning)
-    valid = source.valid[:height, :width].astype(np.float32)
+    weights = weights_of(source)
+    valid = np.ones((height, width), np.float32) if weights is None else weights[:height, :width]
     counts = source.counts(span)
     lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
     lit = lit[:height, :width] * valid

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Canvas, canvas_of, rescaling, translation
+from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.merge_renderer import MergeRenderer
-from photonpano.photometry import tone_mapped
+from photonpano.photometry import WhiteBalance, balanced, tone_mapped
 from photonpano.protocols import Renderer, Source, Trajectory
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
@@ -41,6 +42,11 @@ class RenderOptions(Protocol):
     @property
     def white_quantile(self) -> float:
         """Quantile of the flux that is white in the picture."""
+        ...
+
+    @property
+    def white_balance(self) -> WhiteBalance:
+        """What makes grey things grey in a picture in colour."""
         ...
 
 
@@ -137,6 +143,9 @@ def render(
 ) -> Panorama:
     """Render the frames of a span on a canvas that is not divided.
 
+    Flux and weight of a `ColouredSource` are (H, W, C), one image for each of its colours; `composed` makes red, green and blue
+    of them.
+
     Args:
         source: the capture.
         trajectory: frame pixels to reference pixels.
@@ -163,10 +172,14 @@ def render_tiles(
     """Render the tiles of a canvas, one after the other: see `render`."""
     # The panorama of the residuals is merged, and may lie on the same canvas as that of another renderer.
     step = "tile" if isinstance(renderer, MergeRenderer) else "rendered tile"
-    with context.progress.stage("panorama", len(span) * len(tiles), "frames") as advance:
+    with context.progress.stage("panorama", len(span) * len(tiles) * channels_of(source), "frames") as advance:
+
+        def of_colour(canvas: Canvas, each: Source) -> Panorama:
+            return renderer.render(each, trajectory, span, canvas, tolerance_px, advance)
+
         homographies = trajectory.at(np.arange(span.start, span.stop))
         for tile in tiles:
-            rendered = partial(renderer.render, source, trajectory, span, tile.canvas, tolerance_px, advance)
+            rendered = partial(in_colours, source, partial(of_colour, tile.canvas))
             yield context.checkpoints.once(step, rendered, homographies, span, tile.canvas)
 
 
@@ -181,20 +194,23 @@ class Thumbnail:
     def __init__(self, canvas: Canvas, reduction: int) -> None:
         self._reduction = reduction
         self._n_pixels, self._n_seen = canvas.height * canvas.width, 0
-        shape = -(-canvas.height // reduction), -(-canvas.width // reduction)
-        empty = np.zeros((0, 0) if reduction == 1 else shape, np.float32)
-        self.panorama = Panorama(empty, empty.copy(), rescaling(1 / reduction) @ canvas.transform)
+        self._shape = -(-canvas.height // reduction), -(-canvas.width // reduction)
+        empty = np.zeros((0, 0), np.float32)
+        self.panorama = Panorama(empty, empty, rescaling(1 / reduction) @ canvas.transform)
 
     def add(self, tile: Tile, rendered: Panorama) -> None:
         """Add a tile: the mean flux of the seen pixels and the mean weight of all pixels of each square."""
         step = self._reduction
-        seen = rendered.weight > 0
-        self._n_seen += int(np.count_nonzero(seen))
+        seen = np.isfinite(rendered.flux)
+        self._n_seen += int(np.count_nonzero(seen_in(rendered)))
         if step == 1:
             self.panorama = rendered
             return
         seen_share = _averaged(seen, step)
-        height, width = seen_share.shape
+        height, width = seen_share.shape[:2]
+        if not self.panorama.flux.size:
+            empty = np.zeros((*self._shape, *seen_share.shape[2:]), np.float32)
+            self.panorama = replace(self.panorama, flux=empty, weight=empty.copy())
         box = np.s_[tile.top // step : tile.top // step + height, tile.left // step : tile.left // step + width]
         flux = _averaged(np.where(seen, rendered.flux, 0), step)
         self.panorama.flux[box] = np.divide(flux, seen_share, out=np.full_like(flux, np.nan), where=seen_share > 0)
@@ -208,9 +224,10 @@ class Thumbnail:
 
 def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:
     """Average squares of pixels; the image is padded with 0 to whole squares at the right and at the bottom."""
-    height, width = image.shape
-    padded = np.pad(image, ((0, -height % step), (0, -width % step))).astype(np.float32, copy=False)
-    blocks = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step)
+    height, width, *colours = image.shape
+    padding = [(0, -height % step), (0, -width % step), *[(0, 0) for _ in colours]]
+    padded = np.pad(image, padding).astype(np.float32, copy=False)
+    blocks = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step, *colours)
     return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
 
 
@@ -222,7 +239,7 @@ class RenderedPanorama:
         canvas: pixel grid of the whole panorama.
         thumbnail: flux and weight, averaged down by `reduction`.
         reduction: side of the squares of pixels that are averaged; 1 if the panorama fits into memory.
-        picture: (H, W) uint8, the thumbnail in sRGB.
+        picture: (H, W) or (H, W, 3) uint8, red first, the thumbnail in sRGB.
         white_flux: flux that is white in the picture, photons per pixel per frame.
         coverage_share: share of the pixels that were seen.
         seconds: time of rendering and writing.
@@ -260,14 +277,15 @@ def render_panorama(
         memory: bytes that rendering may take.
         write_tile: called with each tile, its flux and weight, and the whole canvas.
         context: threads and progress.
-        bytes_per_pixel: bytes that the renderer takes for a pixel of the canvas.
-        ready: what the renderer would render of the same frames along the same motion; used if it lies on the same canvas.
+        bytes_per_pixel: bytes that the renderer takes for a pixel of the canvas, in one colour.
+        ready: what `render` would render of the same frames along the same motion; used if it lies on the same canvas.
 
     Raises:
         CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
         LocationError: frames reach the horizon of the reference plane.
     """
     start = time.perf_counter()
+    bytes_per_pixel *= channels_of(source)
     canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory, bytes_per_pixel)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     gathered = Thumbnail(canvas, reduction)
@@ -275,19 +293,21 @@ def render_panorama(
         rendered = iter([ready])
     else:
         rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
-    for tile, part in zip(tiles, rendered, strict=True):
+    for tile, images in zip(tiles, rendered, strict=True):
+        part = composed(images, source)
         write_tile(tile, part, canvas)
         gathered.add(tile, part)
     thumbnail = gathered.panorama
-    lit = thumbnail.flux[thumbnail.weight > 0]
+    shown = balanced(thumbnail.flux, options.white_balance)
+    lit = shown[np.isfinite(shown)]
     white_flux = (float(np.quantile(lit, options.white_quantile)) if lit.size else 0.0) or 1.0
-    picture = tone_mapped(thumbnail.flux, white_flux)
+    picture = tone_mapped(shown, white_flux)
     seconds = time.perf_counter() - start
     return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, gathered.coverage_share, seconds)
 
 
 def _lies_on(panorama: Panorama, canvas: Canvas) -> bool:
-    return panorama.flux.shape == canvas.shape and np.array_equal(panorama.canvas, canvas.transform)
+    return panorama.flux.shape[:2] == canvas.shape and np.array_equal(panorama.canvas, canvas.transform)
 
 
 def _gib(size: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from itertools import count
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from photonpano.source_wrapper import (
     capabilities_of,
     with_capabilities,
 )
-from photonpano.values import BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
+from photonpano.values import Bayer, BoolArray, Counts, FluxImage, Frames, FrameSpan, Response, StreamInfo
 
 logger = logging.getLogger(__name__)
 
@@ -173,6 +173,8 @@ def _checked_info(info: Any) -> StreamInfo:
             raise BrokenContract(f"info.{name} is a whole number of at least 1, got {size!r:.60}")
     if info.kind not in ("binary", "intensity"):
         raise BrokenContract(f"info.kind is binary or intensity, got {info.kind!r:.60}")
+    if info.bayer not in (None, *get_args(Bayer)):
+        raise BrokenContract(f"info.bayer is {', '.join(get_args(Bayer))} or None, got {info.bayer!r:.60}")
     rate: Any = info.frame_rate_hz
     if rate is not None and not (isinstance(rate, int | float | np.number) and 0 < rate < np.inf):
         raise BrokenContract(f"info.frame_rate_hz is a finite number above 0, or None if it is not known; got {rate!r:.60}")

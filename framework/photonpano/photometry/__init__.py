@@ -13,7 +13,7 @@ from photonpano.photometry.similarity import (
     tapered,
     without_local_mean,
 )
-from photonpano.photometry.tone import linear_to_srgb, srgb_to_linear, tone_mapped
+from photonpano.photometry.tone import WhiteBalance, balanced, linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
@@ -24,7 +24,9 @@ __all__ = [
     "IntensityResponse",
     "Similarity",
     "Tone",
+    "WhiteBalance",
     "autocorrelation",
+    "balanced",
     "debiased",
     "flux_std",
     "linear_to_srgb",

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
+
+WhiteBalance: TypeAlias = Literal["none", "grey-world"] | tuple[float, float, float]
+"""Factors of red, green and blue in a picture: all 1, those that make the mean grey, or given ones."""
 
 
 def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -18,11 +23,26 @@ def linear_to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
+def balanced(flux: NDArray[np.float32], white_balance: WhiteBalance) -> NDArray[np.float32]:
+    """Multiply the colours of an image by the factors of a white balance; a grey image stays as it is.
+
+    Args:
+        flux: (H, W), or (H, W, 3) of red, green and blue; NaN where unknown.
+        white_balance: "grey-world" makes the means of the colours equal, and keeps that of green.
+    """
+    if flux.ndim == 2 or white_balance == "none":
+        return flux
+    if white_balance != "grey-world":
+        return np.asarray(flux * np.array(white_balance, np.float32), np.float32)
+    means = np.nanmean(flux, axis=(0, 1)) if np.isfinite(flux).any() else np.ones(3, np.float32)
+    return np.asarray(flux * (means[1] / np.maximum(means, 1e-6)), np.float32)
+
+
 def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -> NDArray[np.uint8]:
     """Return a picture of 8 bits: `white` photons per pixel per frame become 255, unknown pixels are black.
 
     Args:
-        flux: photons per pixel per frame, NaN where unknown.
+        flux: photons per pixel per frame, NaN where unknown; of any shape.
         white: flux that becomes white, as does any higher one.
         srgb: whether levels follow the sRGB curve, for screens, or are proportional to the flux.
     """

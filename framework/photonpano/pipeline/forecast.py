@@ -47,7 +47,7 @@ class Forecast:
 
 
 def part_of(source: Source, span: FrameSpan) -> PartOfSource:
-    """Return some frames of a capture as a source, with `packed` and `corrected` if the capture has them."""
+    """Return some frames of a capture as a source, with the optional methods that it has, but `truth`."""
     capabilities = [each for each in capabilities_of(source) if each is not TruthWrapper]
     return with_capabilities(PartOfSource, capabilities)(source, span)
 
@@ -57,7 +57,7 @@ class PartOfSource(SourceWrapper):
 
     def __init__(self, source: Source, span: FrameSpan) -> None:
         super().__init__(source)
-        self._start = span.start
+        self._span = span
         self._info = replace(source.info, n_frames=len(span))
 
     @property
@@ -69,7 +69,11 @@ class PartOfSource(SourceWrapper):
         """See `SourceWrapper`."""
         del shape
         self.info.require(span)
-        return method(FrameSpan(span.start + self._start, span.stop + self._start))
+        return method(FrameSpan(span.start + self._span.start, span.stop + self._span.start))
+
+    def around(self, source: Source) -> PartOfSource:
+        """See `SourceWrapper`."""
+        return part_of(source, self._span)
 
     def close(self) -> None:
         """Do nothing: the capture stays open."""

@@ -15,7 +15,7 @@ from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
-from photonpano.corrections import CorrectedSource
+from photonpano.corrections import CorrectedSource, FilteredSource
 from photonpano.errors import InputError, OutputError
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
@@ -103,7 +103,7 @@ def run(
             return RunResult(plan.output.directory, *done, was_finished=True)
         if warning := order_warning(source):
             logger.warning(warning)
-        decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource) else ())]
+        decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource | FilteredSource) else ())]
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
         context = replace(context, checkpoints=work.checkpoints)

@@ -60,7 +60,8 @@ class RunFolder:
 
     def write_results(self, panorama: RenderedPanorama, motion: FrameMotion) -> None:
         """Write panorama.png (8 bits, sRGB) and trajectory.npz."""
-        encoded, png = cv2.imencode(".png", panorama.picture)
+        picture = panorama.picture
+        encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
         if not encoded:
             raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
         with _writing(self.directory):
@@ -219,19 +220,21 @@ def _writing(directory: Path) -> Iterator[None]:
 
 
 def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None:
-    """Write a box of pixels into a TIFF file, which the first one lays out."""
+    """Write a box of pixels into a TIFF file, which the first one lays out; (H, W, 3) as red, green and blue of each pixel."""
+    pixel = int(np.prod(image.shape[2:]))
     if not path.exists():
-        room = 4 * canvas.height * canvas.width
+        room = 4 * canvas.height * canvas.width * pixel
         if room > shutil.disk_usage(path.parent).free:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        tifffile.imwrite(path, shape=canvas.shape, dtype=np.float32, photometric="minisblack", metadata=None)
+        shape, kind = (*canvas.shape, *image.shape[2:]), "minisblack" if image.ndim == 2 else "rgb"
+        tifffile.imwrite(path, shape=shape, dtype=np.float32, photometric=kind, metadata=None)
     with tifffile.TiffFile(path) as file:
         start = file.pages.first.dataoffsets[0]
     with path.open("rb+") as stream:
         if image.shape[1] == canvas.width:
-            stream.seek(start + 4 * tile.top * canvas.width)
+            stream.seek(start + 4 * pixel * tile.top * canvas.width)
             image.tofile(stream)
             return
         for row, pixels in enumerate(image, start=tile.top):
-            stream.seek(start + 4 * (row * canvas.width + tile.left))
+            stream.seek(start + 4 * pixel * (row * canvas.width + tile.left))
             pixels.tofile(stream)

@@ -15,6 +15,7 @@ from photonpano.reading.files import (
     reading,
     require_readable,
 )
+from photonpano.reading.filter_arrays import COLOURS, bayer_array, read_filter_array
 from photonpano.reading.first_look import look_first
 from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, unpacked_start
 from photonpano.reading.npy import NpyHeader, npy_header, require_frames, require_whole
@@ -25,6 +26,7 @@ from photonpano.reading.sampling import sampled_frames, sampled_spans
 from photonpano.source_wrapper import Closing
 
 __all__ = [
+    "COLOURS",
     "BinarySource",
     "Channel",
     "Closing",
@@ -36,6 +38,7 @@ __all__ = [
     "OtherOrder",
     "PackedFileSource",
     "PixelOrder",
+    "bayer_array",
     "files_in",
     "frames_are_last",
     "gzipped_npy_header",
@@ -49,6 +52,7 @@ __all__ = [
     "packed_frames_are_last",
     "read_array",
     "read_arrays",
+    "read_filter_array",
     "read_json",
     "read_picture",
     "read_start",

@@ -83,7 +83,7 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
     instants = _instants(len(motion.homographies))
     to_canvas = panorama.thumbnail.canvas @ motion.homographies
     path = apply(to_canvas[instants], _centre(motion.frame_shape))[:, 0]
-    height, width = panorama.picture.shape
+    height, width = panorama.picture.shape[:2]
     with map_figure(height, width) as (figure, axes):
         picture = shrunk(panorama.picture, MAP_PIXELS)
         axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent_of(height, width), alpha=0.55)
@@ -99,7 +99,12 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
 
 
 def coverage_map(coverage: FluxImage) -> str:
-    """Draw the number of frames that saw each pixel of the panorama; unseen pixels are grey."""
+    """Draw the number of frames that saw each pixel of the panorama, in any colour; unseen pixels are grey.
+
+    Args:
+        coverage: (H, W), or (H, W, 3) of red, green and blue pixels.
+    """
+    coverage = coverage if coverage.ndim == 2 else coverage.sum(axis=-1)
     height, width = coverage.shape
     with map_figure(height, width, side_in=0.9) as (figure, axes):
         axes.set_facecolor(LINE)

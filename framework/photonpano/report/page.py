@@ -83,7 +83,7 @@ def _motion(record: RunRecord, motion: FrameMotion, panorama: RenderedPanorama) 
     not_located = true_spans(~motion.located)
     return {
         "picture": jpeg_uri(shrunk(panorama.picture, PICTURE_PIXELS)),
-        "picture_is_smaller": max(panorama.picture.shape) > PICTURE_PIXELS,
+        "picture_is_smaller": max(panorama.picture.shape[:2]) > PICTURE_PIXELS,
         "path_on_panorama": figures.path_on_panorama(motion, panorama),
         "path_over_time": figures.path_over_time(motion, record["source"]["frame_rate_hz"]),
         "coverage_map": figures.coverage_map(panorama.thumbnail.weight),

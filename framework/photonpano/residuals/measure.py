@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.context import Context
 from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
-from photonpano.residuals.prediction import Prediction
+from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.threads import in_order
-from photonpano.values import FloatArray, FluxImage, FrameSpan, SpanResiduals
+from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
 N_STEPS = 4
 """Steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span."""
@@ -96,22 +98,21 @@ class Residuals:
         return solved[:, N_STEPS], np.sqrt(covariance[:, N_STEPS, N_STEPS])
 
 
-def measure(source: Source, span: FrameSpan, prediction: Prediction, context: Context) -> Residuals:
-    """Compare the frames of a span with what the panorama predicts.
+def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Residuals:
+    """Compare the frames of a span with what the panorama predicts, each pixel in its colour.
 
     Args:
-        source: the capture.
         span: the located frames.
-        prediction: the panorama along the motion.
+        predictions: the panorama along the motion, for each colour of the capture.
         context: threads and progress; the result does not depend on the number of threads.
     """
-    spans = spans_of(span, prediction)
+    spans = spans_of(span, predictions)
     # The mean over the frames, which is not the motion at the centre where frames are repeated, or tremble.
     starts = [each.start - span.start for each in spans]
-    of_frames = prediction.trajectory.at(np.arange(span.start, span.stop))
+    of_frames = predictions.first.trajectory.at(np.arange(span.start, span.stop))
     homographies = np.add.reduceat(of_frames, starts) / np.array([len(each) for each in spans])[:, None, None]
     batches = [slice(first, first + _BATCH) for first in range(0, len(spans), _BATCH)]
-    work = partial(_measured, source, prediction, spans, homographies)
+    work = partial(_measured, predictions, spans, homographies)
     total: _Batch | None = None
     results: list[tuple[FloatArray, ...]] = []
     with context.progress.stage("residuals", len(span), "frames") as advance:
@@ -136,28 +137,29 @@ def measure(source: Source, span: FrameSpan, prediction: Prediction, context: Co
             total.cell_misfit / total.cell_count,
             total.cell_count,
             total.cell_noise / total.cell_count,
-            prediction.frames_seen,
-            prediction.frame_shape,
+            predictions.frames_seen,
+            predictions.first.frame_shape,
         )
 
 
-def spans_of(span: FrameSpan, prediction: Prediction) -> tuple[FrameSpan, ...]:
+def spans_of(span: FrameSpan, predictions: Predictions) -> tuple[FrameSpan, ...]:
     """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion.
 
     Args:
         span: the frames to divide.
-        prediction: the panorama along the motion.
+        predictions: the panorama along the motion.
     """
     frames = np.arange(span.start, span.stop)
-    homographies = prediction.trajectory.at(frames)
+    frame_shape = predictions.first.frame_shape
+    homographies = predictions.first.trajectory.at(frames)
     speed, jumps = 0.0, np.empty(0, int)
     if len(frames) > 1:
         steps = inverse(homographies[:-1]) @ homographies[1:]
-        moved = corner_displacements(steps, np.eye(3), prediction.frame_shape).mean(axis=-1)
+        moved = corner_displacements(steps, np.eye(3), frame_shape).mean(axis=-1)
         speed = float(np.quantile(moved, 0.95))
         jumps = span.start + 1 + np.flatnonzero(moved > max(_JUMP_PX, _JUMP_RATIO * speed))
     probes = np.linspace(0, len(frames) - 1, _PROBES).astype(int)
-    noise_px = _shift_noise_px(prediction, homographies[probes])
+    noise_px = _shift_noise_px(predictions, homographies[probes])
     wanted = np.clip(np.ceil((noise_px / _NOISE_PX) ** 2), _SHORTEST, _LONGEST)
     size = int(min(wanted, _MAX_MOTION_PX / max(speed, 1e-9), len(frames) / _FEWEST_SPANS))
     size = max(1, size)
@@ -168,15 +170,20 @@ def spans_of(span: FrameSpan, prediction: Prediction) -> tuple[FrameSpan, ...]:
     return tuple(spans)
 
 
-def _shift_noise_px(prediction: Prediction, homographies: FloatArray) -> float:
+def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float:
     """Return the standard deviation of the shift of a single frame by photon noise, the median over some frames."""
-    images = np.empty((2, *prediction.frame_shape), np.float32)
-    nothing = np.zeros(prediction.frame_shape, np.float32)
+    shape = predictions.first.frame_shape
+    images = np.empty((2, *shape), np.float32)
+    nothing = np.zeros(shape, np.float32)
+    # A grey source counts all of its pixels here, the masked ones too.
+    in_colour = len(predictions.parts) > 1
+    counts = [np.where(each.valid, nothing, np.float32(np.nan)) if in_colour else nothing for each, _ in predictions.parts]
     noises = []
     for homography in homographies:
-        prediction.view(homography, images)
-        sums = np.zeros((*n_blocks(prediction.frame_shape), N_SUMS), np.float32)
-        add_block_sums(nothing, nothing, 1.0, images[0], images[1], sums)
+        sums = np.zeros((*n_blocks(shape), N_SUMS), np.float32)
+        for (_, prediction), zero in zip(predictions.parts, counts, strict=True):
+            prediction.view(homography, images)
+            add_block_sums(zero, nothing, 1.0, images[0], images[1], sums)
         xx, xy, yy = sums[..., :3].sum(axis=(0, 1), dtype=np.float64)
         information = np.array([[xx, xy], [xy, yy]]) + 1e-12 * np.eye(2)
         noises.append(float(np.sqrt(np.trace(np.linalg.inv(information)) / 2)))
@@ -216,23 +223,66 @@ class _Batch:
         )
 
 
-def _measured(
-    source: Source, prediction: Prediction, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice
-) -> _Batch:
-    shape = prediction.frame_shape
-    grid, cells = n_blocks(shape), n_blocks(prediction.mean.shape)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Colour:
+    """What is compared in one colour of the capture.
+
+    Attributes:
+        source: its pixels.
+        prediction: the panorama in this colour.
+        masked: (H, W) 0, NaN for pixels of other colours and masked ones; None if there is none.
+        corrected: takes everything but the flux out of a sum of frames; None if there is nothing else.
+        dark: (H, W) what it subtracts for each frame.
+        extra: (H, W) the variance that this adds to the count of a frame.
+        slope: (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct.
+    """
+
+    source: Source
+    prediction: Prediction
+    masked: FluxImage | None
+    corrected: Callable[[Counts, int], FluxImage] | None
+    dark: FluxImage
+    extra: FluxImage
+    slope: FluxImage | None
+
+    @classmethod
+    def of(cls, source: Source, prediction: Prediction) -> _Colour:
+        shape = prediction.frame_shape
+        corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
+        zeros = np.zeros(shape, np.uint32)
+        # Corrected counts are `slope * counts - n * dark`: counts of the dark, and of less sensitive pixels, add noise.
+        dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)
+        slope = corrected(zeros + 1, 1) + dark if corrected is not None and source.info.kind == "binary" else None
+        masked = None if source.valid.all() else np.where(source.valid, np.float32(0), np.float32(np.nan))
+        return cls(source, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
+
+    def counted(self, raw: Counts, n_frames: int) -> NDArray[np.float32] | NDArray[np.int32]:
+        """Return the counts of a span, corrected, NaN where masked: (H, W)."""
+        # Signed integers become floats at no cost in the loop.
+        signed = np.ascontiguousarray(raw, np.uint32).view(np.int32)
+        counts: Any = signed if self.corrected is None else self.corrected(raw, n_frames)
+        found: NDArray[np.float32] | NDArray[np.int32] = counts if self.masked is None else counts + self.masked
+        return found
+
+    def noise_beside(self, mean: FluxImage) -> FluxImage:
+        """Return the variance of the count of a frame beside that of its photons: (H, W)."""
+        if self.slope is None:
+            return self.extra
+        lit = np.clip((mean + self.dark) / self.slope, 0, 1)
+        return np.asarray(np.maximum(self.slope**2 * lit * (1 - lit) - mean * (1 - mean), 0), np.float32)
+
+
+def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice) -> _Batch:
+    first = predictions.first
+    shape = first.frame_shape
+    grid, cells = n_blocks(shape), n_blocks(first.mean.shape)
     spans, homographies = spans[batch], homographies[batch]
     height, width = shape
     row, column = np.mgrid[: grid[0], : grid[1]]
     middle = np.stack([_middles(column, width), _middles(row, height)], axis=-1)
     lever = middle - corners(shape).mean(axis=0)
-    corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-    zeros = np.zeros(shape, np.uint32)
-    # Corrected counts are `slope * counts - n * dark`: counts of the dark, and of pixels that are less sensitive, add noise.
-    dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)
-    slope = corrected(zeros + 1, 1) + dark if corrected is not None and source.info.kind == "binary" else None
-    extra = np.maximum(dark, 0)
-    masked = None if source.valid.all() else np.where(source.valid, np.float32(0), np.float32(np.nan))
+    colours = [_Colour.of(source, prediction) for source, prediction in predictions.parts]
+    source = colours[0].source
     total = _Batch(
         np.zeros((len(spans), 5, 5)),
         np.zeros((len(spans), 5)),
@@ -246,28 +296,25 @@ def _measured(
         np.zeros(cells),
         np.zeros(cells),
     )
+    # A pixel adds to the image of its colour, which fewer frames have seen.
+    frames_seen = max(predictions.frames_seen / len(colours), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
         raw = source.counts(span)
-        # Signed integers become floats at no cost in the loop.
-        counts = np.ascontiguousarray(raw, np.uint32).view(np.int32) if corrected is None else corrected(raw, len(span))
-        if masked is not None:
-            counts = counts + masked
-        prediction.view(homography, images)
         sums[:] = 0
-        if slope is not None:
-            lit = np.clip((images[0] + dark) / slope, 0, 1)
-            extra = np.maximum(slope**2 * lit * (1 - lit) - images[0] * (1 - images[0]), 0)
-        add_block_sums(counts, extra, float(len(span)), images[0], images[1], sums)
-        if index % _PIXEL_STRIDE == 0:
-            add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
+        for colour in colours:
+            counts = colour.counted(raw, len(span))
+            colour.prediction.view(homography, images)
+            add_block_sums(counts, colour.noise_beside(images[0]), float(len(span)), images[0], images[1], sums)
+            if index % _PIXEL_STRIDE == 0:
+                add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
-        own = min(0.5, len(span) / max(prediction.frames_seen, 1.0))
+        own = min(0.5, len(span) / frames_seen)
         total.misfit[index] = fold(
             sums,
             lever,
             middle,
-            prediction.canvas @ homography,
+            first.canvas @ homography,
             1 - own,
             total.normal[index],
             total.gradient[index],

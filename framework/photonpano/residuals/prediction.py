@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.geometry import corners
-from photonpano.protocols import Trajectory
+from photonpano.protocols import ColouredSource, Source, Trajectory
 from photonpano.residuals.block_sums import sample_view
 from photonpano.values import FluxImage, Homography, Panorama, Response
 
@@ -25,7 +25,7 @@ _STRAIGHT_RUN_PX = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """The panorama as the camera would see it from any instant: a `PanoramaView`.
+    """The panorama, in one colour, as the camera would see it from any instant: a `PanoramaView`.
 
     The panorama is smoothed, and then sharpened by as much as smoothing and interpolation have blurred it, to second order. So
     its noise is low and its edges are where they were.
@@ -105,6 +105,60 @@ class Prediction:
         along = np.abs(to_canvas[0, 0] / depth - u * to_canvas[2, 0] / depth - 1)
         across = np.abs(to_canvas[1, 0] / depth - v * to_canvas[2, 0] / depth)
         return bool(max(along.max(), across.max()) < 1 / _STRAIGHT_RUN_PX)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predictions:
+    """The predictions of all colours of a capture: a `PanoramaView`. A grey capture has one.
+
+    Attributes:
+        parts: the source of each colour, with its prediction. Their motion is the same.
+    """
+
+    parts: tuple[tuple[Source, Prediction], ...]
+
+    @classmethod
+    def of(cls, source: Source, panorama: Panorama, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Predictions:
+        """Make the predictions of a panorama.
+
+        Args:
+            source: the capture.
+            panorama: flux and weight along the trajectory, as `render` returns them for the source.
+            trajectory: frame pixels to reference pixels.
+            frame_shape: (height, width) of a frame.
+        """
+        if not isinstance(source, ColouredSource):
+            return cls(((source, Prediction.of(panorama, source.response, trajectory, frame_shape)),))
+        images = zip(np.moveaxis(panorama.flux, -1, 0), np.moveaxis(panorama.weight, -1, 0), strict=True)
+        singles = [
+            Panorama(np.ascontiguousarray(flux), np.ascontiguousarray(weight), panorama.canvas) for flux, weight in images
+        ]
+        return cls(
+            tuple(
+                (each, Prediction.of(single, each.response, trajectory, frame_shape))
+                for each, single in zip(source.colours().values(), singles, strict=True)
+            )
+        )
+
+    @property
+    def first(self) -> Prediction:
+        """The prediction of the first colour; motion, canvas and frame shape are those of all."""
+        return self.parts[0][1]
+
+    @property
+    def frames_seen(self) -> float:
+        """Frames that saw a place of the panorama, in any colour."""
+        return sum(prediction.frames_seen for _, prediction in self.parts)
+
+    def predicted(self, instant: float) -> tuple[FluxImage, FluxImage]:
+        """Predict the frame of an instant, each pixel in its colour: see `PanoramaView`."""
+        images = [prediction.predicted(instant) for _, prediction in self.parts]
+        if len(images) == 1:
+            return images[0]
+        mean, variance = (np.full(self.first.frame_shape, np.nan, np.float32) for _ in range(2))
+        for (source, _), (of_colour, its_variance) in zip(self.parts, images, strict=True):
+            mean[source.valid], variance[source.valid] = of_colour[source.valid], its_variance[source.valid]
+        return mean, variance
 
 
 def _smoothed(image: FluxImage) -> FluxImage:

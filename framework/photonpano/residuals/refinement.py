@@ -11,12 +11,13 @@ import numpy as np
 from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import FrameTrajectory, corner_displacements, inverse
+from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
-from photonpano.residuals.prediction import Prediction
+from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.values import FloatArray, Panorama, Refined
 
@@ -64,7 +65,7 @@ class Explained:
 
     Attributes:
         motion: of every frame; its expected error covers what the residuals show.
-        panorama: rendered along the motion, for the residuals.
+        panorama: rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array.
         residuals: observed minus predicted photons.
         ratio: see `residual_ratio`.
         refinements: what each refiner did.
@@ -99,19 +100,21 @@ class Look:
     def panorama(self) -> Panorama:
         """The panorama along the motion, at the scale of the frames or the largest that fits."""
         motion, shape = self.motion, self.motion.frame_shape
-        canvas = plan_canvas(motion.trajectory, motion.span, shape, 1.0, self._memory)
-        excess = canvas.height * canvas.width * BYTES_PER_PIXEL / self._memory
+        bytes_per_pixel = channels_of(self._source) * BYTES_PER_PIXEL
+        canvas = plan_canvas(motion.trajectory, motion.span, shape, 1.0, self._memory, bytes_per_pixel)
+        excess = canvas.height * canvas.width * bytes_per_pixel / self._memory
         if excess > 1:
-            canvas = plan_canvas(motion.trajectory, motion.span, shape, float(0.99 / np.sqrt(excess)), self._memory)
+            scale = float(0.99 / np.sqrt(excess))
+            canvas = plan_canvas(motion.trajectory, motion.span, shape, scale, self._memory, bytes_per_pixel)
         return render(self._source, motion.trajectory, motion.span, canvas, self._tolerance_px, self._context)
 
     @cached_property
-    def prediction(self) -> Prediction:
+    def predictions(self) -> Predictions:
         """The panorama as the camera would see it."""
-        return Prediction.of(self.panorama, self._source.response, self.motion.trajectory, self.motion.frame_shape)
+        return Predictions.of(self._source, self.panorama, self.motion.trajectory, self.motion.frame_shape)
 
     def _measured(self) -> Residuals:
-        return measure(self._source, self.motion.span, self.prediction, self._context)
+        return measure(self.motion.span, self.predictions, self._context)
 
     def worse_than(self, other: Look) -> str:
         """Return how the photons are explained worse than by another motion, as a clause; empty if they are not."""
@@ -182,7 +185,7 @@ def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> 
     motion = look.motion
     with attributing(refiner.origin, f"round {number}"):
         std_px = motion.std_px.copy()
-        found = refiner.component.refine(source, motion.trajectory, std_px, look.residuals.steps(), look.prediction)
+        found = refiner.component.refine(source, motion.trajectory, std_px, look.residuals.steps(), look.predictions)
         if found is None:
             return None
         require_refined(found, motion.std_px)

@@ -8,6 +8,8 @@ from pydantic import ByteSize, Field
 
 from photonpano.contributions import Config, SpecPath
 
+_Factor = Annotated[float, Field(gt=0, le=1000)]
+
 
 class LevelSettings(Config):
     """The settings of a level, beside the stages that it overrides."""
@@ -54,6 +56,11 @@ class RenderSettings(Config):
         "the time of 0.125, and costs 0.07 dB for a sharp scene in good light",
     )
     white_quantile: float = Field(0.995, gt=0, le=1, description="quantile of the flux that is white in panorama.png")
+    white_balance: Literal["none", "grey-world"] | tuple[_Factor, _Factor, _Factor] = Field(
+        "none",
+        description="factors of red, green and blue in panorama.png, for a capture in colour: those that make the mean grey, "
+        "or [red, green, blue]; panorama.tiff stays as it was measured",
+    )
 
 
 class OutputSettings(Config):

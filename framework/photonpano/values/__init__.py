@@ -1,7 +1,7 @@
 """Frozen values that stages exchange; this package imports numpy only."""
 
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
-from photonpano.values.capture import CaptureSummary, Decision, DecisionValue, StreamInfo
+from photonpano.values.capture import Bayer, CaptureSummary, Decision, DecisionValue, StreamInfo
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated
@@ -9,6 +9,7 @@ from photonpano.values.refinement import Refined, SpanResiduals
 
 __all__ = [
     "Ambiguity",
+    "Bayer",
     "BoolArray",
     "CaptureSummary",
     "Counts",

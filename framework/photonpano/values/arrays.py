@@ -14,7 +14,7 @@ Homography: TypeAlias = NDArray[np.float64]
 """(3, 3) float64 with h33 = 1; (N, 3, 3) where stated."""
 
 FluxImage: TypeAlias = NDArray[np.float32]
-"""(H, W) float32: photons per pixel per frame, NaN where unknown."""
+"""(H, W) float32: photons per pixel per frame, NaN where unknown; (H, W, 3) where stated."""
 
 Counts: TypeAlias = NDArray[np.uint32]
 """(H, W) uint32: sums of frames."""

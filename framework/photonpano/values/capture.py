@@ -13,6 +13,9 @@ from photonpano.values.frames import FrameSpan
 DecisionValue: TypeAlias = bool | int | float | str
 """Values of decisions that can be recorded."""
 
+Bayer: TypeAlias = Literal["rggb", "bggr", "grbg", "gbrg"]
+"""Colours of the filters of a Bayer array: the first two pixels of the first row, and then of the second."""
+
 
 @dataclass(frozen=True, slots=True)
 class StreamInfo:
@@ -25,6 +28,8 @@ class StreamInfo:
         frame_rate_hz: frames per second; None if the capture does not give it.
         kind: "binary" if a pixel is 0 or 1, "intensity" if it is a grey value or a sum of binary frames.
         bit_depth: bits of a pixel.
+        bayer: colours of the filters before the first two pixels of the first two rows, if these repeat, such as "rggb"; None
+            for a grey sensor, another filter array, or if the capture does not give it.
     """
 
     n_frames: int
@@ -33,6 +38,7 @@ class StreamInfo:
     frame_rate_hz: float | None
     kind: Literal["binary", "intensity"] = "binary"
     bit_depth: int = 1
+    bayer: Bayer | None = None
 
     def __str__(self) -> str:
         kind = "binary" if self.kind == "binary" else f"{self.bit_depth}-bit"

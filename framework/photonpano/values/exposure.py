@@ -65,8 +65,10 @@ class Panorama:
     """Flux and weight on a canvas.
 
     Attributes:
-        flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen.
-        weight: (H, W) float32, number of frames in which each pixel was seen (the coverage).
+        flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen; (H, W, 3) of red, green and blue pixels
+            for a capture in colour.
+        weight: number of frames in which each pixel was seen (the coverage), float32 of the same shape; 0 in a colour that was
+            filled from the others.
         canvas: (3, 3) float64, pixels of the reference plane to pixels of the panorama.
     """
 

@@ -98,7 +98,7 @@ def test_load_truth_refuses_single_array(capture):
         ("homographies", np.full((120, 3, 3), np.nan), "homographies must be finite and invertible"),
         ("frame_shape", np.array([60, 90, 1]), "frame_shape must be two positive integers (height, width), got [60, 90, 1]"),
         ("frame_shape", np.array([60, 0]), "frame_shape must be two positive integers (height, width), got [60, 0]"),
-        ("scene", np.zeros((4, 4, 3)), "scene must be an image (height, width), got the shape (4, 4, 3)"),
+        ("scene", np.zeros((4, 4, 2)), "scene must be an image (height, width) or (height, width, 3), got the shape (4, 4, 2)"),
         ("scene", np.array(["a"]), "scene must contain numbers"),
         (
             "undistorted_corners",

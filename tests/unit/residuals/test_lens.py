@@ -11,7 +11,7 @@ from photonpano.geometry import FrameTrajectory
 from photonpano.merging.panorama import plan_canvas, render
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import measure
-from photonpano.residuals.prediction import Prediction
+from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.verdict import block_shifts
 
 SHAPE = (96, 128)
@@ -30,7 +30,7 @@ def found(k1: float):
         motion = FrameTrajectory(source.truth()["homographies"])
         span = source.info.span
         panorama = render(source, motion, span, plan_canvas(motion, span, SHAPE, 1.0, 2**30), 0.25, Context())
-        residuals = measure(source, span, Prediction.of(panorama, source.response, motion, SHAPE), Context())
+        residuals = measure(span, Predictions.of(source, panorama, motion, SHAPE), Context())
         return lens_distortion(*block_shifts(residuals), motion.at(np.arange(span.stop)), SHAPE)
 
 
