@@ -21,9 +21,7 @@ _LARGEST = 16384
 """Largest side of a scene, px. Warps of OpenCV refuse a side of 32768 px."""
 
 
-def scene_flux(
-    scene: StreetScene | NightScene | PhotoScene, flux: float, in_colour: bool = False
-) -> NDArray[np.float32]:
+def scene_flux(scene: StreetScene | NightScene | PhotoScene, flux: float, in_colour: bool = False) -> NDArray[np.float32]:
     """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame, with the mean `flux`.
 
     Args:
