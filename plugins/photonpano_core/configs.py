@@ -121,3 +121,15 @@ class InterpolatorConfig(Config):
 
 class MergeConfig(Config):
     """`merge`, the renderer, has no keys."""
+
+
+class SuperResolutionConfig(Config):
+    """Keys of `super-resolution`."""
+
+    fill_factor: float = Field(
+        1.0,
+        ge=0.05,
+        le=1,
+        description="share of the area of a pixel that is sensitive to light; 0.105 for SwissSPAD2 without "
+        "microlenses, 1 with good ones",
+    )

@@ -24,6 +24,7 @@ from photonpano_core.configs import (
     SlidingWindowConfig,
     SplatConfig,
     StratifiedConfig,
+    SuperResolutionConfig,
 )
 from photonpano_core.constant_groups import ConstantGroupsResampler
 from photonpano_core.group_size import AutoResampler
@@ -146,12 +147,18 @@ def photonpano_refiners() -> Iterator[RefinerContribution]:
 
 @hookimpl
 def photonpano_renderers() -> Iterator[RendererContribution]:
-    """Offer the merge of all frames."""
+    """Offer the merge of all frames, and super-resolution."""
     yield RendererContribution(
         name="merge",
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=MergeConfig,
         build=_build_merge,
+    )
+    yield RendererContribution(
+        name="super-resolution",
+        summary="The most probable flux on a fine grid, with the area of pixels and a denoiser as prior",
+        config=SuperResolutionConfig,
+        build=_build_super_resolution,
     )
 
 
@@ -235,3 +242,9 @@ def _build_merge(config: MergeConfig, context: StageContext) -> Renderer:
 
     del config
     return MergeRenderer(context.threads)
+
+
+def _build_super_resolution(config: SuperResolutionConfig, context: StageContext) -> Renderer:
+    from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
+
+    return SuperResolutionRenderer(config, context.threads, context.decide)

@@ -143,3 +143,8 @@ class TestShortSpans(RefinerConformance):
 
 class TestMerge(RendererConformance):
     contribution = CATALOG.find("renderer", "merge").contribution
+
+
+class TestSuperResolution(RendererConformance):
+    contribution = CATALOG.find("renderer", "super-resolution").contribution
+    scales = (2.0,)

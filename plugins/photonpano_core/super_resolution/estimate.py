@@ -1,0 +1,157 @@
+"""Estimate the flux of a fine grid from the photons of its cells: expectation-maximisation, and denoising in between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from photonpano import FloatArray, FluxImage
+from photonpano_core.super_resolution.collaborative import GROUP, PATCH, filter_groups, find_similar, places_of
+from photonpano_core.super_resolution.observing import expected, log_likelihood, photon_ratio
+
+STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
+"""Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round."""
+_STEPS = 6
+"""Steps of expectation-maximisation in a round."""
+_MATCHED_ROUNDS = 3
+"""Rounds for which similar patches are looked for once."""
+_FEWEST_FRAMES = 0.25
+"""Frames of a cell, smoothed, below which its noise grows no more."""
+_DARKEST = 1e-5
+"""The flux stays above this share of its mean: expectation-maximisation cannot leave 0."""
+_BRIGHTEST = 1.55
+"""Largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """The photons of the cells of a grid.
+
+    Attributes:
+        lit: (H, W) float32, sums of counts.
+        seen: (H, W) float32, frames in these sums.
+        kernel: (2 r + 1,) float32, the area of a pixel along x and along y: see `pixel_area`.
+        binary: whether a count is 1 for one photon or more; otherwise counts are photons.
+    """
+
+    lit: FluxImage
+    seen: FluxImage
+    kernel: FluxImage
+    binary: bool
+
+    def weight(self) -> FluxImage:
+        """Return the frames of a cell, on average over the area of a pixel: (H, W)."""
+        return _averaged(self.seen, self)
+
+    def log_likelihood(self, flux: FluxImage) -> FluxImage:
+        """Return the log-likelihood of the counts of each cell, but for a constant: (H, W)."""
+        mean, found = np.empty_like(flux), np.empty_like(flux)
+        expected(flux, self.kernel, found, mean)
+        log_likelihood(self.lit, self.seen, mean, self.binary, found)
+        return found
+
+
+def pixel_area(width: float) -> FluxImage:
+    """Return the share of each pixel of a grid in the light of a pixel of the sensor, along one axis.
+
+    The light falls on a box. Its middle may lie anywhere within a cell, and the flux is constant within each pixel: the
+    weights are the integrals of two boxes, convolved with each other.
+
+    Args:
+        width: of the light-sensitive area of a pixel, in px of the grid.
+    """
+    radius = int(np.ceil(width / 2 + 1))
+    offsets = np.arange(-radius, radius + 1)
+    weights = np.zeros(len(offsets))
+    for signs in np.ndindex(2, 2, 2):
+        a, b, c = 1 - 2 * np.array(signs)
+        weights += a * b * c * np.maximum(offsets + (a * width + b + c) / 2, 0) ** 2 / 2
+    weights = np.maximum(weights, 0)
+    inside = weights > 1e-7 * weights.max()
+    return np.asarray(weights[inside] / weights.sum(), np.float32)
+
+
+def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
+    """Estimate the flux, round by round; the last image is the best of the most rounds.
+
+    Each round increases the likelihood of the flux by some steps of expectation-maximisation,
+    `x <- x B'[k / (1 - exp(-B x))] / B'[n]` with the area B of a pixel, counts k and frames n, and then removes what looks
+    like noise: a plug-and-play prior (Venkatakrishnan et al. 2013).
+
+    Args:
+        observed: the photons.
+        n_rounds: how many rounds, at most those of `STRENGTHS`.
+    """
+    seen = observed.weight()
+    noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
+    flux = _started(observed)
+    floor = np.float32(_DARKEST * max(float(flux.mean()), 1e-9))
+    rows, columns = places_of(flux.shape[0]), places_of(flux.shape[1])
+    found = np.empty((len(rows), len(columns), GROUP, 2), np.int32)
+    results = []
+    for number, strength in enumerate(STRENGTHS[:n_rounds]):
+        flux = _likelier(flux, seen, floor, observed)
+        stabilised = _stabilised(flux, observed.binary)
+        if number % _MATCHED_ROUNDS == 0:
+            find_similar(stabilised, rows, columns, found)
+        total, weights = np.zeros_like(flux), np.zeros_like(flux)
+        filter_groups(stabilised, np.asarray(strength * noise, np.float32), rows, columns, found, total, weights)
+        flux = np.maximum(_flux_of(total / weights, observed.binary), floor)
+        results.append(flux)
+    return results
+
+
+def _averaged(image: FluxImage, observed: Observations) -> FluxImage:
+    found = np.empty_like(image)
+    expected(image, observed.kernel, np.empty_like(image), found)
+    return found
+
+
+def _likelier(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Observations) -> FluxImage:
+    mean, ratio, room = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
+    known = seen > 1e-3 * max(float(seen.max()), 1e-9)
+    per_frame = np.divide(1, seen, out=np.zeros_like(seen), where=known)
+    for _ in range(_STEPS):
+        expected(flux, observed.kernel, room, mean)
+        photon_ratio(observed.lit, observed.seen, mean, observed.binary, ratio)
+        expected(ratio, observed.kernel, room, mean)
+        flux = np.maximum(np.where(known, flux * mean * per_frame, flux), floor)
+    return flux
+
+
+def _started(observed: Observations) -> FluxImage:
+    """Return the flux of smoothed sums; where nothing was seen, that of the surroundings."""
+    sigma = 0.25 * len(observed.kernel)
+    lit = cv2.GaussianBlur(observed.lit, (0, 0), sigma) + 1e-3 * cv2.GaussianBlur(observed.lit, (0, 0), 8 * sigma)
+    seen = cv2.GaussianBlur(observed.seen, (0, 0), sigma) + 1e-3 * cv2.GaussianBlur(observed.seen, (0, 0), 8 * sigma)
+    share = float(observed.lit.sum()) / max(float(observed.seen.sum()), 1.0)
+    mean = (lit + 1e-6 * share) / (seen + 1e-6)
+    if not observed.binary:
+        return np.asarray(np.maximum(mean, 1e-9), np.float32)
+    return np.asarray(-np.log1p(-np.clip(mean, 1e-9, 1 - 0.5 / np.maximum(seen, 1))), np.float32)
+
+
+def _stabilised(flux: FluxImage, binary: bool) -> FluxImage:
+    """Map flux to a scale on which the noise of n frames is 0.5 / sqrt(n) (Anscombe 1948)."""
+    return np.asarray(np.arcsin(np.sqrt(-np.expm1(-flux))) if binary else np.sqrt(flux), np.float32)
+
+
+def _flux_of(stabilised: FluxImage, binary: bool) -> FluxImage:
+    if binary:
+        return np.asarray(-2 * np.log(np.cos(np.clip(stabilised, 0, _BRIGHTEST))), np.float32)
+    return np.asarray(np.maximum(stabilised, 0) ** 2, np.float32)
+
+
+def coarser(flux: FluxImage, factor: int = 2) -> FluxImage:
+    """Return an image with the detail of a grid that is coarser by a factor: averaged, and interpolated again."""
+    height, width = flux.shape
+    small = cv2.resize(flux, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
+    return np.asarray(np.maximum(cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC), 1e-9), np.float32)
+
+
+def gain_of(better: FluxImage, worse: FluxImage) -> tuple[float, float]:
+    """Return the sum of the differences of two log-likelihoods, cell by cell, and its standard error."""
+    apart: FloatArray = better.astype(np.float64) - worse
+    return float(apart.sum()), float(np.sqrt((apart**2).sum()))

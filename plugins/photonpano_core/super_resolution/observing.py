@@ -1,0 +1,144 @@
+"""Sort the photons of frames by where their pixels lie on a fine grid. Compiled.
+
+Pixels whose centres fall into one cell of the grid see nearly the same light, whatever their frame: their counts are summed,
+and so are their frames. A capture becomes two images, on which each round of an estimate works, not on the frames.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.compiling import compiled
+
+_UP = 0.5 + 1e-6
+"""A centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates."""
+
+
+@compiled
+def add_observations(
+    counts: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    n_frames: float,
+    to_grid: NDArray[np.float64],
+    first: int,
+    lit: NDArray[np.float32],
+    seen: NDArray[np.float32],
+) -> None:
+    """Add the pixels of a sum of frames to the cells that their centres fall into.
+
+    Convention:
+        Points are (x, y), integers are the centres of pixels and of cells.
+
+    Args:
+        counts: (h, w) sum of frames.
+        usable: (h, w), False for masked pixels.
+        n_frames: frames in the sum.
+        to_grid: (3, 3), pixels of the frame to cells of the whole grid.
+        first: row of the whole grid at which `lit` and `seen` begin.
+        lit: (H, W) rows of the grid: counts, added to.
+        seen: (H, W): frames, added to.
+    """
+    height, width = counts.shape
+    rows, columns = lit.shape
+    n = np.float32(n_frames)
+    for y in range(height):
+        # Along a row of the frame, the grid's coordinates are quotients of linear functions.
+        u0, du = to_grid[0, 1] * y + to_grid[0, 2], to_grid[0, 0]
+        v0, dv = to_grid[1, 1] * y + to_grid[1, 2], to_grid[1, 0]
+        d0, dd = to_grid[2, 1] * y + to_grid[2, 2], to_grid[2, 0]
+        last = width - 1
+        ends = v0 / d0 - first, (v0 + dv * last) / (d0 + dd * last) - first
+        if max(ends[0], ends[1]) < -0.5 or min(ends[0], ends[1]) > rows - 0.5:
+            continue
+        for x in range(width):
+            per_depth = 1 / (d0 + dd * x)
+            column = int(np.floor((u0 + du * x) * per_depth + _UP))
+            row = int(np.floor((v0 + dv * x) * per_depth + _UP)) - first
+            if 0 <= row < rows and 0 <= column < columns and usable[y, x]:
+                lit[row, column] += counts[y, x]
+                seen[row, column] += n
+
+
+@compiled
+def expected(
+    flux: NDArray[np.float32], kernel: NDArray[np.float32], room: NDArray[np.float32], into: NDArray[np.float32]
+) -> None:
+    """Average the flux over the areas of pixels that are centred at each cell; the border is repeated.
+
+    Args:
+        flux: (H, W).
+        kernel: (2 r + 1,) weights along x and along y, with the sum 1; symmetric, so that this is its own adjoint.
+        room: (H, W), overwritten.
+        into: (H, W) output.
+    """
+    height, width = flux.shape
+    radius = len(kernel) // 2
+    for y in range(height):
+        row, out = flux[y], room[y]
+        for x in range(width):
+            if radius <= x < width - radius:
+                continue
+            total = np.float32(0)
+            for i in range(-radius, radius + 1):
+                total += kernel[i + radius] * row[min(max(x + i, 0), width - 1)]
+            out[x] = total
+        inner = out[radius : width - radius]
+        for t in range(len(inner)):
+            inner[t] = np.float32(0)
+        for i in range(2 * radius + 1):
+            weight, part = kernel[i], row[i : i + len(inner)]
+            for t in range(len(inner)):
+                inner[t] += weight * part[t]
+    for y in range(height):
+        out = into[y]
+        for x in range(width):
+            out[x] = np.float32(0)
+        for i in range(-radius, radius + 1):
+            weight, part = kernel[i + radius], room[min(max(y + i, 0), height - 1)]
+            for x in range(width):
+                out[x] += weight * part[x]
+
+
+@compiled
+def photon_ratio(
+    lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
+) -> None:
+    """Return the photons that each cell detected, given its counts, for each photon of the flux: `k / (1 - exp(-mean))`.
+
+    Args:
+        lit: (H, W) counts k.
+        seen: (H, W) frames.
+        mean: (H, W) expected photons of a pixel in a frame.
+        binary: whether counts are of pixels that are 1 with one photon or more; otherwise the ratio is k / mean.
+        into: (H, W) output.
+    """
+    one, least = np.float32(1), np.float32(1e-9)
+    for y in range(lit.shape[0]):
+        k, n, m, out = lit[y], seen[y], mean[y], into[y]
+        for x in range(len(k)):
+            light = max(m[x], least)
+            if k[x] <= 0 or n[x] <= 0:
+                out[x] = np.float32(0)
+            elif binary:
+                out[x] = k[x] / (one - np.exp(-light))
+            else:
+                out[x] = k[x] / light
+
+
+@compiled
+def log_likelihood(
+    lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
+) -> None:
+    """Return the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
+    one, least = np.float32(1), np.float32(1e-9)
+    for y in range(lit.shape[0]):
+        k, n, m, out = lit[y], seen[y], mean[y], into[y]
+        for x in range(len(k)):
+            light = max(m[x], least)
+            if n[x] <= 0:
+                out[x] = np.float32(0)
+            elif binary:
+                out[x] = k[x] * np.log(one - np.exp(-light)) - (n[x] - k[x]) * light
+            else:
+                out[x] = k[x] * np.log(light) - n[x] * light

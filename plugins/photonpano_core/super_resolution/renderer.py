@@ -1,0 +1,313 @@
+"""Renderer `super-resolution`: the most probable flux on a grid finer than the sensor."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from threading import Lock
+
+import numpy as np
+
+from photonpano import FloatArray, FluxImage, FrameSpan, Homography, Panorama, Source, Trajectory
+from photonpano.geometry import Canvas, apply, corners, inverse, translation
+from photonpano.merging import Chunk
+from photonpano.photometry import BinaryResponse, BinarySumResponse
+from photonpano_core.configs import SuperResolutionConfig
+from photonpano_core.super_resolution.estimate import STRENGTHS, Observations, coarser, gain_of, pixel_area, rounds_of
+from photonpano_core.super_resolution.sums import pieces_of, sums_on, visible
+
+Decide = Callable[[str, int | bool, str], None]
+
+Box = tuple[slice, slice]
+"""Rows and columns of an image."""
+
+logger = logging.getLogger("photonpano.super_resolution")
+
+_BLOCK_PX = 320
+"""Side of the blocks that are estimated one by one; all pixels of a block see with the same area."""
+_HALO_PX = 24
+"""Width of the margin around a block: what lies beyond has no influence that counts."""
+_PROBE_PX = 160
+"""Side of the squares on which frames are held out, without their margins."""
+_PROBES = (0.25, 0.5, 0.75)
+"""Where these squares lie: in the middles of the frames at these shares of the span."""
+_HELD_OUT = 8
+"""One chunk of frames in 8 is held out."""
+_FEWEST_FRAMES = 1.0
+"""Pixels that fewer frames saw are unknown."""
+_GATHERING = 5
+"""One part in 5 of the time is spent on sorting photons, about."""
+_SIGNIFICANT = 2.0
+"""Held-out frames show detail if they are likelier with it than without by this many standard errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Chosen:
+    """What frames held out have shown for a motion: the number of rounds."""
+
+    trajectory: Trajectory
+    span: FrameSpan
+    n_rounds: int
+
+
+class SuperResolutionRenderer:
+    """Maximises the probability of the flux on the canvas, given the photons and a prior: see `rounds_of`.
+
+    Some frames are held out on three squares, where the estimate of each round predicts them. The round whose prediction is the
+    likeliest is the last one.
+    """
+
+    def __init__(self, config: SuperResolutionConfig, threads: int, decide: Decide) -> None:
+        """Prepare to render.
+
+        Args:
+            config: the keys of the spec.
+            threads: how many blocks are estimated at once; the result does not depend on it.
+            decide: records how many rounds were chosen, and why.
+        """
+        self._config, self._threads, self._decide = config, threads, decide
+        self._chosen: _Chosen | None = None
+        self._lock = Lock()
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Render the frames of a span on a canvas: see `Renderer`."""
+        # Frames are sorted by where their pixels lie on the canvas.
+        tolerance_px = min(tolerance_px, 0.25 / _scale_of(canvas))
+        chunks = pieces_of(span, trajectory, source.info.frame_shape, tolerance_px)
+        if not visible(chunks, canvas, source.info.frame_shape):
+            advance(len(span))
+            return Panorama(np.full(canvas.shape, np.nan, np.float32), np.zeros(canvas.shape, np.float32), canvas.transform)
+        with _pool(self._threads) as pool:
+            with self._lock:
+                chosen = self._chosen
+                if chosen is None or chosen.trajectory is not trajectory or chosen.span != span:
+                    n_rounds = self._rounds(source, chunks, trajectory, span, canvas, pool)
+                    chosen = self._chosen = _Chosen(trajectory, span, n_rounds)
+            wide, left, top = _widened(canvas)
+            seen = visible(chunks, wide, source.info.frame_shape)
+            progress = _Shares(advance, len(span))
+            n_frames = sum(len(chunk.span) for chunk in seen)
+            sums = sums_on(source, seen, wide, partial(progress.add, 1 / (n_frames * _GATHERING)), pool)
+            blank = np.full(wide.shape, np.nan, np.float32)
+            whole = Panorama(blank, np.zeros(wide.shape, np.float32), wide.transform)
+            blocks = _blocks(wide)
+            work = partial(self._fill, whole, sums, chunks, source, chosen.n_rounds)
+            for _ in pool.map(work, blocks):
+                progress.add((1 - 1 / _GATHERING) / len(blocks), 1)
+            progress.finish()
+        inner = slice(top, top + canvas.height), slice(left, left + canvas.width)
+        return Panorama(whole.flux[inner].copy(), whole.weight[inner].copy(), canvas.transform)
+
+    def _fill(
+        self,
+        panorama: Panorama,
+        sums: tuple[FluxImage, FluxImage],
+        chunks: Sequence[Chunk],
+        source: Source,
+        n_rounds: int,
+        block: Box,
+    ) -> None:
+        """Estimate what frames show of a block of a panorama, if they show anything."""
+        part = _seen_part(sums[1], block)
+        if part is None:
+            return
+        block, inner, around = part
+        rows, columns = block
+        lit, seen = (np.ascontiguousarray(each[around]) for each in sums)
+        middle = np.array([(columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2])
+        zoom = _zoom_at(middle, panorama.canvas, chunks, source.info.frame_shape)
+        observed = self._observations(source, lit, seen, zoom)
+        weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(source))
+        known = weight >= _FEWEST_FRAMES
+        if not known.any():
+            return
+        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(_trials(source))
+        panorama.flux[block] = np.where(known, flux, np.float32(np.nan))
+        panorama.weight[block] = np.where(known, weight, 0)
+
+    def _observations(self, source: Source, lit: FluxImage, seen: FluxImage, zoom: float) -> Observations:
+        binary = isinstance(source.response, BinaryResponse | BinarySumResponse)
+        return Observations(lit, seen, pixel_area(zoom * float(np.sqrt(self._config.fill_factor))), binary)
+
+    def _rounds(
+        self,
+        source: Source,
+        chunks: Sequence[Chunk],
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        pool: ThreadPoolExecutor,
+    ) -> int:
+        """Choose the number of rounds by frames held out, record it, and say whether they show the detail of this scale."""
+        scores: list[FloatArray] = []
+        detail = np.zeros(2)
+        for share in _PROBES:
+            probe = _probe(share, source, trajectory, span, canvas)
+            near = visible(chunks, probe, source.info.frame_shape)
+            held = [chunk for index, chunk in enumerate(near) if index % _HELD_OUT == _HELD_OUT // 2]
+            kept = [chunk for index, chunk in enumerate(near) if index % _HELD_OUT != _HELD_OUT // 2]
+            if not held:
+                continue
+            middle = np.array([(probe.width - 1) / 2, (probe.height - 1) / 2])
+            zoom = _zoom_at(middle, probe.transform, near, source.info.frame_shape)
+            fitted, tested = (
+                self._observations(source, *sums_on(source, part, probe, lambda _: None, pool), zoom) for part in (kept, held)
+            )
+            inner = slice(_HALO_PX, -_HALO_PX), slice(_HALO_PX, -_HALO_PX)
+            results = rounds_of(fitted, len(STRENGTHS))
+            likely = [tested.log_likelihood(flux)[inner] for flux in results]
+            scores.append(np.array([float(each.sum(dtype=np.float64)) for each in likely]))
+            best = int(np.argmax(scores[-1]))
+            gain, error = gain_of(likely[best], tested.log_likelihood(coarser(results[best]))[inner])
+            detail += gain, error**2
+        if not scores:
+            return len(STRENGTHS) // 2
+        total = np.sum(scores, axis=0)
+        n_rounds = int(np.argmax(total)) + 1
+        losses = ", ".join(f"{each:.0f}" for each in total - total.max())
+        self._decide(
+            "super_resolution.rounds",
+            n_rounds,
+            f"of {len(STRENGTHS)}, each with a weaker prior: it predicts frames held out best; their log-likelihood by round, "
+            f"relative to it: {losses}",
+        )
+        gain, error = float(detail[0]), float(np.sqrt(detail[1]))
+        supported = gain > _SIGNIFICANT * error
+        scale = _scale_of(canvas)
+        found = f"the log-likelihood of frames held out changes by {gain:+.1f} +- {error:.1f}"
+        if supported:
+            reason = f"with the detail of scale {scale:g} beyond that of {scale / 2:g}, {found}"
+        else:
+            reason = f"the photons do not support scale {scale:g}: with its detail beyond that of scale {scale / 2:g}, {found}"
+            logger.warning(reason)
+        self._decide("super_resolution.supported", supported, reason)
+        return n_rounds
+
+
+class _Shares:
+    """Turns shares of the work into whole frames for `advance`."""
+
+    def __init__(self, advance: Callable[[int], None], n_frames: int) -> None:
+        self._advance, self._n_frames = advance, n_frames
+        self._share, self._done = 0.0, 0
+
+    def add(self, share: float, times: int) -> None:
+        """Add a share of the work, some times."""
+        self._share += share * times
+        done = min(int(self._share * self._n_frames), self._n_frames)
+        self._advance(done - self._done)
+        self._done = done
+
+    def finish(self) -> None:
+        """Add what rounding has left."""
+        self._advance(self._n_frames - self._done)
+        self._done = self._n_frames
+
+
+@contextmanager
+def _pool(threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Open a pool of threads; an interrupt cancels what has not started."""
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="super-resolution")
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _scale_of(canvas: Canvas) -> float:
+    return float(np.sqrt(abs(np.linalg.det(canvas.transform[:2, :2]))))
+
+
+def _trials(source: Source) -> int:
+    """Return the binary frames that a frame is the sum of."""
+    return source.response.n if isinstance(source.response, BinarySumResponse) else 1
+
+
+def _widened(canvas: Canvas) -> tuple[Canvas, int, int]:
+    """Return a canvas of whole blocks with a margin on all sides, and how far to the left and to the top it is wider.
+
+    Blocks begin at multiples of their side in the reference plane, so that they are the same in every tile.
+    """
+    first = -np.floor(canvas.transform[:2, 2] / canvas.transform[2, 2]).astype(int)
+    left, top = (int(each % _BLOCK_PX) + _HALO_PX for each in first)
+    height, width = (
+        -(-(before - _HALO_PX + side) // _BLOCK_PX) * _BLOCK_PX + 2 * _HALO_PX
+        for before, side in ((top, canvas.height), (left, canvas.width))
+    )
+    return Canvas(height, width, translation(left, top) @ canvas.transform), left, top
+
+
+def _blocks(wide: Canvas) -> list[Box]:
+    return [
+        (slice(top, top + _BLOCK_PX), slice(left, left + _BLOCK_PX))
+        for top in range(_HALO_PX, wide.height - _HALO_PX, _BLOCK_PX)
+        for left in range(_HALO_PX, wide.width - _HALO_PX, _BLOCK_PX)
+    ]
+
+
+def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:
+    """Return the part of a block around which something was seen.
+
+    Returns:
+        The part, rows and columns; where it lies within the third; and the part with its margin. None if nothing was seen.
+    """
+    rows, columns = block
+    near = seen[rows.start - _HALO_PX : rows.stop + _HALO_PX, columns.start - _HALO_PX : columns.stop + _HALO_PX] > 0
+    found = []
+    for axis, side in ((1, rows), (0, columns)):
+        at = np.flatnonzero(near.any(axis=axis)) + side.start - _HALO_PX
+        if not at.size:
+            return None
+        # At least a patch of the denoiser.
+        start, stop = max(side.start, int(at[0]) - _HALO_PX), min(side.stop, int(at[-1]) + 1 + _HALO_PX)
+        if start >= stop:
+            return None
+        found.append(slice(start, stop))
+    part = found[0], found[1]
+    inner = slice(_HALO_PX, _HALO_PX + part[0].stop - part[0].start), slice(_HALO_PX, _HALO_PX + part[1].stop - part[1].start)
+    around = slice(part[0].start - _HALO_PX, part[0].stop + _HALO_PX), slice(part[1].start - _HALO_PX, part[1].stop + _HALO_PX)
+    return part, inner, around
+
+
+def _probe(share: float, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> Canvas:
+    """Return a square, with its margin, around the middle of the frame at a share of the span.
+
+    It lies on the pixels of the canvas, wherever the canvas begins, so that all tiles find the same.
+    """
+    instant = span.start + share * (len(span) - 1)
+    shape = source.info.frame_shape
+    to_canvas = canvas.transform @ trajectory.at([instant])[0]
+    outline = apply(to_canvas, corners(shape))
+    # Even sides, so that the detail of a grid half as fine is easily found.
+    width, height = (2 * int(min(_PROBE_PX, side) // 2 + _HALO_PX) for side in np.ceil(np.ptp(outline, axis=0)) + 1)
+    left, top = np.rint(outline.mean(axis=0) - [width / 2, height / 2])
+    return Canvas(height, width, translation(-left, -top) @ canvas.transform)
+
+
+def _zoom_at(middle: FloatArray, canvas: Homography, chunks: Sequence[Chunk], frame_shape: tuple[int, int]) -> float:
+    """Return the pixels of the canvas along a side of a pixel of a frame, on average over the frames that see a place."""
+    height, width = frame_shape
+    every = chunks[:: max(1, len(chunks) // 256)]
+    to_canvas = canvas @ np.array([chunk.homography for chunk in every])
+    points = apply(inverse(to_canvas), middle[None])[:, 0]
+    outside = np.maximum(np.abs(points - [(width - 1) / 2, (height - 1) / 2]) - [width / 2, height / 2], 0).sum(axis=1)
+    inside = outside <= outside.min()
+    seen, at = to_canvas[inside], points[inside]
+    here, right, below = (
+        np.array([apply(homography, (point + step)[None])[0] for homography, point in zip(seen, at, strict=True)])
+        for step in ([0, 0], [1, 0], [0, 1])
+    )
+    a, b = (right - here).T, (below - here).T
+    return float(np.sqrt(np.abs(a[0] * b[1] - a[1] * b[0])).mean())

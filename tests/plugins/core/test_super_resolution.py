@@ -1,0 +1,220 @@
+"""Super-resolution against known fluxes, with photon noise."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Panorama
+from photonpano.geometry import Canvas, translation
+from photonpano.merging import MergeRenderer
+from photonpano.photometry import BinaryResponse, BinarySumResponse
+from photonpano.testing import KnownMotion, MemorySource
+from photonpano_core.configs import SuperResolutionConfig
+from photonpano_core.super_resolution.collaborative import GROUP, filter_groups, find_similar, places_of
+from photonpano_core.super_resolution.estimate import Observations, pixel_area, rounds_of
+from photonpano_core.super_resolution.observing import add_observations, expected
+from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
+
+SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
+"""Pixels of a side of a frame, its stops, the frames of each, and the samples of the scene along the side of a pixel."""
+SCALE = 2
+
+
+@cache
+def fine_scene(flux: float = 0.3) -> np.ndarray:
+    """Return discs with sharp edges, sampled 8 times a pixel: (448, 448) float64."""
+    rng = np.random.default_rng(4)
+    scene = np.full((56 * FINE, 56 * FINE), 0.3, np.float32)
+    for _ in range(160):
+        middle, radius = rng.integers(0, 56 * FINE, 2).tolist(), int(rng.integers(6, 40))
+        cv2.circle(scene, middle, radius, float(rng.uniform(0.05, 1.0)), -1)
+    return scene.astype(np.float64) * flux / scene.mean()
+
+
+def stops() -> np.ndarray:
+    """Return where the camera stands for each chunk, in samples of the scene: (CHUNKS, 2) along x and y."""
+    return np.random.default_rng(5).integers(0, 16 * FINE, (CHUNKS, 2))
+
+
+def seen_from(stop: np.ndarray, scene: np.ndarray, area: int = FINE) -> np.ndarray:
+    """Return the flux that pixels with an area of a width of some samples see."""
+    x, y = stop
+    margin = (FINE - area) // 2
+    view = scene[y : y + SIDE * FINE, x : x + SIDE * FINE].reshape(SIDE, FINE, SIDE, FINE)
+    return view[:, margin : margin + area, :, margin : margin + area].mean(axis=(1, 3))
+
+
+def capture(scene: np.ndarray, area: int = FINE, seed: int = 0) -> tuple[MemorySource, KnownMotion]:
+    """Simulate a camera that jumps from stop to stop; the reference plane has the pixels of a frame."""
+    rng, places = np.random.default_rng(seed), stops()
+    lit = [rng.random((FRAMES, SIDE, SIDE)) < -np.expm1(-seen_from(stop, scene, area)) for stop in places]
+    motion = KnownMotion(lambda frame: translation(*places[min(int(frame) // FRAMES, CHUNKS - 1)] / FINE))
+    return MemorySource(np.concatenate(lit)), motion
+
+
+def true_panorama(scene: np.ndarray) -> np.ndarray:
+    """Return the flux on the canvas of scale 2."""
+    step = FINE // SCALE
+    return scene.reshape(56 * SCALE, step, 56 * SCALE, step).mean(axis=(1, 3))
+
+
+CANVAS = Canvas(56 * SCALE, 56 * SCALE, np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]]))
+INNER = np.s_[2 * SCALE * 6 : -2 * SCALE * 6, 2 * SCALE * 6 : -2 * SCALE * 6]
+
+
+def rendered(source: MemorySource, motion: KnownMotion, decisions: list | None = None, **keys: float) -> Panorama:
+    decide = (lambda *given: decisions.append(given)) if decisions is not None else (lambda *_: None)
+    renderer = SuperResolutionRenderer(SuperResolutionConfig(**keys), 2, decide)
+    return renderer.render(source, motion, source.info.span, CANVAS, 0.125, lambda _: None)
+
+
+def psnr_db(flux: np.ndarray, truth: np.ndarray) -> float:
+    white = truth.max()
+    difference = np.sqrt(np.clip(flux[INNER] / white, 0, 1)) - np.sqrt(truth[INNER] / white)
+    return float(-10 * np.log10(np.mean(difference**2)))
+
+
+def test_super_resolution_exceeds_interpolated_panorama_by_3_db() -> None:
+    scene = fine_scene()
+    source, motion = capture(scene)
+    truth, decisions = true_panorama(scene), []
+    panorama = rendered(source, motion, decisions)
+    small = Canvas(56, 56, np.eye(3))
+    merged = MergeRenderer(1).render(source, motion, source.info.span, small, 0.125, lambda _: None)
+    bicubic = cv2.resize(np.nan_to_num(merged.flux), CANVAS.shape, interpolation=cv2.INTER_CUBIC)
+    assert psnr_db(panorama.flux, truth) > psnr_db(bicubic, truth) + 3
+    assert float(panorama.flux[INNER].mean()) == pytest.approx(truth[INNER].mean(), rel=0.01)
+    (what, value, reason), (supported, yes, _) = decisions
+    assert (what, supported, yes) == ("super_resolution.rounds", "super_resolution.supported", True)
+    assert 1 <= value <= 6
+    assert reason.startswith(
+        "of 6, each with a weaker prior: it predicts frames held out best; their log-likelihood by round, "
+    )
+
+
+def test_scale_beyond_the_photons_is_said_with_the_figure_and_done(caplog: pytest.LogCaptureFixture) -> None:
+    source, motion = capture(np.full_like(fine_scene(), 0.02))
+    decisions: list = []
+    panorama = rendered(source, motion, decisions)
+    assert np.isfinite(panorama.flux[INNER]).all()
+    what, value, reason = decisions[-1]
+    assert (what, value) == ("super_resolution.supported", False)
+    assert reason.startswith(
+        "the photons do not support scale 2: with its detail beyond that of scale 1, the log-likelihood of"
+    )
+    assert caplog.messages == [reason]
+
+
+def test_weight_is_the_number_of_frames_that_saw_a_pixel() -> None:
+    source, motion = capture(fine_scene())
+    small = Canvas(*CANVAS.shape, CANVAS.transform)
+    merged = MergeRenderer(1).render(source, motion, source.info.span, small, 0.125, lambda _: None)
+    weight = rendered(source, motion).weight
+    assert weight[INNER].mean() == pytest.approx(merged.weight[INNER].mean(), rel=0.02)
+
+
+def test_panorama_keeps_fine_detail_of_pixels_with_a_small_area() -> None:
+    """With a fill factor of 1 / 16, pixels sample points: an estimate for whole pixels sharpens what is sharp."""
+    scene = fine_scene()
+    source, motion = capture(scene, area=2)
+    truth = true_panorama(scene)
+    right, wrong = (psnr_db(rendered(source, motion, fill_factor=each).flux, truth) for each in (1 / 16, 1.0))
+    assert right > wrong + 1
+
+
+def test_frames_outside_of_the_span_do_not_count() -> None:
+    source, motion = capture(fine_scene())
+    renderer = SuperResolutionRenderer(SuperResolutionConfig(), 1, lambda *_: None)
+    span = FrameSpan(0, FRAMES)
+    panorama = renderer.render(source, motion, span, CANVAS, 0.125, lambda _: None)
+    assert panorama.weight.max() == pytest.approx(FRAMES, rel=0.3)
+
+
+@pytest.mark.parametrize("width", [0.3, 1.0, 2.0, 3.3])
+def test_pixel_area_is_the_convolution_of_pixel_cell_and_flux(width: float) -> None:
+    """Integrate over random places of the middle of a pixel in a cell, and of a photon in the pixel."""
+    weights = pixel_area(width).astype(np.float64)
+    radius = len(weights) // 2
+    middles, photons = np.random.default_rng(0).random((2, 400_000)) - 0.5
+    drawn = np.rint(middles + width * photons).astype(int)
+    shares = np.bincount(drawn + radius, minlength=len(weights)) / len(drawn)
+    np.testing.assert_allclose(weights, shares, atol=5e-3)
+
+
+def test_expected_equals_a_filter_and_is_its_own_adjoint_inside() -> None:
+    rng, kernel = np.random.default_rng(0), pixel_area(2.0)
+    image = rng.random((17, 23)).astype(np.float32)
+    found = np.empty_like(image)
+    expected(image, kernel, np.empty_like(image), found)
+    wanted = cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
+def test_add_observations_sorts_pixels_into_the_nearest_cells_and_leaves_masked_ones_out() -> None:
+    counts, usable = np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 3), bool)
+    usable[1, 2] = False
+    lit, seen = np.zeros((2, 4, 8), np.float32)
+    to_grid = np.array([[2.0, 0, 0.4], [0, 2.0, 0.7], [0, 0, 1]])
+    add_observations(counts, usable, 5.0, to_grid, 0, lit, seen)
+    wanted = np.zeros((4, 8))
+    wanted[1, [0, 2, 4]], wanted[3, [0, 2]] = [0, 1, 2], [3, 4]
+    np.testing.assert_array_equal(lit, wanted)
+    assert (seen > 0).sum() == 5
+    assert seen.sum() == 25
+
+
+def test_likelihood_rises_from_round_to_round_until_the_prior_is_weak() -> None:
+    """The photons of other frames are predicted better by each of the first rounds."""
+    truth = true_panorama(fine_scene()).astype(np.float32)
+    rng, kernel = np.random.default_rng(1), pixel_area(2.0)
+    mean = np.empty_like(truth)
+    expected(truth, kernel, np.empty_like(truth), mean)
+    seen = np.full_like(truth, 200)
+    fitted, tested = (
+        Observations(rng.binomial(200, -np.expm1(-mean)).astype(np.float32), seen, kernel, True) for _ in range(2)
+    )
+    likely = [float(tested.log_likelihood(flux).sum(dtype=float)) for flux in rounds_of(fitted, 6)]
+    assert likely[0] < likely[1] < likely[2]
+    assert likely[2] < float(tested.log_likelihood(truth).sum(dtype=float))
+
+
+def test_denoiser_keeps_edges_and_removes_noise() -> None:
+    clean = np.zeros((64, 64), np.float32)
+    clean[:, 32:] = 1
+    noisy = clean + 0.1 * np.random.default_rng(2).standard_normal(clean.shape).astype(np.float32)
+    rows = columns = places_of(64)
+    found = np.empty((len(rows), len(columns), GROUP, 2), np.int32)
+    find_similar(noisy, rows, columns, found)
+    total, weights = np.zeros_like(clean), np.zeros_like(clean)
+    filter_groups(noisy, np.full_like(clean, 0.1), rows, columns, found, total, weights)
+    assert np.sqrt(np.mean((total / weights - clean) ** 2)) < 0.03
+
+
+def test_sums_of_binary_frames_give_the_flux_of_a_sum() -> None:
+    class Sums(MemorySource):
+        """Each frame is the sum of four binary ones."""
+
+    scene = fine_scene()
+    binary, motion = capture(scene)
+    frames = binary.frames(binary.info.span).reshape(-1, 4, SIDE, SIDE).sum(axis=1)
+    source = Sums(frames)
+    source.response = BinarySumResponse(4)
+    summed = rendered(source, KnownMotion(lambda frame: motion.at([4 * frame])[0]))
+    single = rendered(binary, motion)
+    assert isinstance(binary.response, BinaryResponse)
+    np.testing.assert_allclose(np.median(summed.flux[INNER] / single.flux[INNER]), 4, rtol=0.02)
+
+
+def test_canvas_beside_the_frames_is_unseen() -> None:
+    source, motion = capture(fine_scene())
+    canvas = Canvas(30, 40, translation(4000, 0))
+    decisions: list = []
+    renderer = SuperResolutionRenderer(SuperResolutionConfig(), 1, lambda *given: decisions.append(given))
+    done: list[int] = []
+    panorama = renderer.render(source, motion, source.info.span, canvas, 0.125, done.append)
+    assert (panorama.weight == 0).all()
+    assert (sum(done), decisions) == (source.info.n_frames, [])
