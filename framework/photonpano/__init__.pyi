@@ -48,6 +48,7 @@ from .protocols import Interpolator as Interpolator
 from .protocols import KeepsHypotheses as KeepsHypotheses
 from .protocols import KnowsTruth as KnowsTruth
 from .protocols import LinearlyCorrectedSource as LinearlyCorrectedSource
+from .protocols import LitSource as LitSource
 from .protocols import Locator as Locator
 from .protocols import Merger as Merger
 from .protocols import PackedSource as PackedSource
@@ -74,6 +75,7 @@ from .values import Frames as Frames
 from .values import FrameSpan as FrameSpan
 from .values import Group as Group
 from .values import Homography as Homography
+from .values import Light as Light
 from .values import Located as Located
 from .values import NotLocated as NotLocated
 from .values import Panorama as Panorama

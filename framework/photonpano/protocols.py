@@ -18,6 +18,7 @@ from photonpano.values import (
     FrameSpan,
     Group,
     Homography,
+    Light,
     Located,
     NotLocated,
     Panorama,
@@ -131,6 +132,25 @@ class ColouredSource(Source, Protocol):
     def clear_mix(self) -> FloatArray:
         """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
         ...
+
+
+@runtime_checkable
+class LitSource(Source, Protocol):
+    """A source in changing light, which is known.
+
+    What is summed over frames counts each frame by its gain; what predicts a frame multiplies the flux by it. A source in
+    steady light does not have it.
+    """
+
+    @property
+    def light(self) -> Light:
+        """The gain of each frame."""
+        ...
+
+
+def light_of(source: Source) -> Light | None:
+    """Return the changing light of a capture; None if it is steady, or not known."""
+    return source.light if isinstance(source, LitSource) else None
 
 
 @runtime_checkable

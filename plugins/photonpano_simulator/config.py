@@ -234,6 +234,24 @@ class FrameObject(Config):
     frames: int | None = Field(None, ge=1, description="number of frames in which it is there; by default all that follow")
 
 
+class Lamp(Config):
+    """A lamp on the mains, whose light flickers as a sine."""
+
+    frequency_hz: Frequency = Field(100.0, description="frequency of the light in Hz: twice that of the mains")
+    depth: float = Field(
+        0.5, ge=0, le=1, description="amplitude of the flicker, relative to the mean light of the lamp; at 1 it goes out"
+    )
+    phase_deg: float = Field(0.0, ge=-360, le=360, description="phase of the light at the first frame, in degrees")
+    at: tuple[Place, Place] | None = Field(
+        None,
+        description="(x, y) of the place that it lights, as shares of the width and the height of the scene; by default it "
+        "lights all of the scene",
+    )
+    radius: float = Field(
+        0.3, gt=0, le=10, description="standard deviation of the Gaussian spot that it lights, as a share of the scene's height"
+    )
+
+
 class FrameRange(Config):
     """Successive frames, counted before any are dropped or repeated."""
 
@@ -262,6 +280,11 @@ class SimulationConfig(Config):
         ge=1e-3,
         le=1e3,
         description="light of the last frame divided by that of the first; between them it changes exponentially",
+    )
+    lamps: tuple[Lamp, ...] = Field(
+        (),
+        max_length=16,
+        description="lamps that flicker; the rest of the light is steady, and so is the mean light of each place",
     )
     n_frames: int = Field(2000, ge=1, le=10_000_000, description="number of frames that the camera takes")
     frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")

@@ -12,6 +12,7 @@ from photonpano.reading import Closing
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
 from photonpano_simulator.delivery import delivered
 from photonpano_simulator.intensity import IntensityCamera
+from photonpano_simulator.lamps import brightness, shares
 from photonpano_simulator.lens import distorts, pixel_grid, transmission, undistorted
 from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.paths import camera_path, scene_motion
@@ -45,6 +46,11 @@ class SimulatorSource(Closing):
         motion = scene_motion(self._homographies, config.frame_shape) if config.objects else np.zeros((config.n_frames, 2))
         self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
         self._light = config.drift ** np.linspace(0, 1, config.n_frames)
+        self._lamps = shares(config.lamps, (height, width))
+        self._lit_parts = [np.ascontiguousarray((self._scene.T * share.T).T) for share in self._lamps]
+        self._lamp_light = np.zeros((len(config.lamps), config.n_frames))
+        for place, lamp in enumerate(config.lamps):
+            self._lamp_light[place] = brightness(lamp, config.n_frames, config.frame_rate_hz)
         self._sensor: SpadSensor | IntensityCamera
         if isinstance(config.sensor, IntensitySensor):
             self._sensor = IntensityCamera(config.sensor, config.frame_shape)
@@ -90,8 +96,9 @@ class SimulatorSource(Closing):
             counts per frame period, and
             `hot_pixels` (H, W) bool. Captures that are disturbed have more: `distortion` (2,), k1 and k2 of the lens, and
             `undistorted_corners` (4, 2), where a lens without distortion images the corners of the frame; `gains` (H, W)
-            float32, vignetting, sensitivity and dirt; `light` (T,), relative to the first frame; `taken` (T,), the index of
-            each frame before drops and repeats.
+            float32, vignetting, sensitivity and dirt; `light` (T,), relative to the first frame; `lamps` (N, Hs, Ws) float32,
+            the share of each lamp in the light of each place, and `lamp_light` (N, T), 1 on average; `taken` (T,), the index
+            of each frame before drops and repeats.
         """
         truth: dict[str, NDArray[np.generic]] = {
             "homographies": self._homographies[self._taken],
@@ -110,19 +117,28 @@ class SimulatorSource(Closing):
             truth["gains"] = self._gains
         if (self._light != 1).any():
             truth["light"] = self._light[self._taken]
+        if len(self._lamps):
+            truth["lamps"], truth["lamp_light"] = self._lamps, self._lamp_light[:, self._taken]
         if not np.array_equal(self._taken, np.arange(len(self._homographies))):
             truth["taken"] = self._taken
         return truth
 
     def _frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
         taken = int(self._taken[index])
-        views = [self._view(homography) for homography in self._while_open(taken)]
+        views = [self._lit_view(taken, homography) for homography in self._while_open(taken)]
         flux = views[0] if len(views) == 1 else np.mean(views, axis=0)
         for each in self._objects:
             each.draw(flux, taken)
         if not self._is_uniform:
             flux *= self._gains * np.float32(self._light[taken])
         return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
+
+    def _lit_view(self, index: int, homography: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the flux of the scene in a frame, in the light of the lamps: (H, W)."""
+        flux = self._view(self._scene, homography)
+        for part, light in zip(self._lit_parts, self._lamp_light[:, index], strict=True):
+            flux += np.float32(light - 1) * self._view(part, homography)
+        return flux
 
     def _while_open(self, index: int) -> NDArray[np.float64]:
         """Return homographies of a frame while its shutter is open, (n, 3, 3): evenly spaced in time, about a pixel apart."""
@@ -137,19 +153,19 @@ class SimulatorSource(Closing):
         n = max(1, int(np.ceil(corner_displacements(there, np.eye(3), self.info.frame_shape).max())))
         return np.asarray(at + way * ((np.arange(n) + 0.5) / n - 0.5)[:, None, None])
 
-    def _view(self, homography: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the flux of the scene in a frame, (H, W)."""
+    def _view(self, scene: NDArray[np.float32], homography: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the flux of a scene in a frame, (H, W)."""
         height, width = self.info.frame_shape
         # The path lies inside the scene, up to rounding errors.
         border = cv2.BORDER_REPLICATE
         if self._points is None:
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            view = cv2.warpPerspective(self._scene, homography, (width, height), flags=flags, borderMode=border)
+            view = cv2.warpPerspective(scene, homography, (width, height), flags=flags, borderMode=border)
         else:
             x, y = np.moveaxis(apply(homography, self._points.reshape(-1, 2)).reshape(height, width, 2), -1, 0).astype(
                 np.float32
             )
-            view = cv2.remap(self._scene, x, y, cv2.INTER_LINEAR, borderMode=border)
+            view = cv2.remap(scene, x, y, cv2.INTER_LINEAR, borderMode=border)
         if self._filters is not None:
             view = (view * self._filters).sum(axis=-1)
         return view.astype(np.float32, copy=False)

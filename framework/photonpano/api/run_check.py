@@ -14,6 +14,7 @@ from photonpano.corrections import VIGNETTE_DECISION, divided_by
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.geometry import FrameTrajectory
+from photonpano.lighting import in_light_of
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.estimate import vignette_of
@@ -66,6 +67,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
         motion = _motion(run)
         if _divided_by_vignette(record) and (vignette := vignette_of(plan, source, motion.trajectory)):
             source = divided_by(source, vignette)
+        source = in_light_of(source, folder)
         context = Context(thread_count(plan.run.threads), progress or Quiet())
         rendering = plan.render.tolerance_px, int(plan.run.memory), context
         explained = refine(source, Look(source, motion, *rendering), (), *rendering)

@@ -11,6 +11,7 @@ from photonpano.context import Context, Progress, Quiet
 from photonpano.evaluation import Evaluation
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.geometry import Canvas
+from photonpano.lighting import in_light_of
 from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render
 from photonpano.pipeline.components import build_renderer, open_source
@@ -51,12 +52,13 @@ def evaluate(
     plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog)
     with open_source(plan) as source:
         require_same_frames(folder, record, source)
+        lit = in_light_of(source, folder)
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             context = Context(thread_count(plan.run.threads), progress or Quiet())
-            renderer = build_renderer(plan, source, [])
-            images = render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
-            return composed(images, source)
+            renderer = build_renderer(plan, lit, [])
+            images = render(lit, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
+            return composed(images, lit)
 
         return evaluate_folder(run_folder, truth, along_truth)
 

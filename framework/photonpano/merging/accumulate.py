@@ -15,9 +15,10 @@ import numpy as np
 from photonpano.geometry import translation
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
+from photonpano.merging.light import LightTerms, LitFrames
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
-from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource
-from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
+from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource, light_of
+from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
 """Chunks that are summed before they are added to the grid."""
@@ -33,11 +34,13 @@ class PhotonSum:
 
     Attributes:
         counts: (H, W) float32.
-        weight: (H, W) float32, in frames.
+        weight: (H, W) float32, in frames; in changing light, the sum of their gains: in frames of mean light.
+        lit: frames and gains by the class of their light; None in steady light.
     """
 
     counts: FluxImage
     weight: FluxImage
+    lit: LitFrames | None = None
 
     def estimate(self, response: Response) -> tuple[FluxImage, FluxImage]:
         """Return the maximum-likelihood flux of each pixel (paper, equation 3) and its weight.
@@ -46,6 +49,10 @@ class PhotonSum:
             Flux, (H, W) float32, NaN where the weight is below one frame; weight, (H, W) float32, 0 there.
         """
         unknown = self.weight < MIN_WEIGHT
+        if self.lit is not None:
+            flux, weight = self.lit.flux(self.counts, response), self.weight.copy()
+            flux[unknown], weight[unknown] = np.nan, 0
+            return flux, weight
         seen = np.asarray(np.maximum(self.weight, MIN_WEIGHT), dtype=np.float32)
         # Subtraction of dark counts can leave a negative sum by chance.
         mean = np.asarray(np.maximum(self.counts, 0) / seen, dtype=np.float32)
@@ -70,8 +77,8 @@ def accumulate(
         that their quotient is not biased at masks and borders.
 
     Args:
-        source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected, and
-            pixels of a `WeightedSource` are weighted.
+        source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected, pixels
+            of a `WeightedSource` are weighted, and frames of a `LitSource` by their gains.
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid.
         shape: (height, width) of the grid.
@@ -80,7 +87,9 @@ def accumulate(
             number of threads.
         counts_of: returns the uncorrected sum of the frames of a span, such as a `CountsCache`; `source.counts` by default.
     """
-    total = _Total.zeros(shape)
+    light = light_of(source)
+    terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
+    total = _Total.zeros(shape, 1 if terms is None else terms.number)
     # Parts are narrow, so that every thread has work wherever frames lie on the grid. Their number does not depend on that of
     # the threads, since OpenCV rounds a warp by where it starts.
     n_parts = max(1, shape[0] // _PART_ROWS) if pool else 1
@@ -97,13 +106,17 @@ def accumulate(
     adding: Iterable[None] = ()
     for first in range(0, len(visible), _BATCH):
         batch = visible[first : first + _BATCH]
-        summed = list(start(partial(_summed, counts_of or source.counts, corrected, masked), *zip(*batch, strict=True)))
+        summed = list(start(partial(_summed, counts_of or source.counts, corrected, masked, terms), *zip(*batch, strict=True)))
         deque(adding, maxlen=0)
         adding = start(partial(_Total.add, summed=summed), parts)
         for chunk, _ in batch:
             advance(len(chunk.span))
     deque(adding, maxlen=0)
-    return total.result()
+    counts, coverages = total.result()
+    if light is None or terms is None:
+        return PhotonSum(counts, coverages[0])
+    lit = terms.lit_frames(coverages, light, onto)
+    return PhotonSum(counts, lit.weight, lit)
 
 
 def weights_of(source: Source) -> FluxImage | None:
@@ -119,13 +132,14 @@ class _Summed:
 
     Attributes:
         footprint: where it lies on the grid.
-        n_frames: number of frames.
+        amounts: (P,) what each pixel adds to the coverages: the number of frames, and in changing light terms of their gains.
         counts: (h, w) float32 or uint32.
-        seen: (h, w) float32, the number of frames in which each pixel was seen; None if it is `n_frames` for all.
+        seen: (h, w) float32, the share of each pixel that was seen; None if it is 1 for all. In steady light, times the number
+            of frames.
     """
 
     footprint: Footprint
-    n_frames: int
+    amounts: FloatArray
     counts: FluxImage | Counts
     seen: FluxImage | None
 
@@ -134,22 +148,25 @@ def _summed(
     counts_of: Callable[[FrameSpan], Counts],
     corrected: Callable[[Counts, int], FluxImage] | None,
     masked: FluxImage | None,
+    terms: LightTerms | None,
     chunk: Chunk,
     footprint: Footprint,
 ) -> _Summed:
     n_frames, shrink = len(chunk.span), footprint.shrink
+    amounts = np.array([float(n_frames)]) if terms is None else terms.amounts(chunk.span)
+    of_frame = n_frames if terms is None else 1
     raw = counts_of(chunk.span)
     counts: FluxImage | Counts = np.ascontiguousarray(raw)
     if corrected is not None:
         counts = np.ascontiguousarray(corrected(raw, n_frames))
     if masked is not None:
-        lit, seen = counts.astype(np.float32) * masked, masked * np.float32(n_frames)
-        return _Summed(footprint, n_frames, average_squares(lit, shrink), average_squares(seen, shrink))
+        lit, seen = counts.astype(np.float32) * masked, masked * np.float32(of_frame)
+        return _Summed(footprint, amounts, average_squares(lit, shrink), average_squares(seen, shrink))
     if shrink == 1:
-        return _Summed(footprint, n_frames, counts if footprint.straight else counts.astype(np.float32), None)
+        return _Summed(footprint, amounts, counts if footprint.straight else counts.astype(np.float32), None)
     whole = not any(side % shrink for side in counts.shape)
-    everywhere = None if whole else average_squares(np.full(counts.shape, n_frames, np.float32), shrink)
-    return _Summed(footprint, n_frames, average_squares(counts, shrink), everywhere)
+    everywhere = None if whole else average_squares(np.full(counts.shape, of_frame, np.float32), shrink)
+    return _Summed(footprint, amounts, average_squares(counts, shrink), everywhere)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,25 +176,26 @@ class _Total:
     Attributes:
         first: index of the first row.
         counts: (H, W) float32.
-        weight: (H, W) float32, coverage from the borders of frames and from masked frames.
-        steps: (H, W + 1) float32, row-wise differences of the coverage inside of frames; `result` adds their cumulative sum to
-            the weight.
+        coverages: (P, H, W) float32, coverages from the borders of frames and from masked frames.
+        steps: (P, H, W + 1) float32, row-wise differences of the coverages inside of frames; `result` adds their cumulative
+            sums to the coverages.
     """
 
     first: int
     counts: FluxImage
-    weight: FluxImage
+    coverages: FluxImage
     steps: FluxImage
 
     @classmethod
-    def zeros(cls, shape: tuple[int, int]) -> _Total:
+    def zeros(cls, shape: tuple[int, int], number: int) -> _Total:
         height, width = shape
-        return cls(0, *(np.zeros((height, columns), np.float32) for columns in (width, width, width + 1)))
+        coverages, steps = (np.zeros((number, height, columns), np.float32) for columns in (width, width + 1))
+        return cls(0, np.zeros(shape, np.float32), coverages, steps)
 
     def rows(self, rows: range) -> _Total:
         """Return a view of some of the rows."""
         part = slice(rows.start, rows.stop)
-        return _Total(rows.start, self.counts[part], self.weight[part], self.steps[part])
+        return _Total(rows.start, self.counts[part], self.coverages[:, part], self.steps[:, part])
 
     def add(self, summed: Sequence[_Summed]) -> None:
         """Add sums of chunks, in order."""
@@ -186,9 +204,17 @@ class _Total:
                 continue
             to_image = each.footprint.to_image @ translation(0, self.first)
             if each.seen is None:
-                add_footprint(each.counts.shape, to_image, float(each.n_frames), self.steps, self.weight)
+                for amount, coverage, steps in zip(each.amounts, self.coverages, self.steps, strict=True):
+                    if amount:
+                        add_footprint(each.counts.shape, to_image, float(amount), steps, coverage)
+            elif len(each.amounts) == 1:
+                self._warp(each.seen, each.footprint, to_image, self.coverages[0])
             else:
-                self._warp(each.seen, each.footprint, to_image, self.weight)
+                seen = np.zeros_like(self.counts)
+                self._warp(each.seen, each.footprint, to_image, seen)
+                for amount, coverage in zip(each.amounts, self.coverages, strict=True):
+                    if amount:
+                        coverage += np.float32(amount) * seen
             self._warp(each.counts, each.footprint, to_image, self.counts)
 
     def _warp(self, image: FluxImage | Counts, footprint: Footprint, to_image: Homography, total: FluxImage) -> None:
@@ -203,9 +229,11 @@ class _Total:
             box = slice(rows.start, rows.stop), slice(footprint.columns.start, footprint.columns.stop)
             total[box] += cv2.warpPerspective(image, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
 
-    def result(self) -> PhotonSum:
-        add_running_sums(self.steps, self.weight)
-        return PhotonSum(self.counts, self.weight)
+    def result(self) -> tuple[FluxImage, FluxImage]:
+        """Return the counts, (H, W), and the coverages, (P, H, W)."""
+        for steps, coverage in zip(self.steps, self.coverages, strict=True):
+            add_running_sums(steps, coverage)
+        return self.counts, self.coverages
 
 
 def divided(length: int, parts: int) -> list[range]:

@@ -11,7 +11,9 @@ from photonpano.context import Context
 from photonpano.contributions import MergerContribution
 from photonpano.corrections import Vignette, divided_by, estimate_vignette
 from photonpano.errors import CanvasTooLargeError, LocationError
+from photonpano.lighting import decision_of, find_light, in_light, measure_light
 from photonpano.motion.frame_motion import motion_of_frames
+from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.components import build_levels
@@ -29,8 +31,8 @@ class Estimate:
     """The motion of a capture.
 
     Attributes:
-        source: the capture, divided by its vignette if it has one.
-        context: of what is done with this source: its checkpoints depend on the vignette.
+        source: the capture, divided by its vignette if it has one, and in its light if that changes.
+        context: of what is done with this source: its checkpoints depend on vignette and light.
         results: of all levels.
         timeline: where frames repeat, and where the image jumps.
         look: the motion, the panorama along it, and what that does not explain.
@@ -68,12 +70,51 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         source, context = divided_by(source, vignette), replace(context, checkpoints=context.checkpoints.within(vignette))
         if not later:
             results, later = [], levels
+    lit = _lit(plan, source, levels, known, reference, timeline, context)
+    if lit is not None:
+        source, context, first, decision = lit
+        decisions.append(decision)
+        known = first[0].trajectory
+        results, later = first, levels[1:]
     results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
     found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context))
     if cuts := find_cuts(source, found.look, context):
         found = _cut_at(cuts, plan, found)
     decisions += found.timeline.decisions
     return found
+
+
+def _lit(
+    plan: Plan,
+    source: Source,
+    levels: Sequence[Level],
+    known: Trajectory,
+    reference: int,
+    timeline: Timeline,
+    context: Context,
+) -> tuple[Source, Context, list[LevelResult], Decision] | None:
+    """Measure the light of a capture along a motion, and estimate the first level again in this light.
+
+    `light: steady` measures it, too, and warns if it changes. The first motion was estimated in light that seemed steady, so
+    that the light is measured once more along the second one.
+
+    Returns:
+        The capture in its light, its context, the first level in it, and the decision; None if the light is steady.
+    """
+    changing = plan.light.mode == "changing"
+    light = measure_light(source, known, context) if changing else find_light(source, known, context)
+    if light is None:
+        return None
+    if plan.light.mode == "steady":
+        logger.warning(f"light: steady, but {decision_of(light, source.info.frame_rate_hz).reason}; write light: auto")
+        return None
+    for final in (False, True):
+        in_this, within = in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
+        results = estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
+        known = results[0].trajectory
+        if not final:
+            light = measure_light(source, known, context)
+    return in_this, within, results, decision_of(light, source.info.frame_rate_hz)
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:

@@ -25,7 +25,7 @@ from photonpano.pipeline.components import build_refiners, build_renderer, open_
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
-from photonpano.protocols import Source
+from photonpano.protocols import Source, light_of
 from photonpano.record.run_json import peak_memory_bytes, record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
@@ -130,6 +130,8 @@ def run(
         renderer.require_seen(panorama.coverage_share)
         observers.rendered(panorama.canvas, panorama.seconds)
         folder.write_results(panorama, motion)
+        if (light := light_of(source)) is not None:
+            folder.write_light(light)
         seconds = time.perf_counter() - start
         record = folder.commit(
             record_of(plan, source.info, decisions, found.results, explained, verdict, panorama, seconds, depends_on["capture"])

@@ -26,12 +26,13 @@ from photonpano.folders import (
     staging_of,
 )
 from photonpano.geometry import Canvas
+from photonpano.lighting import write_light
 from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import FileContent, RunRecord
-from photonpano.values import FluxImage, Panorama
+from photonpano.values import FluxImage, Light, Panorama
 
 SHOWN_FILES = 3
 """Files that a message names."""
@@ -75,6 +76,11 @@ class RunFolder:
                 located=motion.located,
                 std_px=motion.std_px,
             )
+
+    def write_light(self, light: Light) -> None:
+        """Write light.npz."""
+        with _writing(self.directory):
+            write_light(self.staging, light)
 
     def write_report(self, page: str) -> None:
         """Write report.html."""

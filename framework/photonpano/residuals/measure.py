@@ -35,6 +35,8 @@ _BATCH = 64
 """Spans that a thread measures at a time."""
 _PIXEL_STRIDE = 4
 """One span in 4 is added to the sums of single pixels, which no other sum needs."""
+_DARK = 1e-6
+"""Least weight of a frame in the mean motion of a span."""
 _PROBES = 8
 """Instants at which the noise of a shift is predicted."""
 _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
@@ -63,6 +65,7 @@ class Residuals:
         cell_noise: (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block.
         frames_seen: frames that saw a place of the panorama, the median over its pixels.
         frame_shape: (height, width) of a frame.
+        light: (S,) mean gain of the light of each span, 1 in steady light.
     """
 
     spans: tuple[FrameSpan, ...]
@@ -79,6 +82,7 @@ class Residuals:
     cell_noise: FloatArray
     frames_seen: float
     frame_shape: tuple[int, int]
+    light: FloatArray
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
@@ -109,8 +113,15 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
     spans = spans_of(span, predictions)
     # The mean over the frames, which is not the motion at the centre where frames are repeated, or tremble.
     starts = [each.start - span.start for each in spans]
-    of_frames = predictions.first.trajectory.at(np.arange(span.start, span.stop))
-    homographies = np.add.reduceat(of_frames, starts) / np.array([len(each) for each in spans])[:, None, None]
+    trajectory, changing = predictions.first.trajectory, predictions.first.light
+    of_frames = trajectory.at(np.arange(span.start, span.stop))
+    if changing is None:
+        light = np.ones(len(spans))
+        homographies = np.add.reduceat(of_frames, starts) / np.array([len(each) for each in spans])[:, None, None]
+    else:
+        gain = np.maximum(changing.gain[span.start : span.stop], _DARK)
+        light = np.array([changing.mean(each) for each in spans])
+        homographies = np.add.reduceat(gain[:, None, None] * of_frames, starts) / np.add.reduceat(gain, starts)[:, None, None]
     batches = [slice(first, first + _BATCH) for first in range(0, len(spans), _BATCH)]
     work = partial(_measured, predictions, spans, homographies)
     total: _Batch | None = None
@@ -139,6 +150,7 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             total.cell_noise / total.cell_count,
             predictions.frames_seen,
             predictions.first.frame_shape,
+            light,
         )
 
 
@@ -304,7 +316,7 @@ def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies
         sums[:] = 0
         for colour in colours:
             counts = colour.counted(raw, len(span))
-            colour.prediction.view(homography, images)
+            colour.prediction.view(homography, images, span)
             add_block_sums(counts, colour.noise_beside(images[0]), float(len(span)), images[0], images[1], sums)
             if index % _PIXEL_STRIDE == 0:
                 add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)

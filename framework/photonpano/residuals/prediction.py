@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.geometry import corners
-from photonpano.protocols import ColouredSource, Source, Trajectory
+from photonpano.merging.light import gain_image
+from photonpano.protocols import ColouredSource, Source, Trajectory, light_of
 from photonpano.residuals.block_sums import sample_view
-from photonpano.values import FluxImage, Homography, Panorama, Response
+from photonpano.values import FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
 _BLUR_PX = 0.7
 """Standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture."""
@@ -37,6 +38,8 @@ class Prediction:
         trajectory: the motion.
         frame_shape: (height, width) of a frame.
         frames_seen: frames that saw a place of the panorama, the median over its pixels.
+        response: of the camera.
+        light: the gain of each frame; None in steady light.
     """
 
     canvas: Homography
@@ -45,9 +48,18 @@ class Prediction:
     trajectory: Trajectory
     frame_shape: tuple[int, int]
     frames_seen: float
+    response: Response
+    light: Light | None = None
 
     @classmethod
-    def of(cls, panorama: Panorama, response: Response, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Prediction:
+    def of(
+        cls,
+        panorama: Panorama,
+        response: Response,
+        trajectory: Trajectory,
+        frame_shape: tuple[int, int],
+        light: Light | None = None,
+    ) -> Prediction:
         """Make the prediction of a panorama.
 
         Args:
@@ -55,6 +67,7 @@ class Prediction:
             response: the response of the camera.
             trajectory: frame pixels to reference pixels.
             frame_shape: (height, width) of a frame.
+            light: the gain of each frame; None in steady light.
         """
         seen = panorama.weight > 0
         share = _smoothed(seen.astype(np.float32))
@@ -69,15 +82,30 @@ class Prediction:
         precision = np.asarray(1 / _variance(flux, response), np.float32)
         precision[~inside] = 0
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
-        return cls(panorama.canvas, mean, precision, trajectory, frame_shape, frames_seen)
+        return cls(panorama.canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light)
 
-    def view(self, homography: Homography, into: NDArray[np.float32]) -> None:
+    def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:
         """Sample both images at the pixels of a frame.
 
         Args:
             homography: (3, 3), frame pixels to reference pixels.
             into: (2, H, W) float32, output: mean and precision, NaN where the panorama was not seen.
+            span: the frames whose light is predicted; None for the mean light.
         """
+        self._sample(homography, into)
+        if self.light is not None and span is not None:
+            self._relight(into, gain_image(self.light, span, homography, self.frame_shape))
+
+    def _relight(self, images: NDArray[np.float32], gain: FluxImage) -> None:
+        """Replace mean and precision by those at `gain` times the flux."""
+        mean, precision = images
+        known = np.isfinite(mean) & (precision > 0)
+        flux = self.response.flux(np.where(known, mean, np.float32(0)), _MANY_FRAMES)
+        lit = np.asarray(gain * flux, np.float32)
+        mean[:] = np.where(known, self.response.mean_count(lit), np.float32(np.nan))
+        precision *= _variance(flux, self.response) / _variance(lit, self.response)
+
+    def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
         to_canvas = np.ascontiguousarray(self.canvas @ homography)
         if self._straight(to_canvas):
             sample_view(self.mean, self.precision, to_canvas, into)
@@ -90,7 +118,8 @@ class Prediction:
     def predicted(self, instant: float) -> tuple[FluxImage, FluxImage]:
         """Predict the frame of an instant: see `PanoramaView`."""
         images = np.empty((2, *self.frame_shape), np.float32)
-        self.view(self.trajectory.at([instant])[0], images)
+        frame = max(0, round(float(instant)))
+        self.view(self.trajectory.at([instant])[0], images, FrameSpan(frame, frame + 1))
         mean, precision = images
         known = np.isfinite(mean) & (precision > 0)
         mean[~known] = np.nan
@@ -128,14 +157,14 @@ class Predictions:
             frame_shape: (height, width) of a frame.
         """
         if not isinstance(source, ColouredSource):
-            return cls(((source, Prediction.of(panorama, source.response, trajectory, frame_shape)),))
+            return cls(((source, Prediction.of(panorama, source.response, trajectory, frame_shape, light_of(source))),))
         images = zip(np.moveaxis(panorama.flux, -1, 0), np.moveaxis(panorama.weight, -1, 0), strict=True)
         singles = [
             Panorama(np.ascontiguousarray(flux), np.ascontiguousarray(weight), panorama.canvas) for flux, weight in images
         ]
         return cls(
             tuple(
-                (each, Prediction.of(single, each.response, trajectory, frame_shape))
+                (each, Prediction.of(single, each.response, trajectory, frame_shape, light_of(source)))
                 for each, single in zip(source.colours().values(), singles, strict=True)
             )
         )

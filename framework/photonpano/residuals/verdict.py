@@ -165,7 +165,8 @@ def _fast_motion(ratio: float) -> Reason | None:
 
 
 def _light(residuals: Residuals) -> Reason | None:
-    gains, stds = residuals.gains()
+    # Relative to the mean light: in the dark between two flickers, an error of the gain matters little.
+    gains, stds = (each * residuals.light for each in residuals.gains())
     change = float(np.sqrt(max(float(np.mean(gains**2 - stds**2)), 0)))
     if change <= MAX_GAIN:
         return None

@@ -23,7 +23,7 @@ from photonpano.specs.resolution import (
     UNTIL_CONVERGED,
     VERSION,
 )
-from photonpano.specs.settings import LevelSettings, OutputSettings, RenderSettings
+from photonpano.specs.settings import LevelSettings, LightSettings, OutputSettings, RenderSettings
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from photonpano.registry import Catalog, Entry, Kind
 
 Schema: TypeAlias = dict[str, Any]
+MODES = ["auto", "steady", "changing"]
+"""Words that may stand for the section `light`."""
 SECTION = ["object", "null"]
 """A section may be left empty."""
 FALLBACK = "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}"
@@ -90,6 +92,7 @@ def json_schema(catalog: Catalog) -> Schema:
                 ],
             },
             **{name: schemas[model] for name, model in SETTINGS.items()},
+            "light": {"anyOf": [{"enum": MODES}, schemas[LightSettings]]},
             "render": rendering,
         },
         "$defs": definitions,

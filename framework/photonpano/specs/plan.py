@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from photonpano.contributions import Config, Contribution
     from photonpano.corrections import Correction
     from photonpano.registry import Observer, Origin
-    from photonpano.specs.settings import GraphSettings, OutputSettings, RenderSettings, RunSettings
+    from photonpano.specs.settings import GraphSettings, LightSettings, OutputSettings, RenderSettings, RunSettings
     from photonpano.specs.written import Place
     from photonpano.values import Decision
 
@@ -65,6 +65,7 @@ class Plan:
         refine: the refiners that correct the motion after the last level, in order.
         until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
         renderer: the component that renders the panorama.
+        light: whether the light of the scene changes.
         graph: which pairs are registered, and what happens when the graph is disconnected.
         render: the panorama.
         output: the run folder.
@@ -83,6 +84,7 @@ class Plan:
     refine: tuple[Choice, ...]
     renderer: Choice
     until_converged: bool
+    light: LightSettings
     graph: GraphSettings
     render: RenderSettings
     output: OutputSettings

@@ -12,7 +12,7 @@ from photonpano.specs.aliases import Alias
 from photonpano.specs.checks import STAGES, complaints
 from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
-from photonpano.specs.settings import GraphSettings, LevelSettings, OutputSettings, RenderSettings, RunSettings
+from photonpano.specs.settings import GraphSettings, LevelSettings, LightSettings, OutputSettings, RenderSettings, RunSettings
 from photonpano.specs.validation import validate
 from photonpano.specs.written import WrittenSpec, given
 from photonpano.text import listed
@@ -45,6 +45,7 @@ DEFAULT_REFINER = "short-spans"
 KIND_OF = {kind.section: kind for kind in KINDS.values()}
 """The kind of component that a section chooses."""
 SETTINGS: dict[str, type[BaseModel]] = {
+    "light": LightSettings,
     "graph": GraphSettings,
     "render": RenderSettings,
     "output": OutputSettings,
@@ -129,6 +130,7 @@ class _Resolver:
         written = self.levels(root.get("levels"))
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
         renderer = self.renderer(root.get("render"))
+        self.spell_out_light(root)
         settings: dict[str, Any] = {
             name: validate(model, _settings(name, root.get(name)), name, spec) for name, model in SETTINGS.items()
         }
@@ -161,6 +163,13 @@ class _Resolver:
             decisions=tuple(spec.decisions),
             corrects_itself=corrections is None,
         )
+
+    def spell_out_light(self, root: dict[str, Any]) -> None:
+        """Replace a word in the section `light` by the mapping that it stands for."""
+        if isinstance(root.get("light"), str):
+            root["light"] = {"mode": root["light"]}
+            if "light" in self.spec.places:
+                self.spec.places = {"light.mode": self.spec.places["light"]} | self.spec.places
 
     def sections_of(self, root: dict[str, Any], refiners: list[Any]) -> dict[str, list[str]]:
         """Return the sections in which each key may stand, for the components that the spec chooses."""

@@ -41,6 +41,16 @@ class GraphSettings(Config):
     )
 
 
+class LightSettings(Config):
+    """The light of the scene."""
+
+    mode: Literal["auto", "steady", "changing"] = Field(
+        "auto",
+        description="auto measures the light where the capture shows that it changes, and divides by it; steady never does, "
+        "and changing always",
+    )
+
+
 class RenderSettings(Config):
     """The panorama."""
 

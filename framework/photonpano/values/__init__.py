@@ -4,6 +4,7 @@ from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, F
 from photonpano.values.capture import Bayer, CaptureSummary, Decision, DecisionValue, StreamInfo
 from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
+from photonpano.values.light import Light
 from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated
 from photonpano.values.refinement import Refined, SpanResiduals
 
@@ -22,6 +23,7 @@ __all__ = [
     "Frames",
     "Group",
     "Homography",
+    "Light",
     "Located",
     "NotLocated",
     "Panorama",

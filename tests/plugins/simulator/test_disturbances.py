@@ -165,3 +165,22 @@ def test_light_drifts_exponentially(simulated: Simulated) -> None:
     assert first / expected == pytest.approx(8**-0.05, rel=0.05)
     assert last / expected == pytest.approx(8**-0.95, rel=0.15)
     assert mean == pytest.approx(0.2, rel=0.01)
+
+
+def test_lamp_flickers_by_its_depth_at_its_phase(simulated: Simulated) -> None:
+    lamp = {"frequency_hz": 100.0, "depth": 0.8, "phase_deg": 90.0}
+    source = simulated(**STILL, flux=0.3, frame_rate_hz=2000.0, lamps=[lamp])
+    light = source.truth()["lamp_light"][0]
+    np.testing.assert_allclose(light, 1 + 0.8 * np.cos(2 * np.pi * np.arange(2000) / 20 + np.pi / 2))
+    lit = source.frames(FrameSpan(0, 2000)).mean(axis=(1, 2)).reshape(100, 20).mean(axis=0)
+    steady = simulated(**STILL, flux=0.3).frames(FrameSpan(0, 2000)).mean()
+    np.testing.assert_allclose(-np.log1p(-lit), -np.log1p(-steady) * light[:20], atol=0.02)
+
+
+def test_lamp_lights_its_place_of_the_scene(simulated: Simulated) -> None:
+    spot = {"depth": 1.0, "at": [0.2, 0.5], "radius": 0.1}
+    truth = simulated(lamps=[spot, {**spot, "at": [0.8, 0.5]}]).truth()
+    assert truth["lamps"].shape == (2, 150, 200)
+    assert truth["lamps"][0, 75, 40] > 0.95
+    assert truth["lamps"][0, 75, 160] < 0.01
+    assert truth["lamps"].sum(axis=0).max() <= 1 + 1e-6

@@ -78,6 +78,7 @@ def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: flo
         cell_noise=np.full(cells, 0.01),
         frames_seen=4000.0,
         frame_shape=FRAME_SHAPE,
+        light=np.ones(len(spans)),
     )
 
 

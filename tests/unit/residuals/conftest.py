@@ -43,6 +43,7 @@ def noise() -> Residuals:
         cell_noise=np.full(cells, 0.01),
         frames_seen=1000.0,
         frame_shape=SHAPE,
+        light=np.ones(N_SPANS),
     )
 
 

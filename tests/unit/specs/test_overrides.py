@@ -26,6 +26,8 @@ SPEC = "version: 1\nsource: {use: simulator}\nlevels: [{}, {scale: 0.5}, null]\n
         ("refine=drift", ("refine",), [{"use": "drift", "with": {"knots": 4}}]),
         ("run=", ("run", "seed"), 0),
         ("levels.2.scale=0.5", ("levels", 2, "scale"), 0.5),
+        ("light=steady", ("light", "mode"), "steady"),
+        ("light={mode: changing}", ("light", "mode"), "changing"),
         ("run.memory=1 GiB", ("run", "memory"), 2**30),
     ],
 )

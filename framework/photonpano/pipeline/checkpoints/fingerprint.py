@@ -45,6 +45,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
             "common": {
                 "source": _component(plan.source),
                 "corrections": document.get("corrections"),
+                "light": document["light"],
                 "graph": document["graph"],
                 "run.seed": plan.run.seed,
                 "render.reference": document["render"]["reference"],

@@ -1,0 +1,95 @@
+"""Find out whether the light of a capture changes, and measure it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from photonpano.context import Context
+from photonpano.geometry import corner_displacements, inverse
+from photonpano.lighting.gains import Gains, seen_cells, solve_gains
+from photonpano.lighting.series import gain_of_frames
+from photonpano.protocols import Source, Trajectory
+from photonpano.values import Decision, FrameSpan, Light
+
+LIGHT_DECISION = "light"
+"""What a record names the decision to divide by the gain of the light."""
+LEAST_CHANGE = 0.03
+"""Root mean square of the changes of the light, between instants that see the same places, from which it is divided out."""
+_LEAST_SIGMAS = 3.0
+"""They also exceed their noise by this factor."""
+_PROBES, _PROBE_FRAMES = 128, 16
+"""Spans all over the capture, and frames of each, that are compared to find out."""
+_MOST_SPANS, _FEWEST_FRAMES = 640, 4
+"""Most spans, and fewest frames of each, with which the light is measured."""
+_SPAN_PX = 4.0
+"""The image moves by no more than this in a span."""
+
+
+def find_light(source: Source, trajectory: Trajectory, context: Context) -> Light | None:
+    """Measure the light of a capture; None if it is steady.
+
+    Args:
+        source: the capture.
+        trajectory: its motion, known to a few pixels.
+        context: threads.
+    """
+    n_frames = source.info.n_frames
+    longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(_speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
+    gains = _gains(source, trajectory, _spread(n_frames, longest), context)
+    return measure_light(source, trajectory, context) if changes(gains) else None
+
+
+def changes(gains: Gains) -> bool:
+    """Return whether the light changes by more than a steady one seems to."""
+    return gains.change > max(LEAST_CHANGE, _LEAST_SIGMAS * float(np.median(gains.std)))
+
+
+def measure_light(source: Source, trajectory: Trajectory, context: Context) -> Light:
+    """Measure the gain of each frame of a capture.
+
+    Args:
+        source: the capture.
+        trajectory: its motion, known to a few pixels.
+        context: threads.
+    """
+    n_frames = source.info.n_frames
+    length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
+    bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
+    gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
+    lengths = np.array([len(span) for span in gains.seen.spans], float)
+    gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
+    mean = float(gain.mean())
+    return Light.of_frames(gain / mean, frequency, std / mean)
+
+
+def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
+    """Return what was found, for the record: the depth of the changes, and the frequency of a flicker."""
+    low, high = (float(np.quantile(light.gain, each)) for each in (0.01, 0.99))
+    depth = (high - low) / (high + low)
+    where = f"the light of the scene changes between {low:.2f} and {high:.2f} of its mean"
+    if light.frequency:
+        period = f"with a period of {1 / light.frequency:.4g} frames"
+        where += f", {period}" if frame_rate_hz is None else f", at {light.frequency * frame_rate_hz:.2f} Hz"
+    return Decision(LIGHT_DECISION, round(depth, 3), where)
+
+
+def _gains(source: Source, trajectory: Trajectory, spans: list[FrameSpan], context: Context) -> Gains:
+    return solve_gains(seen_cells(source, trajectory, spans, context))
+
+
+def _spread(n_frames: int, length: int) -> list[FrameSpan]:
+    """Return spans all over the capture, at uneven distances, so that no flicker has their period."""
+    even = np.linspace(0, n_frames - length, min(_PROBES, n_frames // length))
+    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(even)) * max(n_frames / _PROBES - length, 0)
+    starts = np.clip(even + jitter, 0, n_frames - length).astype(int)
+    return [FrameSpan(start, start + length) for start in np.unique(starts).tolist()]
+
+
+def _speed_px(source: Source, trajectory: Trajectory) -> float:
+    """Return the usual speed of the image, in px per frame."""
+    instants = np.linspace(0, source.info.n_frames - 1, 65)
+    steps = inverse(trajectory.at(instants[:-1])) @ trajectory.at(instants[1:])
+    moved = np.median(corner_displacements(steps, np.eye(3), source.info.frame_shape).max(axis=-1))
+    return float(moved) / max(float(instants[1]), 1e-9)

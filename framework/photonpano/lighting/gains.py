@@ -1,0 +1,208 @@
+"""Compare what successive frames see of the same places: the gain of the light, apart from the brightness of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.context import Context
+from photonpano.geometry import canvas_of
+from photonpano.merging import Chunk, accumulate
+from photonpano.protocols import Source, Trajectory
+from photonpano.threads import in_order
+from photonpano.values import FloatArray, FrameSpan, Homography
+
+_CELLS = 24
+"""Squares of the scene along the shorter side of a frame."""
+_LARGEST_PX = 32
+"""Largest side of a square, px."""
+_BLUR = 0.75
+"""Standard deviation of the Gaussian that weights the pixels of a square, in sides: what it sees must not depend on the
+fraction of a pixel at which a frame lies."""
+_COVERED = 0.999
+"""Squares that the border of a frame cuts are left out."""
+_MOST_CELLS = 16_000
+"""Squares of the whole scene: they are larger where the motion is long."""
+_STRUCTURE = 0.1
+"""Relative error of a square beside photon noise: its structure is sampled at other fractions of a pixel in each frame."""
+_ROUNDS = 4
+"""The equations are solved this many times, with outliers down-weighted."""
+_OUTLIER = 3.0
+"""Standard deviations from which a square is down-weighted (Huber), as one that an object crosses."""
+_DARKEST = -7.0
+"""Least logarithm of a gain."""
+_WEAK = 1e-6
+"""Weight of the prior that the light is steady, relative to that of the photons: it decides where frames share no place."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenCells:
+    """Photons of squares of the scene in spans of frames: N observations of C squares in S spans.
+
+    Attributes:
+        spans: the spans.
+        cells: (N,) index of the square, below `n_cells`.
+        times: (N,) index of the span.
+        photons: (N,) photons, those that a saturated pixel missed included.
+        exposure: (N,) pixels times frames.
+        n_cells: C.
+        places: (C, 2) middles of the squares, px of the reference plane.
+    """
+
+    spans: tuple[FrameSpan, ...]
+    cells: NDArray[np.intp]
+    times: NDArray[np.intp]
+    photons: FloatArray
+    exposure: FloatArray
+    n_cells: int
+    places: FloatArray
+
+    @property
+    def instants(self) -> FloatArray:
+        """(S,) centres of the spans."""
+        return np.array([span.centre for span in self.spans])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gains:
+    """The light of spans of frames, up to a common factor.
+
+    Attributes:
+        seen: the observations.
+        logarithm: (S,) of the gain, 0 on average.
+        std: (S,) its standard deviation.
+        brightness: (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen.
+        change: root mean square of the change of the light between spans that see the same places, noise subtracted.
+    """
+
+    seen: SeenCells
+    logarithm: FloatArray
+    std: FloatArray
+    brightness: FloatArray
+    change: float
+
+    @property
+    def gain(self) -> FloatArray:
+        """(S,) gain of each span, 1 on average."""
+        gain = np.exp(self.logarithm)
+        return np.asarray(gain / gain.mean())
+
+
+def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan], context: Context) -> SeenCells:
+    """Sum the photons of squares of the scene in spans of frames, along a motion.
+
+    Args:
+        source: the capture.
+        trajectory: its motion, known to a few pixels.
+        spans: so short that the image hardly moves in them.
+        context: threads.
+    """
+    shape = source.info.frame_shape
+    motions = trajectory.at([span.centre for span in spans])
+    half = int(np.clip(min(shape) // _CELLS, 2, _LARGEST_PX)) // 2
+    canvas = canvas_of(motions, shape, 1 / half)
+    while canvas.height * canvas.width > 4 * _MOST_CELLS:
+        half *= 2
+        canvas = canvas_of(motions, shape, 1 / half)
+    n_rows, n_columns = canvas.height // 2, canvas.width // 2
+
+    def seen(place: tuple[FrameSpan, Homography]) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+        span, homography = place
+        summed = accumulate(source, [Chunk(span, homography)], canvas.transform, canvas.shape)
+        counts, weight = (
+            cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
+            for image in (np.maximum(summed.counts, 0), summed.weight)
+        )
+        index = np.flatnonzero(weight > _COVERED * len(span))
+        frames = np.asarray(weight.ravel()[index], np.float32)
+        exposure = 4 * half**2 * frames
+        flux = source.response.flux(np.asarray(counts.ravel()[index] / frames, np.float32), exposure)
+        return index, np.asarray(np.maximum(flux, 0) * exposure, np.float64), exposure.astype(np.float64)
+
+    parts = list(in_order(seen, list(zip(spans, motions, strict=True)), context.threads))
+    cells = np.concatenate([part[0] for part in parts])
+    times = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
+    y, x = np.divmod(np.arange(n_rows * n_columns), n_columns)
+    middles = np.stack([2 * x + 1, 2 * y + 1, np.ones(len(x))], axis=0)
+    u, v, w = np.linalg.inv(canvas.transform) @ middles
+    return SeenCells(
+        tuple(spans),
+        cells,
+        times,
+        np.concatenate([part[1] for part in parts]),
+        np.concatenate([part[2] for part in parts]),
+        n_rows * n_columns,
+        np.stack([u / w, v / w], axis=1),
+    )
+
+
+def solve_gains(seen: SeenCells) -> Gains:
+    """Solve for the gain of each span and the brightness of each square, from all that saw the same places.
+
+    A square c in a span t sends `exposure exp(s_c + l_t)` photons. Its weight is that of photon noise together with what the
+    structure of the square adds; both sets of unknowns are found by iterated least squares, the squares eliminated.
+    """
+    n_times = len(seen.spans)
+    brightness, light = _first_guess(seen)
+    robust = np.ones(len(seen.photons))
+    for _ in range(_ROUNDS):
+        expected = seen.exposure * np.exp(brightness[seen.cells] + light[seen.times])
+        step = (seen.photons - expected) / np.maximum(expected, 1e-12)
+        weight = robust / (1 / np.maximum(expected, 1e-12) + _STRUCTURE**2)
+        change, of_cells, covariance, shared = _step(seen, weight, np.clip(step, -2, 2))
+        light = np.clip(light + change, _DARKEST, -_DARKEST)
+        brightness = brightness + of_cells
+        light -= light.mean()
+        left = (step - change[seen.times] - of_cells[seen.cells]) * np.sqrt(weight / np.maximum(robust, 1e-9))
+        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        # Smoothed squares share photons: their residuals are small, and correlated.
+        noise = scale * np.sqrt(np.pi) * 2 * _BLUR
+        robust = 1 / np.maximum(1, np.abs(left) / (_OUTLIER * scale))
+    difference = light[:, None] - light
+    covariance *= noise**2
+    expected = np.diag(covariance)[:, None] + np.diag(covariance) - 2 * covariance
+    off = shared * (1 - np.eye(n_times))
+    squares = float((off * (difference**2 - expected)).sum() / max(off.sum(), 1e-12))
+    unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
+    return Gains(
+        seen,
+        light,
+        np.sqrt(np.diag(covariance)),
+        np.where(unseen, np.nan, brightness),
+        float(np.sqrt(max(squares, 0))),
+    )
+
+
+def _first_guess(seen: SeenCells) -> tuple[FloatArray, FloatArray]:
+    """Return the brightness of each square in steady light, and no change of the light."""
+    photons = np.bincount(seen.cells, seen.photons, seen.n_cells)
+    exposure = np.bincount(seen.cells, seen.exposure, seen.n_cells)
+    flux = (photons + 0.5) / np.maximum(exposure, 1)
+    return np.log(flux), np.zeros(len(seen.spans))
+
+
+def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Solve `step = s_c + l_t` for both.
+
+    Returns:
+        Changes of the light, (S,), and of the squares, (C,); the covariance of the light, (S, S); and how much two spans saw of
+        the same squares, (S, S), in weights.
+    """
+    n_times = len(seen.spans)
+    matrix = np.zeros((seen.n_cells, n_times))
+    matrix[seen.cells, seen.times] = weight
+    of_cell = np.maximum(matrix.sum(axis=1), 1e-12)
+    right_cells = np.bincount(seen.cells, weight * step, seen.n_cells)
+    right_times = np.bincount(seen.times, weight * step, n_times)
+    shared = matrix.T @ (matrix / of_cell[:, None])
+    normal = np.diag(matrix.sum(axis=0)) - shared
+    normal[np.diag_indices(n_times)] += _WEAK * max(float(weight.sum()) / n_times, 1e-12)
+    covariance = np.linalg.inv(normal)
+    light = covariance @ (right_times - matrix.T @ (right_cells / of_cell))
+    light -= light.mean()
+    centred = np.eye(n_times) - 1 / n_times
+    return light, (right_cells - matrix @ light) / of_cell, centred @ covariance @ centred, shared

@@ -1,0 +1,145 @@
+"""Sums of frames in changing light: how many frames of which gain each pixel of a grid was seen in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.geometry import inverse
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Response
+
+_ROUNDS = 8
+"""Steps that solve for the flux of bright pixels in frames of different gains. Each at least halves the error."""
+_ACCURACY = 1e-4
+"""The steps end when no flux changes by more than this share."""
+_SEEN = 1e-3
+"""Sums of less than this many frames are rounding errors."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LitFrames:
+    """Frames and gains of the pixels of a grid, by the class of their light.
+
+    Attributes:
+        frames: (C, H, W) float32, number of frames of each class in which a pixel was seen.
+        gains: (C, H, W) float32, sum of the gains of the pixel in these frames.
+    """
+
+    frames: FluxImage
+    gains: FluxImage
+
+    @property
+    def weight(self) -> FluxImage:
+        """Sum of the gains of each pixel: (H, W), frames of mean light."""
+        return np.asarray(self.gains.sum(axis=0), np.float32)
+
+    def flux(self, counts: FluxImage, response: Response) -> FluxImage:
+        """Return the flux of each pixel that explains its counts: `counts = sum_c frames_c mean_count(gain_c flux)`.
+
+        Frames of one gain, and linear responses, need one step. Saturated pixels get a flux that is finite, and too small.
+
+        Args:
+            counts: (H, W) summed counts.
+            response: the response of the camera.
+        """
+        frames = np.maximum(self.frames.sum(axis=0), np.float32(1))
+        total = np.maximum(self.weight, np.float32(_SEEN))
+        # Subtraction of dark counts can leave a negative sum by chance.
+        found = response.flux(np.asarray(np.maximum(counts, 0) / frames, np.float32), frames)
+        flux = np.asarray(found * frames / total, np.float32)
+        if len(self.frames) == 1:
+            return flux
+        gains = np.divide(self.gains, self.frames, out=np.zeros_like(self.gains), where=self.frames > _SEEN)
+        for _ in range(_ROUNDS):
+            mean = np.zeros_like(flux)
+            for each, gain in zip(self.frames, gains, strict=True):
+                mean += each / frames * response.mean_count(np.asarray(gain * flux, np.float32))
+            seen = response.flux(mean, frames)
+            better = np.where(np.abs(seen) > 1e-9, flux * found / np.where(np.abs(seen) > 1e-9, seen, 1), flux)
+            change = np.abs(better - flux) > _ACCURACY * np.abs(flux)
+            flux = np.asarray(better, np.float32)
+            if not change.any():
+                break
+        return flux
+
+    def weighted(self, by: FluxImage) -> LitFrames:
+        """Return these frames with a weight for each pixel, (H, W)."""
+        return LitFrames(self.frames * by, self.gains * by)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightTerms:
+    """What chunks of frames add to the coverages of a grid: for each class of light, frames and the terms of their gains.
+
+    Attributes:
+        light: of the capture.
+        classes: (T,) class of each frame.
+        present: the classes of the frames that are summed, in order.
+    """
+
+    light: Light
+    classes: NDArray[np.int64]
+    present: tuple[int, ...]
+
+    @classmethod
+    def of(cls, light: Light, spans: Sequence[FrameSpan]) -> LightTerms:
+        """Prepare to sum the frames of spans."""
+        classes = light.classes()
+        parts = [classes[span.start : span.stop] for span in spans]
+        return cls(light, classes, tuple(np.unique(np.concatenate(parts)).tolist()) if parts else (0,))
+
+    @property
+    def number(self) -> int:
+        """How many coverages there are."""
+        return len(self.present) * (2 + len(self.light.waves))
+
+    def amounts(self, span: FrameSpan) -> FloatArray:
+        """Return what the frames of a span add to each coverage: (number,)."""
+        terms = self.light.terms(span)
+        values = np.concatenate([np.ones_like(terms[:1]), terms])
+        of_class = self.classes[span.start : span.stop] == np.array(self.present)[:, None]
+        return np.asarray((of_class.astype(float) @ values.T).ravel())
+
+    def lit_frames(self, coverages: FluxImage, light: Light, onto: Homography) -> LitFrames:
+        """Return the frames and gains of each pixel.
+
+        Args:
+            coverages: (number, H, W).
+            light: of the capture.
+            onto: (3, 3), pixels of the reference plane to pixels of the grid.
+        """
+        shape = coverages.shape[1:]
+        by_class = coverages.reshape(len(self.present), -1, *shape)
+        gains = by_class[:, 1].copy()
+        for index, image in enumerate(amplitudes(light, inverse(onto), (shape[0], shape[1]))):
+            gains += image * by_class[:, 2 + index]
+        return LitFrames(np.ascontiguousarray(by_class[:, 0]), np.maximum(gains, 0))
+
+
+def amplitudes(light: Light, to_plane: Homography, shape: tuple[int, int]) -> list[FluxImage]:
+    """Return the amplitudes of the lamps at the pixels of a grid: (H, W) for each of the maps.
+
+    Args:
+        light: of the capture.
+        to_plane: (3, 3), pixels of the grid to pixels of the reference plane.
+        shape: (H, W).
+    """
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = (shape[1], shape[0])
+    return [
+        np.asarray(cv2.warpPerspective(each, light.to_map @ to_plane, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
+        for each in light.maps
+    ]
+
+
+def gain_image(light: Light, span: FrameSpan, to_plane: Homography, shape: tuple[int, int]) -> FluxImage:
+    """Return the mean gain of the pixels of a frame over a span: (H, W); see `amplitudes`."""
+    gain, *waves = light.terms(span).mean(axis=1)
+    image = np.full(shape, gain, np.float32)
+    for wave, amplitude in zip(waves, amplitudes(light, to_plane, shape), strict=True):
+        image += np.float32(wave) * amplitude
+    return np.maximum(image, np.float32(0))

@@ -1,0 +1,54 @@
+"""Changing light is found along the motion, and steady light is left alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photonpano.context import Context
+from photonpano.geometry import translation
+from photonpano.lighting import decision_of, find_light
+from photonpano.lighting.series import flicker_frequency
+from photonpano.testing import KnownMotion, MemorySource, Scene
+
+SHAPE, N = (48, 64), 1024
+MOTION = KnownMotion(lambda frame: translation(0.06 * float(frame), 0.01 * float(frame)))
+STEADY = np.ones(N)
+DRIFT = 0.5 ** np.linspace(0, 1, N)
+FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
+
+
+def panned(light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int = 0) -> MemorySource:
+    """A pan over a scene that gets brighter along the way."""
+    scene, rng = Scene(seed, flux), np.random.default_rng(seed)
+    frames = np.empty((N, *SHAPE), np.uint8)
+    for first in range(0, N, 8):
+        at = MOTION.at([first + 3.5])[0]
+        view = scene.view(at, SHAPE) * (1 + (at[0, 2] + np.arange(SHAPE[1])) / 60)
+        frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view * light[first : first + 8, None, None])
+    return MemorySource(frames)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_pan_over_bright_scene_is_no_change_of_light(seed: int) -> None:
+    assert find_light(panned(STEADY, seed=seed), MOTION, Context(1)) is None
+
+
+@pytest.mark.parametrize(("light", "period"), [(DRIFT, None), (FLICKER, 90.5)], ids=["drift", "flicker"])
+def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None) -> None:
+    found = find_light(panned(light), MOTION, Context(1))
+    assert found is not None
+    error = found.gain - light / light.mean()
+    assert float(np.sqrt(np.mean(error**2))) < 0.02
+    assert found.gain.mean() == pytest.approx(1)
+    assert found.frequency == (0 if period is None else pytest.approx(1 / period, rel=2e-3))
+    decision = decision_of(found, 9050.0)
+    assert decision.what == "light"
+    if period is not None:
+        assert decision.value == pytest.approx(0.5, abs=0.03)
+        assert "Hz" in decision.reason
+
+
+def test_frequency_of_noise_is_none() -> None:
+    noise = np.random.default_rng(0).normal(1, 0.05, 400)
+    assert flicker_frequency(np.arange(400.0), noise) == 0

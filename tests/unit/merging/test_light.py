@@ -1,0 +1,73 @@
+"""Sums of frames in changing light are divided by the sum of their gains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Light
+from photonpano.geometry import translation
+from photonpano.lighting import in_light
+from photonpano.merging import Chunk, accumulate
+from photonpano.merging.light import LitFrames, gain_image
+from photonpano.photometry import BinaryResponse, IntensityResponse
+from photonpano.testing import MemorySource
+
+SHAPE, N = (24, 32), 400
+FLICKER = 1 + np.cos(2 * np.pi * np.arange(N) / 100)
+
+
+def in_flicker(flux: float, gain: np.ndarray, valid: np.ndarray | None = None) -> MemorySource:
+    """Frames of an even scene, lit with the probability 1 - exp(-gain flux)."""
+    chance = -np.expm1(-gain * flux)[:, None, None]
+    return MemorySource(np.random.default_rng(1).random((len(gain), *SHAPE)) < chance, valid)
+
+
+@pytest.mark.parametrize("flux", [0.05, 0.5, 2.0])
+def test_flux_in_deep_flicker_is_unbiased_up_to_bright_pixels(flux: float) -> None:
+    source = in_light(in_flicker(flux, FLICKER), Light.of_frames(FLICKER))
+    photons = accumulate(source, [Chunk(FrameSpan(0, N), np.eye(3))], np.eye(3), SHAPE)
+    estimate, weight = photons.estimate(source.response)
+    noise = np.sqrt(np.expm1(flux) / (N * estimate.size)) * 3
+    assert float(estimate.mean()) == pytest.approx(flux, abs=4 * noise + 0.005 * flux)
+    np.testing.assert_allclose(weight, FLICKER.sum(), rtol=1e-4)
+
+
+def test_frames_of_one_gain_have_the_exact_flux() -> None:
+    frames, gains = np.full((1, 2, 2), 100, np.float32), np.full((1, 2, 2), 50, np.float32)
+    flux = LitFrames(frames, gains).flux(np.full((2, 2), 30, np.float32), BinaryResponse())
+    np.testing.assert_allclose(flux, -np.log1p(-0.3) / 0.5, rtol=1e-6)
+
+
+def test_flux_of_linear_response_needs_only_the_sum_of_gains() -> None:
+    frames, gains = np.float32([[[60]], [[40]]]), np.float32([[[30]], [[80]]])
+    response = IntensityResponse(photons_per_level=2.0, black_level=0.0, saturation_level=255, read_noise=0.0)
+    flux = LitFrames(frames, gains).flux(np.float32([[550]]), response)
+    np.testing.assert_allclose(flux, 2 * 550 / 110, rtol=1e-5)
+
+
+def test_pixel_lit_in_every_frame_has_finite_flux() -> None:
+    frames, gains = np.float32([[[60]], [[40]]]), np.float32([[[0]], [[80]]])
+    assert np.isfinite(LitFrames(frames, gains).flux(np.float32([[100]]), BinaryResponse())).all()
+
+
+def test_gains_are_counted_where_frames_lie_with_and_without_a_mask() -> None:
+    valid = np.ones(SHAPE, np.bool_)
+    valid[5, 7] = False
+    for mask in (None, valid):
+        source = in_light(in_flicker(0.5, FLICKER, mask), Light.of_frames(FLICKER))
+        chunks = [Chunk(FrameSpan(0, 50), np.eye(3)), Chunk(FrameSpan(50, 100), translation(4, 0))]
+        weight = accumulate(source, chunks, np.eye(3), SHAPE).weight
+        np.testing.assert_allclose(weight[10, 10], FLICKER[:100].sum(), rtol=1e-5)
+        np.testing.assert_allclose(weight[10, 2], FLICKER[:50].sum(), rtol=1e-5)
+        if mask is not None:
+            np.testing.assert_allclose(weight[5, 7], FLICKER[50:100].sum(), rtol=1e-5)
+
+
+def test_gain_of_lamps_follows_the_place_of_the_frame() -> None:
+    maps = np.zeros((2, 1, 40), np.float32)
+    maps[0] = np.linspace(0, 0.39, 40)
+    waves = np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
+    light = Light(np.ones(8), waves, maps, np.eye(3), 1 / (2 * np.pi), np.zeros(8))
+    image = gain_image(light, FrameSpan(3, 4), translation(6, 0), (4, 10))
+    np.testing.assert_allclose(image[2], 1 + np.cos(3) * 0.01 * (np.arange(10) + 6), atol=1e-5)
