@@ -9,7 +9,7 @@ from photonpano.cli.options import Overrides, SpecPath
 from photonpano.cli.verdict import Strict
 
 if TYPE_CHECKING:
-    from photonpano.record.schema import RefinementRecord
+    from photonpano.record.schema import PanoramaRecord, RefinementRecord
 
 
 def run(
@@ -72,11 +72,25 @@ def run(
     for refinement in record["refinements"]:
         if refinement["rounds"]:
             typer.echo(f"refined   {_correction(refinement)}")
+    if line := _range(record.get("panorama")):
+        typer.echo(f"range     {line}")
     typer.echo(f"panorama  {directory / 'panorama.png'}")
     if "report.html" in record["files"]:
         typer.echo(f"report    {directory / 'report.html'}")
     if strict:
         require_trust(result.verdict, "all files of the run folder are written")
+
+
+def _range(panorama: "PanoramaRecord | None") -> str:
+    """Describe the dynamic range of a panorama; empty where nothing exceeds its noise."""
+    if panorama is None:
+        return ""
+    decibels, measurable = panorama.get("dynamic_range_db"), panorama.get("measurable_range_db")
+    if decibels is None or measurable is None:
+        return ""
+    share = panorama.get("saturated_share", 0.0)
+    saturated = f"; {100 * share:.2g} % of the pixels are saturated" if share else ""
+    return f"{decibels:.0f} dB, of {measurable:.0f} dB that the frames over a pixel can measure{saturated}"
 
 
 def _correction(refinement: "RefinementRecord") -> str:

@@ -1,5 +1,6 @@
 from .alignment import align_planes as align_planes
 from .canvas import Canvas as Canvas
+from .canvas import Extent as Extent
 from .canvas import canvas_of as canvas_of
 from .canvas import canvas_of_box as canvas_of_box
 from .frame_trajectory import FrameTrajectory as FrameTrajectory

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -11,6 +12,11 @@ from photonpano.values import FloatArray, Homography
 
 BLOCK_FRAMES = 8192
 """The corners of this many frames are mapped at a time, which bounds the memory."""
+
+Box: TypeAlias = tuple[int, int, int, int]
+"""x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1."""
+Extent: TypeAlias = Literal["panorama", "reference"] | Box
+"""What a canvas holds: every frame, the reference frame, or a box."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,11 +65,11 @@ def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: flo
     return Canvas(int(height), int(width), rescaling(scale) @ translation(-low[0], -low[1]))
 
 
-def canvas_of_box(box: tuple[int, int, int, int], scale: float) -> Canvas:
+def canvas_of_box(box: Box, scale: float) -> Canvas:
     """Return the canvas of a box of the reference plane.
 
     Args:
-        box: x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1.
+        box: in pixels of the reference frame.
         scale: pixels of the canvas per pixel of the reference frame.
     """
     x0, y0, x1, y1 = box

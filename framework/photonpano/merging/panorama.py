@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import Canvas, canvas_of, rescaling, translation
+from photonpano.errors import CanvasTooLargeError, InputError, LocationError
+from photonpano.geometry import Canvas, Extent, apply, canvas_of, canvas_of_box, inverse, rescaling, translation
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.merge_renderer import MergeRenderer
-from photonpano.photometry import WhiteBalance, balanced, tone_mapped
+from photonpano.photometry import Tone, WhiteBalance, balanced, picture_of
 from photonpano.protocols import Renderer, Source, Trajectory
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
@@ -49,6 +50,21 @@ class RenderOptions(Protocol):
         """What makes grey things grey in a picture in colour."""
         ...
 
+    @property
+    def extent(self) -> Extent:
+        """What the canvas holds."""
+        ...
+
+    @property
+    def tone(self) -> Tone:
+        """How flux becomes the picture."""
+        ...
+
+    @property
+    def exposure_stops(self) -> float:
+        """How much brighter the picture is, in powers of two."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tile:
@@ -72,8 +88,9 @@ def plan_canvas(
     scale: float,
     memory: int,
     bytes_per_pixel: int = BYTES_PER_PIXEL,
+    extent: Extent = "panorama",
 ) -> Canvas:
-    """Choose the canvas that holds every frame of a span, before anything of its size is allocated.
+    """Choose the canvas that holds every frame of a span, or a part of it, before anything of its size is allocated.
 
     Args:
         trajectory: the motion, frame pixels to reference pixels.
@@ -82,8 +99,10 @@ def plan_canvas(
         scale: pixels of the canvas per pixel of the reference frame.
         memory: bytes that rendering may take.
         bytes_per_pixel: bytes that rendering takes for a pixel of the canvas.
+        extent: the part, by default everything.
 
     Raises:
+        InputError: no frame shows the extent.
         CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
             a scale that fits.
         LocationError: frames reach the horizon of the reference plane.
@@ -96,6 +115,8 @@ def plan_canvas(
             f"the motion turns so far away from the reference frame that a flat panorama cannot show it ({error}); "
             "choose a render.reference in the middle of the motion, or fewer frames"
         ) from error
+    if extent != "panorama":
+        canvas = _part_of(canvas, (0, 0, *frame_shape[::-1]) if extent == "reference" else extent, scale)
     excess = canvas.height * canvas.width * bytes_per_pixel / memory
     if excess > MAX_EXCESS:
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
@@ -107,6 +128,24 @@ def plan_canvas(
             "or choose a render.reference nearer to the middle of the motion"
         )
     return canvas
+
+
+def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Canvas:
+    """Return the canvas of a box in pixels of the reference frame.
+
+    Raises:
+        InputError: it lies outside the whole canvas.
+    """
+    part = canvas_of_box(box, scale)
+    ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
+    (left, top), (right, bottom) = np.rint(apply(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
+    x0, y0, x1, y1 = box
+    if x1 <= left or x0 > right or y1 <= top or y0 > bottom:
+        raise InputError(
+            f"render.extent: [{x0}, {y0}, {x1}, {y1}] lies outside the panorama, which holds x from {left} to {right} and "
+            f"y from {top} to {bottom}, in pixels of the reference frame"
+        )
+    return part
 
 
 def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL) -> tuple[tuple[Tile, ...], int]:
@@ -243,6 +282,8 @@ class RenderedPanorama:
         white_flux: flux that is white in the picture, photons per pixel per frame.
         coverage_share: share of the pixels that were seen.
         seconds: time of rendering and writing.
+        noise: what the noise depends on, beside flux and weight; None if it was not asked for.
+        dynamic_range: the range of flux; None if it was not asked for.
     """
 
     canvas: Canvas
@@ -252,6 +293,8 @@ class RenderedPanorama:
     white_flux: float
     coverage_share: float
     seconds: float
+    noise: CanvasNoise | None = None
+    dynamic_range: DynamicRange | None = None
 
 
 def render_panorama(
@@ -273,7 +316,7 @@ def render_panorama(
         source: the capture.
         trajectory: the motion, frame pixels to reference pixels.
         span: the frames to render.
-        options: scale, tolerance and white quantile.
+        options: scale, extent, tolerance, and how the picture is made.
         memory: bytes that rendering may take.
         write_tile: called with each tile, its flux and weight, and the whole canvas.
         context: threads and progress.
@@ -281,14 +324,16 @@ def render_panorama(
         ready: what `render` would render of the same frames along the same motion; used if it lies on the same canvas.
 
     Raises:
+        InputError: no frame shows the extent.
         CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
         LocationError: frames reach the horizon of the reference plane.
     """
     start = time.perf_counter()
     bytes_per_pixel *= channels_of(source)
-    canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory, bytes_per_pixel)
+    canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory, bytes_per_pixel, options.extent)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
-    gathered = Thumbnail(canvas, reduction)
+    gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas)
+    dynamic_range = DynamicRange(noise)
     if ready is not None and len(tiles) == 1 and _lies_on(ready, canvas):
         rendered = iter([ready])
     else:
@@ -297,13 +342,17 @@ def render_panorama(
         part = composed(images, source)
         write_tile(tile, part, canvas)
         gathered.add(tile, part)
+        dynamic_range.add(part.flux, part.weight, tile.top, tile.left)
+    if options.extent != "panorama" and not gathered.coverage_share:
+        raise InputError("render.extent: no frame that was located shows it; choose a part of the panorama")
     thumbnail = gathered.panorama
     shown = balanced(thumbnail.flux, options.white_balance)
     lit = shown[np.isfinite(shown)]
     white_flux = (float(np.quantile(lit, options.white_quantile)) if lit.size else 0.0) or 1.0
-    picture = tone_mapped(shown, white_flux)
+    picture = picture_of(shown, white_flux, options.tone, options.exposure_stops)
     seconds = time.perf_counter() - start
-    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, gathered.coverage_share, seconds)
+    share, white_flux = gathered.coverage_share, white_flux / 2**options.exposure_stops
+    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, noise, dynamic_range)
 
 
 def _lies_on(panorama: Panorama, canvas: Canvas) -> bool:

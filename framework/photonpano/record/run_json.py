@@ -25,6 +25,7 @@ from photonpano.record.schema import (
     LevelRecord,
     MotionRecord,
     PairRecord,
+    PanoramaRecord,
     PluginRecord,
     ReasonRecord,
     RefinementRecord,
@@ -89,15 +90,7 @@ def record_of(
         "libraries": library_versions(plan),
         "decisions": [DecisionRecord(what=each.what, value=each.value, reason=each.reason) for each in decisions],
         "levels": [level_record(result) for result in levels],
-        "panorama": {
-            "height": panorama.canvas.height,
-            "width": panorama.canvas.width,
-            "scale": plan.render.scale,
-            "picture_reduction": panorama.reduction,
-            "white_flux": panorama.white_flux,
-            "coverage_share": panorama.coverage_share,
-            "seconds": round(panorama.seconds, 3),
-        },
+        "panorama": panorama_record(plan, panorama),
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
         "verdict": verdict_record(verdict),
@@ -197,6 +190,28 @@ def level_record(result: LevelResult) -> LevelRecord:
         "residual_px": located.solution.residual_px,
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
+
+
+def panorama_record(plan: Plan, panorama: RenderedPanorama) -> PanoramaRecord:
+    """Describe the panorama."""
+    record: PanoramaRecord = {
+        "height": panorama.canvas.height,
+        "width": panorama.canvas.width,
+        "scale": plan.render.scale,
+        "picture_reduction": panorama.reduction,
+        "white_flux": panorama.white_flux,
+        "coverage_share": panorama.coverage_share,
+        "seconds": round(panorama.seconds, 3),
+    }
+    if (found := panorama.dynamic_range) is not None:
+        record["dynamic_range_db"] = _rounded(found.decibels)
+        record["measurable_range_db"] = _rounded(found.measurable_decibels)
+        record["saturated_share"] = found.saturated_share
+    return record
+
+
+def _rounded(decibels: float | None) -> float | None:
+    return None if decibels is None else round(decibels, 2)
 
 
 def motion_record(std_px: FloatArray) -> MotionRecord | None:

@@ -100,6 +100,9 @@ class PanoramaRecord(TypedDict):
     """The panorama: `coverage_share` is the share of pixels that were seen, `white_flux` the flux that is white in the PNG.
 
     `picture_reduction` is the factor by which the PNG is smaller than the panorama, 1 unless that was rendered in tiles.
+    `dynamic_range_db` is the ratio of the highest and the lowest flux that exceed their standard deviation, and
+    `measurable_range_db` what the mean number of frames over a pixel can measure, both None where nothing exceeds its noise;
+    `saturated_share` is the share of the seen pixels that were lit in every frame.
     """
 
     height: int
@@ -109,6 +112,9 @@ class PanoramaRecord(TypedDict):
     white_flux: float
     coverage_share: float
     seconds: float
+    dynamic_range_db: NotRequired[float | None]
+    measurable_range_db: NotRequired[float | None]
+    saturated_share: NotRequired[float]
 
 
 class RefinementRecord(TypedDict):

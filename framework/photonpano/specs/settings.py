@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import ByteSize, Field
+from pydantic import ByteSize, Field, field_validator
 
 from photonpano.contributions import Config, SpecPath
 
 _Factor = Annotated[float, Field(gt=0, le=1000)]
+Extent = Literal["panorama", "reference"] | tuple[int, int, int, int]
 
 
 class LevelSettings(Config):
@@ -58,6 +59,11 @@ class RenderSettings(Config):
     reference: Literal["first", "middle", "last"] | Annotated[int, Field(ge=0)] = Field(
         "middle", description="the frame in whose plane the panorama lies: first, middle, last, or a frame index"
     )
+    extent: Extent = Field(
+        "panorama",
+        description="what panorama.tiff holds: panorama for every frame, reference for the reference frame (a stabilised "
+        "image), or a box [x0, y0, x1, y1] in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1",
+    )
     tolerance_px: float = Field(
         0.125,
         gt=0,
@@ -71,6 +77,21 @@ class RenderSettings(Config):
         description="factors of red, green and blue in panorama.png, for a capture in colour: those that make the mean grey, "
         "or [red, green, blue]; panorama.tiff stays as it was measured",
     )
+    tone: Literal["srgb", "reinhard", "drago", "mantiuk", "local"] = Field(
+        "srgb",
+        description="how flux becomes panorama.png: srgb shows it as it is up to white_quantile; the others compress a large "
+        "range: reinhard, drago and mantiuk with OpenCV, and local by regions, which keeps the details of dark and bright ones",
+    )
+    exposure_stops: float = Field(
+        0.0, ge=-20, le=20, description="how much brighter panorama.png is, in powers of two; 1 is twice as bright"
+    )
+
+    @field_validator("extent", mode="after")
+    @classmethod
+    def _has_pixels(cls, extent: Extent) -> Extent:
+        if not isinstance(extent, str) and (extent[2] <= extent[0] or extent[3] <= extent[1]):
+            raise ValueError(f"expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1, got {list(extent)}")
+        return extent
 
 
 class OutputSettings(Config):

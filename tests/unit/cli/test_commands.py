@@ -65,8 +65,12 @@ def test_run_prints_only_verdict_paths_and_warnings_into_pipe(finished: Path) ->
     record = json.loads((finished / "run" / "run.json").read_text())
     refined = [line for line in (finished / "run.out").read_text().splitlines(keepends=True) if line.startswith("refined ")]
     assert len(refined) == sum(bool(each["rounds"]) for each in record["refinements"])
+    panorama = record["panorama"]
+    decibels, measurable = panorama["dynamic_range_db"], panorama["measurable_range_db"]
     assert (finished / "run.out").read_text() == (
         f"verdict   {record['verdict']['status']}\n{''.join(refined)}"
+        f"range     {decibels:.0f} dB, of {measurable:.0f} dB that the frames over a pixel can measure; "
+        f"{100 * panorama['saturated_share']:.2g} % of the pixels are saturated\n"
         f"panorama  {finished}/run/panorama.png\nreport    {finished}/run/report.html\n"
     )
     reasons = [f"doubtful: {Reason(**reason)}\n" for reason in record["verdict"]["reasons"]]
@@ -85,15 +89,30 @@ SENTENCE = (
 def run_with(folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Invoke `run` with a verdict that is given instead of found."""
 
-    def run_with(verdict: Verdict, *arguments: str) -> Any:
+    def run_with(verdict: Verdict, *arguments: str, **more: Any) -> Any:
         refined = {"use": "short-spans", "rounds": ["tremor at 223 Hz", "less"], "change_px": 0.664, "kept_out": None}
         still = {"use": "other", "rounds": [], "change_px": 0.0, "kept_out": None}
-        record = {"warnings": ["a warning"], "refinements": [refined, still], "decisions": [], "files": {"report.html": {}}}
-        result = RunResult(folder / "run", record, verdict)
+        record = {
+            "warnings": ["a warning"],
+            "refinements": [refined, still],
+            "decisions": [],
+            "files": {"report.html": {}},
+            **more,
+        }
+        result = RunResult(folder / "run", record | more, verdict)
         monkeypatch.setattr("photonpano.pipeline.run.run", lambda *_, **_options: result)
         return invoke("run", "capture.yaml", *arguments)
 
     return run_with
+
+
+@pytest.mark.parametrize(("share", "end"), [(0.0, ""), (0.012, "; 1.2 % of the pixels are saturated")])
+def test_run_prints_dynamic_range_and_saturated_pixels(
+    folder: Path, run_with: Callable[..., Any], share: float, end: str
+) -> None:
+    panorama = {"dynamic_range_db": 71.2, "measurable_range_db": 99.9, "saturated_share": share}
+    result = run_with(Verdict("trusted", (), 1.0), panorama=panorama)
+    assert f"range     71 dB, of 100 dB that the frames over a pixel can measure{end}\n" in result.stdout
 
 
 def test_run_prints_verdict_reasons_and_corrections(folder: Path, run_with: Callable[..., Any]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import CanvasTooLargeError, FrameSpan, LocationError, Panorama
+from photonpano import CanvasTooLargeError, FrameSpan, InputError, LocationError, Panorama
 from photonpano.context import Context, Quiet
 from photonpano.geometry import Canvas, apply, from_parameters, translation
 from photonpano.merging import MergeRenderer
@@ -58,6 +58,37 @@ def test_plan_canvas_refuses_turn_to_the_horizon(known_motion: type) -> None:
         "(homography 59 of 60 sends part of its frame behind the reference plane); "
         "choose a render.reference in the middle of the motion, or fewer frames"
     )
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_plan_canvas_of_reference_is_its_frame(pan: Callable, scale: float) -> None:
+    canvas = plan_canvas(pan(2), ALL, SHAPE, scale, GIB, extent="reference")
+    assert canvas.shape == (30 * scale, 40 * scale)
+    np.testing.assert_allclose(canvas.transform, plan_canvas(pan(0), ALL, SHAPE, scale, GIB).transform, atol=1e-12)
+
+
+def test_plan_canvas_of_box_is_part_of_panorama(pan: Callable) -> None:
+    canvas = plan_canvas(pan(2), ALL, SHAPE, 1.0, GIB, extent=(-5, 10, 55, 25))
+    assert canvas.shape == (15, 60)
+    np.testing.assert_array_equal(canvas.transform, translation(5, -10))
+
+
+@pytest.mark.parametrize("box", [(158, 0, 170, 30), (-9, 0, 0, 30), (0, 30, 40, 31), (0, -4, 40, 0)])
+def test_plan_canvas_refuses_box_outside_panorama(pan: Callable, box: tuple[int, int, int, int]) -> None:
+    with pytest.raises(InputError) as caught:
+        plan_canvas(pan(2), ALL, SHAPE, 2.0, GIB, extent=box)
+    assert str(caught.value) == (
+        f"render.extent: {list(box)} lies outside the panorama, which holds x from 0 to 157 and y from 0 to 29, "
+        "in pixels of the reference frame"
+    )
+
+
+def test_render_of_box_equals_part_of_panorama(panning: Any, pan: Callable) -> None:
+    whole, _ = rendered(panning, pan(1))
+    canvas = plan_canvas(pan(1), ALL, SHAPE, 1.0, GIB, extent=(20, 5, 50, 25))
+    part = render(panning, pan(1), ALL, canvas, 0.25, Context())
+    np.testing.assert_allclose(part.flux, whole.flux[5:25, 20:50], rtol=1e-4)
+    np.testing.assert_allclose(part.weight, whole.weight[5:25, 20:50], rtol=1e-5)
 
 
 def scene(width: int) -> np.ndarray:

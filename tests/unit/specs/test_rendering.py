@@ -34,6 +34,9 @@ def test_renderer_stands_beside_the_settings_and_is_read_back_from_the_record(ca
         ({"use": "sharp", "rounds": 3}, "render.rounds: unknown key; it belongs under `render.with`"),
         ({"with": {"rounds": 3}}, "render.with.rounds: unknown key; no keys are allowed here"),
         ({"scal": 3}, "render.scal: unknown key; did you mean 'scale'?"),
+        ({"extent": [0, 0, 0, 9]}, "render.extent: expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1, got [0, 0, 0, 9]"),
+        ({"extent": [0, 0, 9]}, "render.extent: expected panorama, reference or a list of 4 integers, got a list of 3"),
+        ({"tone": "drag"}, "render.tone: expected srgb, reinhard, drago, mantiuk or local, got 'drag'"),
         ("sharp", "render: expected a mapping, got 'sharp'"),
     ],
 )
