@@ -36,6 +36,8 @@ from photonpano.specs import parse_spec
 
 HANGS_S = 5.0
 """A file that takes longer is a failure; also one with a first look, which takes 2 s at most to find a loop."""
+STARTS_S = 1800.0
+"""A worker imports and compiles first, which takes long at a low priority."""
 MEMORY_BYTES = 8 * 1024**3
 MOST_READ = 2**26
 """Pixels of a damaged capture that are summed at most."""
@@ -378,7 +380,7 @@ def fuzz(name: str, seed: int, seconds: float) -> tuple[Counter[str], dict[str, 
     worker = Worker(name, seed, first)
     try:
         while time.monotonic() < end:
-            begun = worker.line(300)
+            begun = worker.line(STARTS_S)
             end = min(end, time.monotonic() + seconds)  # without the imports of the first file
             if not begun:
                 raise RuntimeError(f"{name}: the worker ended with {worker.end()}")

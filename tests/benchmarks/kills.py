@@ -29,9 +29,9 @@ from photonpano import parse_spec, run, simulate
 FILES = ("trajectory.npz", "panorama.tiff", "coverage.tiff")
 CAPTURE = {
     "scene": {"kind": "street", "width": 512, "height": 400},
-    "path": {"kind": "pan", "length_px": 40, "shake": {"rms_px": 1.5, "frequencies_hz": [600, 1500]}},
-    "n_frames": 300,
-    "frame_shape": [64, 96],
+    "path": {"kind": "pan", "length_px": 24, "shake": {"rms_px": 1, "frequencies_hz": [600, 1500]}},
+    "n_frames": 160,
+    "frame_shape": [48, 64],
 }
 
 
@@ -80,8 +80,9 @@ class Kills:
         spec: dict[str, Any] = {
             "version": 1,
             "source": {"use": "packed-npy", "with": {"path": str(self._folder / "cube.npy"), "frame_rate_hz": 96_800}},
+            "corrections": [],
+            "resample": {"use": "midpoint", "with": {"group_size": 20}},
             "levels": 2,
-            "render": {"scale": 1.5},
         }
         plan = parse_spec(spec, output=self._folder / "runs" / name)
         with (
@@ -98,7 +99,7 @@ class Kills:
 
     def while_writing(self, number: int) -> Trial:
         """Kill a run in the middle of writing a file, and resume it."""
-        file, part = int(self._rng.integers(1, 40)), float(self._rng.uniform())
+        file, part = int(self._rng.integers(1, 35)), float(self._rng.uniform())
 
         def die() -> None:
             with _dying_at(file, part):

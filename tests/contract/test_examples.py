@@ -62,6 +62,8 @@ SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
 NEEDS = {"colmap": "pycolmap", "high-speed-video": "av", "kornia": "kornia"}
 """Optional libraries of specs, which run only if the library is installed."""
+REPORTS = {"scan", "revisits", "high-speed-video"}
+"""Specs whose reports are drawn; those of others show no more."""
 
 
 STREET = {"kind": "street", "width": 1024, "height": 682}
@@ -120,7 +122,9 @@ def test_example_captures_simulate(name, examples, tmp_path):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_example_specs_run(name, examples, tmp_path, write_video):
+def test_example_specs_run(name, examples, tmp_path, write_video, request):
+    if name not in REPORTS:
+        request.getfixturevalue("without_report")
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
     if name == "high-speed-video":

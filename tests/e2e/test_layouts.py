@@ -12,7 +12,15 @@ from typer.testing import CliRunner
 
 from photonpano.cli.app import app
 
-SPEC = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\nresample: {with: {group_size: 48}}\nlevels: 1\n"
+pytestmark = pytest.mark.usefixtures("without_report")
+
+SPEC = """\
+version: 1
+source: {use: packed-npy, with: {path: cube.npy}}
+resample: {with: {group_size: 48}}
+levels: 1
+refine: []
+"""
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from typer.testing import CliRunner
 
 from photonpano.cli.app import app
 
+pytestmark = pytest.mark.usefixtures("without_report")
+
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "follow-runs.md"
 CLUMSY = """
 from photonpano import hookimpl
