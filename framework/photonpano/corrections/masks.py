@@ -15,8 +15,6 @@ from photonpano.reading import look_first, read_array, read_picture
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from photonpano.corrections.pixels import Decide, Pixels
     from photonpano.protocols import Source
     from photonpano.values import BoolArray
@@ -41,8 +39,8 @@ class Mask(Correction):
 
 def _read_mask(path: Path) -> BoolArray:
     expected = "a mask of bad pixels"
-    if _is_picture(path):
-        return np.asarray(_read_picture(path, expected).any(axis=-1))
+    if path.suffix.lower() == ".png":
+        return _read_picture(path, f"is not {expected}: it is no picture that can be read")
     mask = read_array(path, expected)
     if mask.dtype != np.bool_:
         raise InputError(
@@ -51,14 +49,9 @@ def _read_mask(path: Path) -> BoolArray:
     return mask
 
 
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() == ".png"
-
-
-def _read_picture(path: Path, expected: str) -> NDArray[np.uint8]:
-    """Read a picture: (H, W, 3) uint8, red first."""
+def _read_picture(path: Path, otherwise: str) -> BoolArray:
+    """Return which pixels of a picture of 8 or 16 bits are not black: (H, W)."""
     import cv2
 
     look_first(path, "cv2:imread")
-    picture = read_picture(path, f"is not {expected}: it is no picture that can be read", cv2.IMREAD_COLOR)
-    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+    return np.asarray(read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH).any(axis=-1))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.reading.arrays import read_array, read_picture
+from photonpano.reading.first_look import look_first
 from photonpano.values import Bayer
 
 COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "clear": (255, 255, 255)}
@@ -58,5 +59,6 @@ def _read_picture(path: Path) -> NDArray[np.uint8]:
     """Read a picture: (H, W, 3) uint8, red first."""
     import cv2
 
+    look_first(path, "cv2:imread")
     picture = read_picture(path, f"is not {_WHAT}: it is no picture that can be read", cv2.IMREAD_COLOR)
     return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)

@@ -38,7 +38,8 @@ def test_mask_from_a_picture_equals_mask_from_an_array(source: MemorySource, cor
     bad = np.random.default_rng(3).random(SHAPE) < 0.2
     np.save(tmp_path / "bad.npy", bad)
     cv2.imwrite(str(tmp_path / "bad.png"), bad * np.uint8(255))
-    for name in ("bad.npy", "bad.png"):
+    cv2.imwrite(str(tmp_path / "faint.png"), bad * np.uint16(1))
+    for name in ("bad.npy", "bad.png", "faint.png"):
         np.testing.assert_array_equal(corrected_source(source, corrections({"mask": {"file": name}})).valid, ~bad)
 
 
