@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import av
 import cv2
@@ -34,10 +34,12 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.merging.panorama import plan_canvas, render
-from photonpano.photometry import BinaryResponse, tone_mapped
+from photonpano.photometry import BinaryResponse, Tone, picture_of, tone_mapped
 from photonpano.report.residual_figures import spectrum_over_noise
 from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
+from photonpano_simulator.config import NightScene
+from photonpano_simulator.scenes import scene_flux
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -119,6 +121,9 @@ INTERPOLATORS = {
     "smoothing-spline": ("tab:blue", "-"),
 }
 """Interpolators, with the colour and style of their lines."""
+NIGHT_FLUX = 12.0
+"""Flux of the brightest lamp in the night scene, photons per pixel per frame."""
+NIGHT_FRAMES = 100_000
 SPACINGS = (125, 31)
 """Frames between knots at the first and at the third level of `street_spec`."""
 
@@ -151,6 +156,8 @@ def main() -> None:
         plan = parse_spec(tremor_spec(trembling), overrides=[f"refine={refiner}"], output=in_folder(folder, f"tremor {name}"))
         finish(plan, f"tremor {name}", trembling)
     save("tremor.png", tremor(folder, trembling))
+
+    save("night.png", night())
 
     video = filmed(parse_spec(HIGH_SPEED), folder / "high-speed.mp4")
     source = {"use": "video", "with": {"path": str(video.absolute()), "frame_rate_hz": 500}}
@@ -395,6 +402,20 @@ def motion(directory: Path) -> FrameTrajectory:
     """Return the estimated motion of a run."""
     with np.load(directory / "trajectory.npz") as trajectory:
         return FrameTrajectory(trajectory["homographies"])
+
+
+def night() -> Picture:
+    """Show a night scene of 120 dB, as 100,000 frames of a still camera measure it, with each tone."""
+    scene = scene_flux(NightScene(width=520, height=346), 1.0)
+    scene *= NIGHT_FLUX / scene.max()
+    lit = np.random.default_rng(0).binomial(NIGHT_FRAMES, -np.expm1(-scene.astype(float)))
+    weight = np.full(scene.shape, NIGHT_FRAMES, np.float32)
+    response = BinaryResponse()
+    flux = response.debiased(response.flux((lit / NIGHT_FRAMES).astype(np.float32), weight), weight)
+    white = float(np.quantile(flux, 0.995))
+    shown = [labelled(picture_of(flux, white, tone, 0.5 if tone == "local" else 0.0), tone) for tone in get_args(Tone)]
+    shown.append(np.full_like(shown[0], 255))
+    return stacked([beside(shown[first : first + 2]) for first in range(0, len(shown), 2)])
 
 
 def picture(flux: NDArray[np.float32], white: float) -> Picture:

@@ -17,6 +17,7 @@ from .api.verification import Verification as Verification
 from .api.verification import clean as clean
 from .api.verification import verify as verify
 from .contributions import Config as Config
+from .contributions import ExporterContribution as ExporterContribution
 from .contributions import InterpolatorContribution as InterpolatorContribution
 from .contributions import LocatorContribution as LocatorContribution
 from .contributions import MergerContribution as MergerContribution
@@ -44,6 +45,8 @@ from .pipeline.forecast import Forecast as Forecast
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run
 from .protocols import ColouredSource as ColouredSource
+from .protocols import Exporter as Exporter
+from .protocols import FinishedPanorama as FinishedPanorama
 from .protocols import Interpolator as Interpolator
 from .protocols import KeepsHypotheses as KeepsHypotheses
 from .protocols import KnowsTruth as KnowsTruth
@@ -79,6 +82,7 @@ from .values import Light as Light
 from .values import Located as Located
 from .values import NotLocated as NotLocated
 from .values import Panorama as Panorama
+from .values import PanoramaRows as PanoramaRows
 from .values import Refined as Refined
 from .values import Response as Response
 from .values import SpanResiduals as SpanResiduals

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
 
 from photonpano.errors import CaptureUnreadError
 from photonpano.paths import given_path, refusal
-from photonpano.protocols import Interpolator, Locator, Merger, Refiner, Renderer, Resampler, Source
+from photonpano.protocols import Exporter, Interpolator, Locator, Merger, Refiner, Renderer, Resampler, Source
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
@@ -119,6 +119,9 @@ def no_problems(*_: Any) -> Sequence[str]:
 
 _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
+_SUFFIX = re.compile(r"(\.[a-z0-9]+)+")
+_TAKEN_SUFFIXES = (".tiff", ".png")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Contribution:
@@ -199,7 +202,7 @@ class SourceContribution(Contribution):
 
 @dataclass(frozen=True, kw_only=True)
 class StageContribution(Contribution):
-    """Offers a component that is built for a capture: of a stage of the levels, a refiner, or a renderer.
+    """Offers a component that is built for a capture: of a stage of the levels, a refiner, a renderer, or an exporter.
 
     Attributes:
         check: finds problems of a config with a capture, from its description; reads no data, imports nothing heavy.
@@ -271,3 +274,23 @@ class RendererContribution(StageContribution):
         StageContribution.__post_init__(self)
         if type(self.bytes_per_pixel) is not int or self.bytes_per_pixel < 1:
             raise ValueError(f"{self.name}: bytes_per_pixel is a whole number of at least 1, got {self.bytes_per_pixel!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExporterContribution(StageContribution):
+    """Offers an exporter.
+
+    Attributes:
+        suffix: the ending of its file, in small letters, such as ".exr": the run folder gets `panorama.exr`.
+    """
+
+    kind: ClassVar[str] = "exporter"
+    build: Callable[[Any, StageContext], Exporter]
+    suffix: str
+
+    def __post_init__(self) -> None:
+        StageContribution.__post_init__(self)
+        if not _SUFFIX.fullmatch(self.suffix):
+            raise ValueError(f"{self.name}: suffix is a dot and small letters or digits, such as .exr, got {self.suffix!r}")
+        if self.suffix in _TAKEN_SUFFIXES:
+            raise ValueError(f"{self.name}: every run writes panorama{self.suffix} itself; choose another suffix")

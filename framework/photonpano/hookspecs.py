@@ -18,6 +18,7 @@ from typing import Any
 import pluggy
 
 from photonpano.contributions import (
+    ExporterContribution,
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
@@ -302,6 +303,45 @@ def photonpano_renderers() -> Iterable[RendererContribution]:  # type: ignore[em
                 summary="Adds each photon to the nearest pixel",
                 config=NearestConfig,
                 build=lambda config, context: Nearest(config.every),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_exporters() -> Iterable[ExporterContribution]:  # type: ignore[empty-body]
+    """Offer exporters: they write the panorama as a file of another format.
+
+    Example:
+        ```python
+        import numpy as np
+
+        from photonpano import Config, ExporterContribution, hookimpl
+
+
+        class PgmConfig(Config):
+            pass
+
+
+        class Pgm:
+            def export(self, panorama, path):
+                height, width = panorama.shape
+                with path.open("wb") as file:
+                    file.write(f"P5 {width} {height} 255 ".encode())
+                    for row in range(height):
+                        flux = panorama.rows(row, row + 1).flux.reshape(1, width, -1).mean(axis=-1)
+                        level = np.clip(np.nan_to_num(flux) / panorama.white_flux, 0, 1)
+                        file.write((255 * level + 0.5).astype(np.uint8).tobytes())
+
+
+        @hookimpl
+        def photonpano_exporters():
+            yield ExporterContribution(
+                name="pgm",
+                summary="Grey levels of 8 bits, proportional to the flux",
+                config=PgmConfig,
+                suffix=".pgm",
+                build=lambda config, context: Pgm(),
             )
         ```
     """

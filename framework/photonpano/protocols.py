@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -22,6 +23,7 @@ from photonpano.values import (
     Located,
     NotLocated,
     Panorama,
+    PanoramaRows,
     Refined,
     Response,
     SpanResiduals,
@@ -346,5 +348,48 @@ class Renderer(Protocol):
         Returns:
             Flux in photons per pixel of a frame per frame, whatever the scale of the canvas, and its weight, with
             `canvas.transform` as canvas. Flux is NaN exactly where the weight is 0.
+        """
+        ...
+
+
+class FinishedPanorama(Protocol):
+    """A panorama that is rendered and stored. It may exceed the memory, so it is read in rows."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        ...
+
+    @property
+    def in_colour(self) -> bool:
+        """Whether pixels have red, green and blue."""
+        ...
+
+    @property
+    def canvas(self) -> Homography:
+        """(3, 3), pixels of the reference plane to pixels of the panorama."""
+        ...
+
+    @property
+    def white_flux(self) -> float:
+        """Flux that is white in panorama.png, photons per pixel per frame."""
+        ...
+
+    def rows(self, start: int, stop: int) -> PanoramaRows:
+        """Return flux, weight, standard deviation and saturated pixels of the rows from `start` to `stop - 1`."""
+        ...
+
+
+class Exporter(Protocol):
+    """Writes the panorama as a file of another format."""
+
+    def export(self, panorama: FinishedPanorama, path: Path) -> None:
+        """Write one file, and nothing else.
+
+        The framework puts it into the run folder with the other results, and records its hash.
+
+        Args:
+            panorama: what to write.
+            path: the file; it does not exist yet.
         """
         ...

@@ -133,3 +133,15 @@ class SuperResolutionConfig(Config):
         description="share of the area of a pixel that is sensitive to light; 0.105 for SwissSPAD2 without "
         "microlenses, 1 with good ones",
     )
+
+
+class ExrConfig(Config):
+    """An OpenEXR file."""
+
+    compression: Literal["zip", "zips", "none"] = Field(
+        "zip", description="compression, without loss: zip of 16 rows, zips of single rows, or none"
+    )
+
+
+class RadianceConfig(Config):
+    """A Radiance picture."""

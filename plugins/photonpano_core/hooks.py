@@ -5,20 +5,24 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 from photonpano import (
+    ExporterContribution,
     InterpolatorContribution,
     MergerContribution,
     RefinerContribution,
     RendererContribution,
+    Requirement,
     ResamplerContribution,
     SourceContribution,
     hookimpl,
 )
 from photonpano_core.configs import (
+    ExrConfig,
     GroupedConfig,
     InterpolatorConfig,
     MergeConfig,
     MidpointConfig,
     PhotonMleConfig,
+    RadianceConfig,
     RobustMergeConfig,
     ShortSpansConfig,
     SlidingWindowConfig,
@@ -38,7 +42,7 @@ from photonpano_core.stratified import StratifiedResampler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from photonpano import Interpolator, Merger, Refiner, Renderer, Resampler, StageContext, StreamInfo
+    from photonpano import Exporter, Interpolator, Merger, Refiner, Renderer, Resampler, StageContext, StreamInfo
 
 Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
@@ -248,3 +252,35 @@ def _build_super_resolution(config: SuperResolutionConfig, context: StageContext
     from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
 
     return SuperResolutionRenderer(config, context.threads, context.decide)
+
+
+@hookimpl
+def photonpano_exporters() -> Iterator[ExporterContribution]:
+    """Offer files for pictures of a large range."""
+    yield ExporterContribution(
+        name="exr",
+        summary="OpenEXR: flux, weight, standard deviation and saturated pixels as channels of 32 bits",
+        config=ExrConfig,
+        suffix=".exr",
+        requires=(Requirement("OpenEXR", "photonpano[exr]"),),
+        build=_exr,
+    )
+    yield ExporterContribution(
+        name="hdr",
+        summary="Radiance: flux in 8 bits a colour with a common exponent",
+        config=RadianceConfig,
+        suffix=".hdr",
+        build=_radiance,
+    )
+
+
+def _exr(config: ExrConfig, _: StageContext) -> Exporter:
+    from photonpano_core.exr import ExrExporter
+
+    return ExrExporter(config)
+
+
+def _radiance(_: RadianceConfig, __: StageContext) -> Exporter:
+    from photonpano_core.radiance import RadianceExporter
+
+    return RadianceExporter()

@@ -21,6 +21,13 @@ EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
 SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}
 SMALL_STREET = SMALL | {"source.with.scene": "{kind: street, width: 1024, height: 682}"}
 GROUPS = {"resample.with.group_size": 50}
+SMALL_NIGHT = {
+    "source.with.n_frames": 600,
+    "source.with.frame_shape": "[128, 160]",
+    "source.with.scene": "{kind: night, width: 512, height: 341, range_db: 60}",
+    "source.with.flux": 0.5,
+    "resample.with.group_size": 150,
+}
 CAPTURES = {
     "capture": SMALL_STREET | GROUPS,
     "demo-capture": SMALL_STREET | GROUPS | {"source.with.path": "{kind: pan, length_px: 60}"},
@@ -52,6 +59,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}
     | {"source.with.flux": 0.5, "resample.with.group_size": 25, "graph.skips": "[1, 2]"},
+    "high-dynamic-range": SMALL_NIGHT,
     "high-speed-video": {"resample.with.group_size": 8},
     "photograph": SMALL
     | {"source.with.n_frames": 300, "source.with.scene.width": 640}

@@ -15,7 +15,7 @@ from photonpano import FrameSpan, Group, PluginError, hookspecs, registry, run
 from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.specs import parse_spec
-from photonpano.testing import RefinerConformance, RendererConformance, ResamplerConformance
+from photonpano.testing import ExporterConformance, RefinerConformance, RendererConformance, ResamplerConformance
 
 pytestmark = pytest.mark.usefixtures("without_report")
 
@@ -28,6 +28,7 @@ KINDS = {
     "photonpano_interpolators": ("interpolator", "nearest"),
     "photonpano_refiners": ("refiner", "jump"),
     "photonpano_renderers": ("renderer", "nearest-pixel"),
+    "photonpano_exporters": ("exporter", "pgm"),
 }
 
 
@@ -132,6 +133,13 @@ class TestNearestPixel(RendererConformance):
     """The example of a renderer keeps what renderers promise."""
 
     contribution = contributions_of(example_of("photonpano_renderers"))[0]
+    hook_module = "photonpano_core.hooks"
+
+
+class TestPgm(ExporterConformance):
+    """The example of an exporter keeps what exporters promise."""
+
+    contribution = contributions_of(example_of("photonpano_exporters"))[0]
     hook_module = "photonpano_core.hooks"
 
 

@@ -27,6 +27,7 @@ class KindName(StrEnum):
     INTERPOLATOR = "interpolator"
     REFINER = "refiner"
     RENDERER = "renderer"
+    EXPORTER = "exporter"
 
 
 _KIND_NAMES = ", ".join(KindName)

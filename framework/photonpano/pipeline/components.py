@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from photonpano.contributions import RendererContribution, SourceContext, StageContext, install_command
+from photonpano.contributions import ExporterContribution, RendererContribution, SourceContext, StageContext, install_command
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
@@ -26,6 +26,7 @@ from photonpano.threads import thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
 
 if TYPE_CHECKING:
+    from photonpano.pipeline.exports import AttributedExporter
     from photonpano.pipeline.renderers import AttributedRenderer
     from photonpano.residuals.refinement import NamedRefiner
 
@@ -152,6 +153,25 @@ def build_renderer(plan: Plan, source: Source, decisions: list[Decision]) -> Att
     )
     assert isinstance(contribution, RendererContribution)
     return AttributedRenderer(_built(choice, context), choice.label, contribution.bytes_per_pixel)
+
+
+def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
+    """Build the exporters of a plan, in order.
+
+    Args:
+        plan: which exporters.
+        source: the capture.
+        decisions: receives the decisions that they take.
+    """
+    from photonpano.pipeline.exports import AttributedExporter  # imports tifffile, which is not needed to check a spec
+
+    threads = thread_count(plan.run.threads)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_recorder(decisions))
+    exporters = []
+    for choice in plan.formats:
+        assert isinstance(choice.contribution, ExporterContribution)
+        exporters.append(AttributedExporter(_built(choice, context), choice.label, choice.contribution.suffix))
+    return tuple(exporters)
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:

@@ -21,8 +21,9 @@ from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
-from photonpano.pipeline.components import build_refiners, build_renderer, open_source
+from photonpano.pipeline.components import build_exporters, build_refiners, build_renderer, open_source
 from photonpano.pipeline.estimate import estimate
+from photonpano.pipeline.exports import export_all
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
 from photonpano.protocols import Source, light_of
@@ -114,7 +115,7 @@ def run(
         explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)
         verdict = judge(explained, found.results, decisions)
         motion = explained.motion
-        renderer = build_renderer(plan, source, decisions)
+        renderer, exporters = build_renderer(plan, source, decisions), build_exporters(plan, source, decisions)
         panorama = render_panorama(
             renderer,
             source,
@@ -130,6 +131,7 @@ def run(
         renderer.require_seen(panorama.coverage_share)
         observers.rendered(panorama.canvas, panorama.seconds)
         folder.write_results(panorama, motion)
+        export_all(exporters, folder.staging, panorama)
         if (light := light_of(source)) is not None:
             folder.write_light(light)
         seconds = time.perf_counter() - start

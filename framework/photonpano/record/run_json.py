@@ -149,6 +149,7 @@ def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
         yield "interpolate", level.interpolate
     yield from (("refine", choice) for choice in plan.refine)
     yield "render", plan.renderer
+    yield from (("output", choice) for choice in plan.formats)
 
 
 def level_record(result: LevelResult) -> LevelRecord:

@@ -157,7 +157,7 @@ class Catalog:
         """Look a component up, whether or not its libraries are installed: see `Entry.unavailable`.
 
         Args:
-            kind: "source", "resampler", "merger", "locator", "interpolator", "refiner" or "renderer".
+            kind: "source", "resampler", "merger", "locator", "interpolator", "refiner", "renderer" or "exporter".
             name: the name of the component in specs.
 
         Raises:

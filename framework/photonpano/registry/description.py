@@ -55,7 +55,15 @@ class ConfigRow:
 
 def snippet(contribution: Contribution) -> str:
     """Return the section of a spec that uses a component, with all defaults; a key that is required has a value `<...>`."""
-    lines = [f"{KINDS[contribution.kind].section}:", f"  use: {contribution.name}"]
+    outer, _, inner = KINDS[contribution.kind].section.partition(".")
+    if inner:
+        keys = {row.key: row for row in config_rows(contribution.config) if "." not in row.key and row.default != _COMPUTED}
+        written = ", ".join(
+            f"{key}: {flow(f'<{row.type}>') if row.default is None else row.default}" for key, row in keys.items()
+        )
+        chosen = f"{{use: {contribution.name}, with: {{{written}}}}}" if written else contribution.name
+        return f"{outer}:\n  {inner}: [{chosen}]\n"
+    lines = [f"{outer}:", f"  use: {contribution.name}"]
     for row in config_rows(contribution.config):
         if "." in row.key or row.default == _COMPUTED:
             continue

@@ -1,4 +1,4 @@
-"""The seven kinds of components, and what each is called in hooks and in specs."""
+"""The kinds of components, and what each is called in hooks and in specs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from photonpano.contributions import (
     Contribution,
+    ExporterContribution,
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
@@ -26,7 +27,7 @@ class Kind:
 
     Attributes:
         name: what a component of this kind is, such as `locator`.
-        section: where a spec chooses it, such as `locate`.
+        section: where a spec chooses it, such as `locate` or `output.formats`.
         hook: the hook that offers it, such as `photonpano_locators`.
         contribution: the record that the hook yields.
         methods: what the component does.
@@ -49,6 +50,7 @@ KINDS: Mapping[str, Kind] = {
         Kind("interpolator", "interpolate", "photonpano_interpolators", InterpolatorContribution, ("fit",)),
         Kind("refiner", "refine", "photonpano_refiners", RefinerContribution, ("refine",)),
         Kind("renderer", "render", "photonpano_renderers", RendererContribution, ("render",)),
+        Kind("exporter", "output.formats", "photonpano_exporters", ExporterContribution, ("export",)),
     )
 }
 """All kinds by name, in the order in which a run needs them."""

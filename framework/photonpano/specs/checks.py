@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from photonpano.specs.plan import Choice, Plan
     from photonpano.values import StreamInfo
 
-STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner", "renderer"))
+STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner", "renderer", "exporter"))
 """The sections of a spec that choose the components of a level, in the order of the loop."""
 MAX_COMPLAINTS = 100
 """Most problems of one component that are reported."""
@@ -34,6 +34,7 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         choices |= {f"levels.{index}.locate.fallback.{rank}": choice for rank, choice in enumerate(level.fallbacks)}
     choices |= {f"refine.{index}": choice for index, choice in enumerate(plan.refine)}
     choices["render"] = plan.renderer
+    choices |= {f"output.formats.{index}": choice for index, choice in enumerate(plan.formats)}
     sentences: dict[tuple[str, str], str] = {}
     for where, choice in choices.items():
         for sentence in complaints(choice, info):

@@ -40,6 +40,9 @@ FALLBACK = "the locators to which a lost pair is offered, in order: one or a lis
 REFINE = "the refiners that correct the motion after the last level, in order: one or a list, each a name or {use, with}"
 """The description of the refiners, but for the default."""
 
+FORMATS = "further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}"
+"""The description of the formats."""
+
 
 def json_schema(catalog: Catalog) -> Schema:
     """Return the JSON Schema (draft 2020-12) of the specs that choose from this catalog.
@@ -70,6 +73,9 @@ def json_schema(catalog: Catalog) -> Schema:
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
     level["properties"] |= {name: schema for name, schema in overrides.items() if name in STAGES}
     sections["source"]["required"] = ["use"]
+    formats = _one_or_list(_item(KINDS["exporter"], entries, schemas))
+    del sections[KINDS["exporter"].section]
+    definitions[OutputSettings.__name__]["properties"]["formats"] = {"description": FORMATS} | formats
     rendering = _rendering(sections.pop("render"), definitions[_definition(schemas[RenderSettings])])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -65,6 +65,7 @@ class Plan:
         refine: the refiners that correct the motion after the last level, in order.
         until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
         renderer: the component that renders the panorama.
+        formats: the exporters that write it as files of other formats.
         light: whether the light of the scene changes.
         graph: which pairs are registered, and what happens when the graph is disconnected.
         render: the panorama.
@@ -83,6 +84,7 @@ class Plan:
     levels: tuple[LevelPlan, ...]
     refine: tuple[Choice, ...]
     renderer: Choice
+    formats: tuple[Choice, ...]
     until_converged: bool
     light: LightSettings
     graph: GraphSettings

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from photonpano.contributions import ExporterContribution
 from photonpano.errors import PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
 from photonpano.registry.kinds import KINDS
@@ -130,6 +131,7 @@ class _Resolver:
         written = self.levels(root.get("levels"))
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
         renderer = self.renderer(root.get("render"))
+        formats = self.formats(_written_formats(root))
         self.spell_out_light(root)
         settings: dict[str, Any] = {
             name: validate(model, _settings(name, root.get(name)), name, spec) for name, model in SETTINGS.items()
@@ -148,12 +150,14 @@ class _Resolver:
             **{name: section.model_dump(mode="json") for name, section in settings.items()},
         }
         document["render"] = _component(renderer) | document["render"]
+        document["output"] |= {"formats": [_component(each) for each in formats]}
         return Plan(
             source,
             corrections or (),
             tuple(filter(None, levels)),
             tuple(filter(None, refine)),
             renderer,
+            formats,
             until_converged,
             **settings,
             document=document,
@@ -178,6 +182,11 @@ class _Resolver:
         for index, item in enumerate(refiners):
             where = f"refine.{index}.with" if isinstance(root.get("refine"), list) else "refine.with"
             keys[where] = self.keys_of(KIND_OF["refine"], _name("refine", {"use": item} if isinstance(item, str) else item))
+        keys |= {
+            f"output.formats.{index}.with": self.keys_of(KIND_OF["output.formats"], item.get("use"))
+            for index, item in enumerate(_as_list(_written_formats(root)))
+            if isinstance(item, dict)
+        }
         keys |= {name: model.model_fields for name, model in SETTINGS.items()} | {"locate": ("fallback",)}
         found = {name: [""] for name in SECTIONS}
         for section, own in keys.items():
@@ -219,6 +228,23 @@ class _Resolver:
             return None  # reported with the settings of the section
         chosen = {"use": DEFAULTS["render"]} | {key: value for key, value in (data or {}).items() if key in _CHOICE}
         return self.component(KIND_OF["render"], chosen, "render")
+
+    def formats(self, data: Any) -> tuple[Choice, ...]:
+        """Resolve the exporters; two of them cannot write the same file."""
+        where, found = "output.formats", dict[str, Choice]()
+        for index, item in enumerate(self.items(KIND_OF[where], data, where, None)):
+            choice = self.item(KIND_OF[where], item, f"{where}.{index}")
+            if choice is None:
+                continue
+            assert isinstance(choice.contribution, ExporterContribution)
+            name, suffix = choice.contribution.name, choice.contribution.suffix
+            if suffix in found:
+                other = found[suffix].contribution.name
+                self.spec.wrong_key(
+                    f"{where}.{index}", f"{name!r} writes panorama{suffix}, as {other!r} does; keep one of them"
+                )
+            found.setdefault(suffix, choice)
+        return tuple(found.values())
 
     def spelled_out(self, name: str, content: dict[str, Any], where: str, base: _Stage | None) -> dict[str, Any] | None:
         """Return a section with inherited keys, defaults and aliases filled in, and a list of fallbacks; None if that fails."""
@@ -288,7 +314,9 @@ class _Resolver:
             if where in spec.places:
                 spec.places = {f"{where}.use": spec.places[where]} | spec.places
         if not isinstance(item, dict):
-            spec.wrong(where, f"expected the name of a {kind.name}, or a mapping such as {{use: NAME}}, got {given(item)}")
+            article = "an" if kind.name[0] in "aeiou" else "a"
+            expected = f"the name of {article} {kind.name}, or a mapping such as {{use: NAME}}"
+            spec.wrong(where, f"expected {expected}, got {given(item)}")
             return None
         known = ["use", "with"]
         if kind is KIND_OF["locate"] and "fallback" in item:
@@ -378,10 +406,19 @@ class _Resolver:
 
 
 def _settings(name: str, data: Any) -> Any:
-    """Return the framework's own keys of a section; in `render`, those of the renderer stand beside them."""
-    if name != "render" or not isinstance(data, dict):
-        return data
-    return {key: value for key, value in data.items() if key not in _CHOICE}
+    """Return the framework's own keys of a section, without those that choose components."""
+    others = {"render": _CHOICE, "output": ("formats",)}.get(name, ())
+    return {key: value for key, value in data.items() if key not in others} if isinstance(data, dict) else data
+
+
+def _written_formats(root: dict[str, Any]) -> Any:
+    """Return what is written under `output.formats`; None if there is nothing."""
+    output = root.get("output")
+    return output.get("formats") if isinstance(output, dict) else None
+
+
+def _as_list(data: Any) -> list[Any]:
+    return data if isinstance(data, list) else [data]
 
 
 def _name(section: str, data: Any) -> object:

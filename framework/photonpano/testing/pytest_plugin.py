@@ -12,7 +12,7 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_KINDS = ("sources", "resamplers", "mergers", "locators", "interpolators", "refiners", "renderers")
+_KINDS = ("sources", "resamplers", "mergers", "locators", "interpolators", "refiners", "renderers", "exporters")
 for _name in ("conformance", "stages", *_KINDS):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 

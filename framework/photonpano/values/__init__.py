@@ -7,6 +7,7 @@ from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.light import Light
 from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated
 from photonpano.values.refinement import Refined, SpanResiduals
+from photonpano.values.rendered import PanoramaRows
 
 __all__ = [
     "Ambiguity",
@@ -27,6 +28,7 @@ __all__ = [
     "Located",
     "NotLocated",
     "Panorama",
+    "PanoramaRows",
     "Refined",
     "Response",
     "SpanResiduals",

@@ -9,6 +9,7 @@ import numpy as np
 
 from photonpano import discover
 from photonpano.testing import (
+    ExporterConformance,
     InterpolatorConformance,
     MergerConformance,
     RefinerConformance,
@@ -148,3 +149,11 @@ class TestMerge(RendererConformance):
 class TestSuperResolution(RendererConformance):
     contribution = CATALOG.find("renderer", "super-resolution").contribution
     scales = (2.0,)
+
+
+class TestExr(ExporterConformance):
+    contribution = CATALOG.find("exporter", "exr").contribution
+
+
+class TestHdr(ExporterConformance):
+    contribution = CATALOG.find("exporter", "hdr").contribution

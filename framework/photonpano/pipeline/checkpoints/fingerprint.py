@@ -36,6 +36,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
         "refine": [_component(choice) for choice in plan.refine],
         "render": {**document["render"], **_component(plan.renderer), "code": _code([plan.renderer])},
         "memory": int(plan.run.memory),
+        "formats": [{**_component(choice), "code": _code([choice])} for choice in plan.formats],
     }
     found: Fingerprint = _plain(
         {
