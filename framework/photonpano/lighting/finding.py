@@ -9,6 +9,7 @@ import numpy as np
 from photonpano.context import Context
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.lighting.gains import Gains, seen_cells, solve_gains
+from photonpano.lighting.lamps import Lamps, lamp_frequency, measure_lamps
 from photonpano.lighting.series import gain_of_frames
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import Decision, FrameSpan, Light
@@ -38,7 +39,7 @@ def find_light(source: Source, trajectory: Trajectory, context: Context) -> Ligh
     n_frames = source.info.n_frames
     longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(_speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
     gains = _gains(source, trajectory, _spread(n_frames, longest), context)
-    return measure_light(source, trajectory, context) if changes(gains) else None
+    return measure_light(source, trajectory, context) if changes(gains) or lamp_frequency(gains) else None
 
 
 def changes(gains: Gains) -> bool:
@@ -58,10 +59,22 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
     length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
     gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
+    frequency = lamp_frequency(gains)
+    if frequency:
+        return _light_of(measure_lamps(gains, frequency), gains, n_frames)
     lengths = np.array([len(span) for span in gains.seen.spans], float)
     gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
     mean = float(gain.mean())
     return Light.of_frames(gain / mean, frequency, std / mean)
+
+
+def _light_of(lamps: Lamps, gains: Gains, n_frames: int) -> Light:
+    """Return the light of each frame, with lamps over parts of the scene."""
+    frames = np.arange(n_frames)
+    slow, std = (np.interp(frames, gains.seen.instants, each) for each in (lamps.slow, gains.std))
+    turns = 2 * np.pi * lamps.frequency * frames
+    maps = np.stack([lamps.cosine, lamps.sine])
+    return Light(slow / slow.mean(), np.stack([np.cos(turns), np.sin(turns)]), maps, gains.seen.to_cells, lamps.frequency, std)
 
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
@@ -69,6 +82,9 @@ def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
     low, high = (float(np.quantile(light.gain, each)) for each in (0.01, 0.99))
     depth = (high - low) / (high + low)
     where = f"the light of the scene changes between {low:.2f} and {high:.2f} of its mean"
+    if light.has_lamps:
+        depth = float(np.quantile(np.hypot(*light.maps), 0.9))
+        where = f"lamps over parts of the scene, each at its own phase, flicker by up to {depth:.2f} of the mean light"
     if light.frequency:
         period = f"with a period of {1 / light.frequency:.4g} frames"
         where += f", {period}" if frame_rate_hz is None else f", at {light.frequency * frame_rate_hz:.2f} Hz"

@@ -27,7 +27,7 @@ _COVERED = 0.999
 """Squares that the border of a frame cuts are left out."""
 _MOST_CELLS = 16_000
 """Squares of the whole scene: they are larger where the motion is long."""
-_STRUCTURE = 0.1
+STRUCTURE = 0.1
 """Relative error of a square beside photon noise: its structure is sampled at other fractions of a pixel in each frame."""
 _ROUNDS = 4
 """The equations are solved this many times, with outliers down-weighted."""
@@ -49,8 +49,8 @@ class SeenCells:
         times: (N,) index of the span.
         photons: (N,) photons, those that a saturated pixel missed included.
         exposure: (N,) pixels times frames.
-        n_cells: C.
-        places: (C, 2) middles of the squares, px of the reference plane.
+        shape: (h, w) rows and columns of squares, C in all.
+        to_cells: (3, 3), pixels of the reference plane to squares: integers are their middles.
     """
 
     spans: tuple[FrameSpan, ...]
@@ -58,8 +58,13 @@ class SeenCells:
     times: NDArray[np.intp]
     photons: FloatArray
     exposure: FloatArray
-    n_cells: int
-    places: FloatArray
+    shape: tuple[int, int]
+    to_cells: Homography
+
+    @property
+    def n_cells(self) -> int:
+        """C."""
+        return self.shape[0] * self.shape[1]
 
     @property
     def instants(self) -> FloatArray:
@@ -126,17 +131,14 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     parts = list(in_order(seen, list(zip(spans, motions, strict=True)), context.threads))
     cells = np.concatenate([part[0] for part in parts])
     times = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    y, x = np.divmod(np.arange(n_rows * n_columns), n_columns)
-    middles = np.stack([2 * x + 1, 2 * y + 1, np.ones(len(x))], axis=0)
-    u, v, w = np.linalg.inv(canvas.transform) @ middles
     return SeenCells(
         tuple(spans),
         cells,
         times,
         np.concatenate([part[1] for part in parts]),
         np.concatenate([part[2] for part in parts]),
-        n_rows * n_columns,
-        np.stack([u / w, v / w], axis=1),
+        (n_rows, n_columns),
+        np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform,
     )
 
 
@@ -152,7 +154,7 @@ def solve_gains(seen: SeenCells) -> Gains:
     for _ in range(_ROUNDS):
         expected = seen.exposure * np.exp(brightness[seen.cells] + light[seen.times])
         step = (seen.photons - expected) / np.maximum(expected, 1e-12)
-        weight = robust / (1 / np.maximum(expected, 1e-12) + _STRUCTURE**2)
+        weight = robust / (1 / np.maximum(expected, 1e-12) + STRUCTURE**2)
         change, of_cells, covariance, shared = _step(seen, weight, np.clip(step, -2, 2))
         light = np.clip(light + change, _DARKEST, -_DARKEST)
         brightness = brightness + of_cells

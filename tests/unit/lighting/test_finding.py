@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from photonpano import FrameSpan
 from photonpano.context import Context
 from photonpano.geometry import translation
 from photonpano.lighting import decision_of, find_light
 from photonpano.lighting.series import flicker_frequency
+from photonpano.merging.light import gain_image
 from photonpano.testing import KnownMotion, MemorySource, Scene
 
 SHAPE, N = (48, 64), 1024
@@ -47,6 +49,31 @@ def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None)
     if period is not None:
         assert decision.value == pytest.approx(0.5, abs=0.03)
         assert "Hz" in decision.reason
+
+
+def test_lamps_of_two_phases_are_told_apart() -> None:
+    scene, rng, shape = Scene(3, (0.1, 0.6)), np.random.default_rng(3), (32, 96)
+    motion = KnownMotion(lambda frame: translation(0.03 * float(frame), 0))
+    turns = 2 * np.pi * np.arange(768) / 64
+    frames = np.empty((768, *shape), np.uint8)
+    for first in range(0, 768, 4):
+        at = motion.at([first + 1.5])[0]
+        x = at[0, 2] + np.arange(shape[1])
+        # The left part of the scene has another phase than the right one.
+        phase = np.where(x < 60, 0, 2 * np.pi / 3)
+        gain = 1 + 0.6 * np.cos(turns[first : first + 4, None] + phase)
+        frames[first : first + 4] = rng.random((4, *shape)) < -np.expm1(-scene.view(at, shape) * gain[:, None, :])
+    light = find_light(MemorySource(frames), motion, Context(1))
+    assert light is not None
+    assert light.has_lamps
+    assert light.frequency == pytest.approx(1 / 64, rel=5e-3)
+    assert "lamps over parts of the scene" in decision_of(light, None).reason
+    for frame in (200, 333, 500):
+        x = motion.at([frame])[0][0, 2] + np.arange(shape[1])
+        expected = 1 + 0.6 * np.cos(turns[frame] + np.where(x < 60, 0, 2 * np.pi / 3))
+        found = gain_image(light, FrameSpan(frame, frame + 1), motion.at([frame])[0], shape)[16]
+        inside = (np.abs(x - 60) > 8) & (x > 20) & (x < 96)
+        assert float(np.sqrt(np.mean((found - expected)[inside] ** 2))) < 0.08
 
 
 def test_frequency_of_noise_is_none() -> None:

@@ -1,0 +1,179 @@
+"""Lamps that light parts of a scene and flicker at one frequency: their amplitude and phase at each place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from photonpano.lighting.gains import STRUCTURE, Gains, SeenCells
+from photonpano.values import FloatArray, FluxImage
+
+_PERIODS = 2.5
+"""A place is seen for this many periods of a flicker that is found."""
+_FINER = 3
+"""Frequencies are compared at this many steps for each that the time for which a place is seen tells apart."""
+_STANDS_OUT = 3.0
+"""The power of a flicker is this many times the median of all frequencies."""
+_SMALLEST = 0.05
+"""Root mean square, over places and time, of the flicker that is divided out."""
+_SPREAD = 0.5
+"""Standard deviation of the amplitudes that is expected beforehand, where photons tell little."""
+_SMOOTH_CELLS = 1.0
+"""Standard deviation of the Gaussian over which neighbouring squares share their photons: lamps have no sharp borders."""
+_ROUNDS = 2
+"""Amplitudes and slow changes of the light are fitted in turn this many times."""
+_MOST = 1.5
+"""Largest amplitude, relative to the mean light of a place."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lamps:
+    """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light.
+
+    Attributes:
+        frequency: f, in cycles per frame.
+        cosine: (h, w) float32.
+        sine: (h, w) float32.
+        slow: (S,) gain of the spans, over which it does not flicker.
+    """
+
+    frequency: float
+    cosine: FluxImage
+    sine: FluxImage
+    slow: FloatArray
+
+
+def lamp_frequency(gains: Gains) -> float:
+    """Return the frequency at which places flicker, each at its own phase, in cycles per frame; 0 if none stands out.
+
+    The power of all squares is added up, whatever their phase. A square is seen for a short time only, so that few frequencies
+    can be told apart.
+    """
+    seen = gains.seen
+    instants = seen.instants
+    ratio, weight = _relative(gains)
+    known = seen.n_cells, len(seen.spans)
+    first, last = np.full(known[0], np.inf), np.full(known[0], -np.inf)
+    np.minimum.at(first, seen.cells, instants[seen.times])
+    np.maximum.at(last, seen.cells, instants[seen.times])
+    duration = float(np.median((last - first)[last >= first]))
+    length = float(np.median([len(span) for span in seen.spans]))
+    highest = 1 / max(4 * length, 2.0 * (instants[-1] - instants[0]) / (4 * len(instants)))
+    frequencies = np.arange(_PERIODS / max(duration, 1.0), highest, 1 / (_FINER * max(duration, 1.0)))
+    if len(frequencies) < 8 or duration < 8 * length:
+        return 0.0
+    # A square whose mean is not subtracted would have power at all frequencies.
+    series, weights = np.zeros(known), np.zeros(known)
+    weights[seen.cells, seen.times] = weight
+    series[seen.cells, seen.times] = weight * ratio
+    total = np.maximum(weights.sum(axis=1), 1e-12)
+    series -= weights * (series.sum(axis=1) / total)[:, None]
+
+    def power(each: FloatArray) -> FloatArray:
+        turns = np.exp(-2j * np.pi * np.outer(instants, each))
+        return np.asarray((np.abs(series @ turns) ** 2 / total[:, None]).sum(axis=0))
+
+    found = power(frequencies)
+    peak = int(found.argmax())
+    near = frequencies[peak] + np.linspace(-1, 1, 17) / (_FINER * duration)
+    best = float(near[int(power(near).argmax())])
+    excess = float(found[peak] - np.median(found))
+    # Of a wave of amplitude a, this power is a^2 / 4 for each unit of weight.
+    if found[peak] < _STANDS_OUT * float(np.median(found)) or 2 * excess / weight.sum() < _SMALLEST**2:
+        return 0.0
+    return best if _differs(gains, best) else 0.0
+
+
+def _differs(gains: Gains, frequency: float) -> bool:
+    """Return whether places flicker differently at a frequency."""
+    lamps = measure_lamps(gains, frequency)
+    seen = np.bincount(gains.seen.cells, gains.seen.photons, gains.seen.n_cells).reshape(gains.seen.shape)
+    wave = lamps.cosine - 1j * lamps.sine
+    mean = (seen * wave).sum() / seen.sum()
+    scatter = float(np.sqrt((seen * np.abs(wave - mean) ** 2).sum() / seen.sum() / 2))
+    return scatter > _SMALLEST
+
+
+def measure_lamps(gains: Gains, frequency: float) -> Lamps:
+    """Fit the amplitude and the phase of each square of the scene.
+
+    Args:
+        gains: of spans much shorter than a period.
+        frequency: in cycles per frame.
+    """
+    seen = gains.seen
+    lengths = np.array([len(span) for span in seen.spans], float)
+    turns = 2 * np.pi * frequency * seen.instants
+    averaged = np.sinc(frequency * lengths)
+    waves = np.stack([np.ones(len(turns)), averaged * np.cos(turns), averaged * np.sin(turns)])
+    period = max(1, round(1 / (frequency * float(np.median(np.diff(seen.instants))))))
+    slow = np.ones(len(seen.spans))
+    for _ in range(_ROUNDS):
+        coefficients = _fitted(seen, waves, slow)
+        expected = seen.exposure * (coefficients[seen.cells] * waves.T[seen.times]).sum(axis=1)
+        photons, sums = (
+            np.bincount(seen.times, each, len(slow)).astype(float) for each in (seen.photons, np.maximum(expected, 0))
+        )
+        slow = np.maximum(_running(photons, period) / np.maximum(_running(sums, period), 1e-12), 1e-3)
+        slow = slow / slow.mean()
+    brightness = coefficients[:, 0]
+    cosine, sine = _smoothed(seen, waves, slow, brightness)
+    return Lamps(frequency, cosine, sine, slow)
+
+
+def _relative(gains: Gains) -> tuple[FloatArray, FloatArray]:
+    """Return what each observation has beyond its square, as a fraction, and its weight: (N,) each."""
+    seen = gains.seen
+    expected = seen.exposure * np.exp(np.nan_to_num(gains.brightness)[seen.cells])
+    ratio = np.clip(seen.photons / np.maximum(expected, 1e-12) - 1, -2, 2)
+    return ratio, 1 / (1 / np.maximum(expected, 1e-12) + STRUCTURE**2)
+
+
+def _fitted(seen: SeenCells, waves: FloatArray, slow: FloatArray) -> FloatArray:
+    """Return mean, cosine and sine of the flux of each square: (C, 3)."""
+    flux = np.bincount(seen.cells, seen.photons, seen.n_cells) / np.maximum(
+        np.bincount(seen.cells, seen.exposure * slow[seen.times], seen.n_cells), 1e-12
+    )
+    flux = np.maximum(flux, 1e-9)
+    exposure = seen.exposure * slow[seen.times]
+    weight = 1 / (flux[seen.cells] / exposure + (STRUCTURE * flux[seen.cells]) ** 2)
+    columns = waves[:, seen.times]
+    normal = np.zeros((seen.n_cells, 3, 3))
+    right = np.zeros((seen.n_cells, 3))
+    for i in range(3):
+        right[:, i] = np.bincount(seen.cells, weight * columns[i] * seen.photons / exposure, seen.n_cells)
+        for j in range(3):
+            normal[:, i, j] = np.bincount(seen.cells, weight * columns[i] * columns[j], seen.n_cells)
+    normal[:, 0, 0] += 1e-12
+    for i in (1, 2):
+        normal[:, i, i] += 1 / (_SPREAD * flux) ** 2
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
+
+
+def _smoothed(seen: SeenCells, waves: FloatArray, slow: FloatArray, brightness: FloatArray) -> tuple[FluxImage, FluxImage]:
+    """Return the amplitudes of cosine and sine, relative to the brightness of each square: (h, w) each."""
+    flux = np.maximum(brightness[seen.cells], 1e-9)
+    exposure = seen.exposure * slow[seen.times]
+    ratio = seen.photons / (exposure * flux) - 1
+    weight = 1 / (1 / (exposure * flux) + STRUCTURE**2)
+    cosine, sine = waves[1, seen.times], waves[2, seen.times]
+
+    def shared(values: FloatArray) -> FloatArray:
+        image = np.bincount(seen.cells, weight * values, seen.n_cells).reshape(seen.shape)
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTH_CELLS, borderType=cv2.BORDER_CONSTANT))
+
+    cc, cs, ss = shared(cosine * cosine), shared(cosine * sine), shared(sine * sine)
+    rc, rs = shared(ratio * cosine), shared(ratio * sine)
+    cc, ss = cc + 1 / _SPREAD**2, ss + 1 / _SPREAD**2
+    determinant = cc * ss - cs**2
+    amplitudes = (ss * rc - cs * rs) / determinant, (cc * rs - cs * rc) / determinant
+    first, second = (np.clip(each, -_MOST, _MOST).astype(np.float32) for each in amplitudes)
+    return first, second
+
+
+def _running(values: FloatArray, length: int) -> FloatArray:
+    """Return the mean over windows of this length, shorter ones at the ends."""
+    kernel = np.ones(min(length, len(values)))
+    return np.asarray(np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same"))
