@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.geometry import inverse
+from photonpano.protocols import Source, light_of
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Response
 
 _ROUNDS = 8
@@ -18,6 +19,15 @@ _ACCURACY = 1e-4
 """The steps end when no flux changes by more than this share."""
 _SEEN = 1e-3
 """Sums of less than this many frames are rounding errors."""
+
+
+def bytes_of_light(source: Source) -> int:
+    """Return the memory that the light of a capture takes for each pixel of a grid; 0 in steady light."""
+    light = light_of(source)
+    if light is None:
+        return 0
+    # Each coverage has two images; frames and gains, and their quotient, are three more for a class.
+    return 4 * (int(light.classes().max()) + 1) * (2 * (2 + len(light.waves)) + 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from photonpano.errors import CanvasTooLargeError, InputError, LocationError
 from photonpano.geometry import Canvas, Extent, apply, canvas_of, canvas_of_box, inverse, rescaling, translation
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
+from photonpano.merging.light import bytes_of_light
 from photonpano.merging.merge_renderer import MergeRenderer
 from photonpano.photometry import Tone, WhiteBalance, balanced, picture_of
 from photonpano.protocols import Renderer, Source, Trajectory
@@ -329,7 +330,7 @@ def render_panorama(
         LocationError: frames reach the horizon of the reference plane.
     """
     start = time.perf_counter()
-    bytes_per_pixel *= channels_of(source)
+    bytes_per_pixel = (bytes_per_pixel + bytes_of_light(source)) * channels_of(source)
     canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory, bytes_per_pixel, options.extent)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas)

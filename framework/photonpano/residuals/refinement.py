@@ -12,6 +12,7 @@ from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import FrameTrajectory, corner_displacements, inverse
 from photonpano.merging.colour import channels_of
+from photonpano.merging.light import bytes_of_light
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.motion.frame_motion import FrameMotion
@@ -100,7 +101,7 @@ class Look:
     def panorama(self) -> Panorama:
         """The panorama along the motion, at the scale of the frames or the largest that fits."""
         motion, shape = self.motion, self.motion.frame_shape
-        bytes_per_pixel = channels_of(self._source) * BYTES_PER_PIXEL
+        bytes_per_pixel = channels_of(self._source) * (BYTES_PER_PIXEL + bytes_of_light(self._source))
         canvas = plan_canvas(motion.trajectory, motion.span, shape, 1.0, self._memory, bytes_per_pixel)
         excess = canvas.height * canvas.width * bytes_per_pixel / self._memory
         if excess > 1:
