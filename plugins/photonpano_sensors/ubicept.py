@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photonpano import Config, FrameSpan, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
+from photonpano import Bayer, Config, FrameSpan, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinarySumResponse
 from photonpano.reading import Closing, look_first, missing_file, read_start, reading
 
@@ -76,6 +76,7 @@ class UbiceptSource(Closing):
             frame_rate_hz=config.frame_rate_hz or _frame_rate_hz(metadata, binary_frames),
             kind="intensity",
             bit_depth=binary_frames.bit_length(),
+            bayer=_bayer(metadata),
         )
         self.response = BinarySumResponse(binary_frames)
         self.valid = np.ones(self.info.frame_shape, np.bool_)
@@ -145,6 +146,14 @@ def _frame_rate_hz(metadata: dict[str, Any], binary_frames: int) -> float | None
         if rate is not None and 0 < float(rate) < float("inf"):
             return float(rate) / binary_frames
     return None
+
+
+def _bayer(metadata: dict[str, Any]) -> Bayer | None:
+    """Return the Bayer array before the pixels, from the metadata of a frame; None for a grey sensor and for other arrays."""
+    key = "cfa_pattern"
+    written = str(metadata.get("polycam_metadata", {}).get(key, metadata.get(key))).lower()
+    known: tuple[Bayer, ...] = get_args(Bayer)
+    return next((order for order in known if order == written), None)
 
 
 def _check(config: UbiceptConfig) -> Sequence[str]:

@@ -55,6 +55,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "visionsim": GROUPS,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
+    "colour": SMALL_STREET | {"resample.with.group_size": 60},
     "splat": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}

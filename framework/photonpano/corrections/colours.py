@@ -31,6 +31,8 @@ _SPANS, _SPAN_FRAMES = 16, 256
 """The gains are measured in 16 spans of 256 frames all over the capture."""
 _CELL_PX = 16
 """Side of the squares of the sensor whose clear and coloured pixels are compared, px."""
+_MOSTLY = 0.5
+"""Share of clear pixels from which on the motion is estimated from them alone."""
 _LEAST_GAIN = 0.05
 """A colour is brightened by 20 at most: in the light of a red lamp, blue pixels see noise."""
 _MIX_STD = 0.3
@@ -44,6 +46,9 @@ class FilteredSource(SourceWrapper):
     A pixel whose colour has the gain g is lit with the probability `p = 1 - exp(-g f)`, and the best pixel with
     `q = 1 - (1 - p)^(1 / g)`. Sums are corrected from p to q, linearly around the mean of the colour. Such a pixel has seen g
     times the photons, and so carries the information of g frames of the best one.
+
+    If half of the pixels are clear, the others are left out of the grey source: they see few photons, and as they show what is
+    red or blue, they draw a pattern that stands still in the frame.
     """
 
     def __init__(self, source: Source, colour: Callable[[], NDArray[np.int8]], decisions: list[Decision]) -> None:
@@ -67,7 +72,7 @@ class FilteredSource(SourceWrapper):
 
     def weights(self) -> FluxImage:
         """See `WeightedSource`."""
-        return self._balanced().gain
+        return self._balanced().weight
 
     def colours(self) -> Mapping[str, Source]:
         """See `ColouredSource`."""
@@ -129,13 +134,14 @@ class _Balance:
     """What makes the sums of all colours alike.
 
     Attributes:
-        gain: (H, W) float32, flux of the pixel's colour, relative to the brightest colour.
+        weight: (H, W) float32, what a frame of each pixel is worth: the flux of its colour, relative to the brightest one; 0
+            beside clear pixels, if most pixels are clear.
         slope: (H, W) float32, factor of the counts.
         offset: (H, W) float32, added for each frame.
         clear_mix: (3,) factors of red, green and blue in clear pixels.
     """
 
-    gain: FluxImage
+    weight: FluxImage
     slope: FluxImage
     offset: FluxImage
     clear_mix: FloatArray
@@ -151,16 +157,22 @@ class _Balance:
         means = np.array([mean[each].mean() if each.any() else np.nan for each in pixels], np.float32)
         flux = source.response.flux(means, _MANY_FRAMES).astype(np.float64)
         gains = np.clip(flux / max(np.nanmax(flux), 1e-9), _LEAST_GAIN, None)
-        gain, slope, offset = np.ones(mean.shape, np.float32), np.ones(mean.shape, np.float32), np.zeros(mean.shape, np.float32)
+        weight, slope, offset = (
+            np.ones(mean.shape, np.float32),
+            np.ones(mean.shape, np.float32),
+            np.zeros(mean.shape, np.float32),
+        )
+        clear = colour == list(COLOURS).index("clear")
+        mostly_clear = float(clear.mean()) >= _MOSTLY
         for place, name in enumerate(COLOURS):
             if not np.isfinite(gains[place]):
                 continue
             mask = colour == place
-            gain[mask] = gains[place]
+            weight[mask] = 0 if mostly_clear and name != "clear" else gains[place]
             slope[mask], offset[mask] = _line(source.response, float(means[place]), float(gains[place]))
             reason = f"flux of {name} pixels, relative to the brightest colour, from {n_seen} frames"
             decisions.append(Decision(f"{name}_gain", round(float(gains[place]), 4), reason))
-        return cls(gain, slope, offset, _clear_mix(sums, n_frames, pixels, source.response))
+        return cls(weight, slope, offset, _clear_mix(sums, n_frames, pixels, source.response))
 
 
 def _corrected(source: Source, counts: Counts, n_frames: int) -> FluxImage:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.merging.shared_detail import noise_of_a_frame, with_shared_detail
 from photonpano.protocols import ColouredSource, Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
@@ -21,8 +22,6 @@ _LARGEST = 8
 """Neighbourhoods are doubled at most this many times."""
 _ROUNDS = 3
 """Times that the sum of the colours, and their ratios to it, follow from each other."""
-_RELATIVE_STEP = 0.02
-"""Relative step of numerical derivatives."""
 
 
 def in_colours(source: Source, render: Callable[[Source], Panorama]) -> Panorama:
@@ -50,8 +49,8 @@ def channels_of(source: Source) -> int:
 def composed(panorama: Panorama, source: Source) -> Panorama:
     """Return red, green and blue of what `in_colours` rendered; a grey panorama as it is.
 
-    Where a colour was hardly seen, or not at all, it follows from the others: see `filled`. Clear pixels count for all colours:
-    see `with_clear`.
+    Where a colour was hardly seen, or not at all, it follows from the others: see `filled`. Noise is lower by the detail that
+    the colours share: see `with_shared_detail`. Clear pixels count for all colours: see `with_clear`.
 
     Returns:
         Flux and weight are (H, W, 3) for a `ColouredSource`. The weight is the number of frames that saw the place in this
@@ -60,8 +59,11 @@ def composed(panorama: Panorama, source: Source) -> Panorama:
     if not isinstance(source, ColouredSource):
         return panorama
     flux, weight = filled(panorama.flux, panorama.weight), panorama.weight
+    seen, trusted = seen_in(panorama), np.maximum(weight, _due(weight))
+    flux = with_shared_detail(np.nan_to_num(flux), trusted, source.response)
     if flux.shape[-1] > len(COLOURS):
-        flux = with_clear(flux, np.maximum(weight, _due(weight)), source.clear_mix(), source.response)
+        flux = with_clear(flux, trusted, source.clear_mix(), source.response)
+    flux[~seen] = np.nan
     flux, weight = (np.ascontiguousarray(each[..., : len(COLOURS)]) for each in (flux, weight))
     return Panorama(flux, weight, panorama.canvas)
 
@@ -115,7 +117,7 @@ def with_clear(flux: FluxImage, weight: FluxImage, mix: FloatArray, response: Re
     `f + v mix (c - mix . f) / (u + mix . v mix)`.
 
     Args:
-        flux: (H, W, 4), the last one clear.
+        flux: (H, W, 4), the last one clear; finite.
         weight: (H, W, 4), in frames.
         mix: (3,) factors of red, green and blue in clear pixels.
         response: the camera's response, from which the noise follows.
@@ -124,7 +126,7 @@ def with_clear(flux: FluxImage, weight: FluxImage, mix: FloatArray, response: Re
         (H, W, 3).
     """
     colours, clear = flux[..., : len(COLOURS)], flux[..., -1]
-    variance = _noise(np.nan_to_num(flux), response) / np.maximum(weight, np.float32(1e-3))
+    variance = noise_of_a_frame(flux, response) / np.maximum(weight, np.float32(1e-3))
     factors = mix.astype(np.float32)
     gain = variance[..., :-1] * factors
     difference = clear - colours @ factors
@@ -136,16 +138,6 @@ def _due(weight: FluxImage) -> FluxImage:
     """Return the number of frames below which each colour is thin: (H, W, C)."""
     share = weight.sum(axis=(0, 1)) / max(float(weight.sum()), 1e-9)
     return np.asarray(_THIN * weight.sum(axis=-1, keepdims=True) * share, np.float32)
-
-
-def _noise(flux: FluxImage, response: Response) -> FluxImage:
-    """Return the variance of flux estimated from one frame of many, from the scale on which its noise is uniform."""
-    many = 1e4
-    at = np.maximum(flux, np.float32(1e-4))
-    low, high = (np.asarray(at * factor, np.float32) for factor in (1 - _RELATIVE_STEP, 1 + _RELATIVE_STEP))
-    slope = np.asarray((response.stabilised(high, many) - response.stabilised(low, many)) / (high - low), np.float32)
-    std = response.stabilised_std(many) / np.maximum(slope, np.float32(1e-9))
-    return np.asarray(many * std**2, np.float32)
 
 
 def _around(above: FluxImage, below: FluxImage, weight: FluxImage, share: NDArray[np.float32]) -> FluxImage:
