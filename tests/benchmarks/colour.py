@@ -37,7 +37,7 @@ from photonpano.reading import COLOURS, bayer_array, read_filter_array
 SHAPE, N_FRAMES, WIDTH = (128, 192), 3000, 700
 FLUX = 0.5
 PATH = {"kind": "pan", "length_px": 260, "angle_deg": 15, "shake": {"rms_px": 1.0}}
-GROUP_PX = 1.0
+GROUP_SIZE, GROUP_PX = 120, 1.0
 
 
 @dataclass
@@ -71,7 +71,8 @@ def measured(photograph: Path, filters: str, seed: int, folder: Path) -> Row:
     np.savez(folder / "truth.npz", **truth)
     corrections = [{"colour-filter": {"pattern": filters, "keep": "all"}}]
     packed = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy"), "frame_rate_hz": 96800}}
-    done = run(parse_spec({"version": 1, "source": packed, "corrections": corrections}, output=folder / "run"), overwrite=True)
+    run_spec = {"version": 1, "source": packed, "corrections": corrections, "resample": {"with": {"group_size": GROUP_SIZE}}}
+    done = run(parse_spec(run_spec, output=folder / "run"), overwrite=True)
     scores = evaluate(done.directory, folder / "truth.npz", oracle=True)
 
     with np.load(done.directory / "trajectory.npz") as kept:
@@ -90,7 +91,7 @@ def measured(photograph: Path, filters: str, seed: int, folder: Path) -> Row:
     compared = covered(weight) & np.all([np.isfinite(each).all(axis=-1) for each in images.values()], axis=0)
     white = white_flux(truth["scene"])
     for name, image in {**images, "truth": true_image}.items():
-        picture = np.nan_to_num(linear_to_srgb(image / white)) * 255
+        picture = np.rint(np.nan_to_num(linear_to_srgb(image / white)) * 255).astype(np.uint8)
         cv2.imwrite(str(folder / f"{photograph.stem}-{Path(filters).stem}-{name}.png"), picture[..., ::-1])
     psnr = {name: image_score(image, true_image, compared, white).psnr_db for name, image in images.items()}
     errors = scores.trajectory.errors_px[located]

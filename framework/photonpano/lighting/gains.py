@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from photonpano.context import Context
 from photonpano.geometry import canvas_of
 from photonpano.merging import Chunk, accumulate
+from photonpano.merging.accumulate import weights_of
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FrameSpan, Homography
@@ -114,6 +115,9 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         half *= 2
         canvas = canvas_of(motions, shape, 1 / half)
     n_rows, n_columns = canvas.height // 2, canvas.width // 2
+    # Masked pixels, and those of faint colours, cover less everywhere.
+    weights = weights_of(source)
+    covered = _COVERED if weights is None else _COVERED * float(weights.mean())
 
     def seen(place: tuple[FrameSpan, Homography]) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
         span, homography = place
@@ -122,7 +126,7 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
             cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
             for image in (np.maximum(summed.counts, 0), summed.weight)
         )
-        index = np.flatnonzero(weight > _COVERED * len(span))
+        index = np.flatnonzero(weight > covered * len(span))
         frames = np.asarray(weight.ravel()[index], np.float32)
         exposure = 4 * half**2 * frames
         flux = source.response.flux(np.asarray(counts.ravel()[index] / frames, np.float32), exposure)
