@@ -37,11 +37,15 @@ def discard_unfinished() -> None:
 
 
 @contextmanager
-def atomic_path(final: Path) -> Iterator[Path]:
+def atomic_path(final: Path, *, flushed: bool = True) -> Iterator[Path]:
     """Lend a temporary path beside `final`, which becomes `final` when the block ends well.
 
     When the block raises, Ctrl-C included, the temporary file is removed, and an older `final` stays as it was. The temporary
     name keeps the suffix of `final`, by which writers of images and archives choose their format.
+
+    Args:
+        final: the path of the whole file.
+        flushed: whether to wait until it is on the disk. A file that is not may be damaged after a power failure.
 
     Example:
         ```python
@@ -54,7 +58,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
     """
     with _becoming(final), _lent(final, f".{final.stem}.", f".partial{final.suffix}") as temporary:
         yield temporary
-        _rename(temporary, final)
+        _rename(temporary, final, flushed=flushed)
 
 
 def part_path(final: Path) -> Path:
@@ -176,11 +180,13 @@ def _becoming(final: Path) -> Iterator[None]:
         raise OutputError(_message(final, error)) from error
 
 
-def _rename(temporary: Path, final: Path) -> None:
-    """Give a file or folder its final name, once it is on the disk."""
-    flush(temporary)
+def _rename(temporary: Path, final: Path, *, flushed: bool = True) -> None:
+    """Give a file or folder its final name, once it is on the disk if it is to be flushed."""
+    if flushed:
+        flush(temporary)
     temporary.replace(final)
-    flush(final.parent)
+    if flushed:
+        flush(final.parent)
 
 
 def require_space(final: Path, n_bytes: int) -> None:

@@ -42,7 +42,8 @@ class Store:
         try:
             arrays = packed(value)
             self._require_room(sum(array.nbytes for array in arrays.values()))
-            with atomic_path(path) as temporary:
+            # A record that a power failure damages is computed again; waiting for the disk would cost more.
+            with atomic_path(path, flushed=False) as temporary:
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]  # no array is named allow_pickle
         except (OutputError, OSError, TypeError) as error:
             if not self._warned:
