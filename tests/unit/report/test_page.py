@@ -53,6 +53,22 @@ def test_page_is_self_contained_and_deterministic(record, explained, panorama):
     assert page.count("<svg") == 7
 
 
+@pytest.mark.parametrize(("share", "end"), [(0.0, ""), (0.012, "; 1.2 % of the pixels are saturated")])
+def test_page_shows_dynamic_range(record, explained, panorama, no_figures, share, end):
+    assert "dynamic range" not in text_of(render_report(record, explained, panorama))
+    measured = {"dynamic_range_db": 71.2, "measurable_range_db": 99.9, "saturated_share": share}
+    changed = record | {"panorama": record["panorama"] | measured}
+    text = text_of(render_report(changed, explained, panorama))
+    assert f"dynamic range 71 dB of 100 dB measurable{end} " in text
+
+
+def test_page_names_tone_in_place_of_white(record, explained, panorama, no_figures):
+    changed = record | {"spec": record["spec"] | {"render": {"tone": "local"}}}
+    text = text_of(render_report(changed, explained, panorama))
+    assert "shown with the tone local" in text
+    assert "white is" not in text
+
+
 def test_page_shows_facts_warnings_and_failures(record, explained, panorama, no_figures):
     text = text_of(render_report(record, explained, panorama))
     height, width = panorama.canvas.shape

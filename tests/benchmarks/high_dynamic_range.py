@@ -1,0 +1,170 @@
+"""Measure the flux of a night scene of 120 dB: its error, its bias and its claimed standard deviation, against the bound.
+
+    python tests/benchmarks/high_dynamic_range.py
+
+Simulates 100,000 frames of 72x120 px and renders them three times: of a camera that stands still; of one that trembles by 3 px,
+along the true motion; and of the latter with dark counts that are corrected. For each decade of flux it prints the root mean
+square error and the bias in units of the bound, `sqrt((exp(flux + dark) - 1) / frames)`, and the share of the pixels whose
+error is at most two of their standard deviations. A panorama interpolates between pixels, so that of a moving camera is
+compared with the same panorama of frames without noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import FrameSpan, open_source, parse_spec
+from photonpano.context import Context
+from photonpano.geometry import Canvas, FrameTrajectory, canvas_of_box, inverse, normalised
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
+from photonpano.merging.panorama import render
+from photonpano.source_wrapper import SourceWrapper
+from photonpano_simulator.config import NightScene
+from photonpano_simulator.scenes import scene_flux
+
+SHAPE = (72, 120)
+SCENE = (240, 320)
+LOWEST, HIGHEST = 1e-5, 10.0
+"""Range of flux whose decades are listed: 120 dB. The middle 100 dB, of which the photons allow a measurement, are judged."""
+JUDGED = (1e-4, 10.0)
+LARGEST_ERROR, LEAST_WITHIN = 1.1, 0.95
+BRIGHTEST = 10.0
+DARK = 0.0013
+TOLERANCE_PX = 0.125
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Flux with its standard deviation, and what it should be, of all pixels."""
+
+    name: str
+    flux: NDArray[np.float64]
+    std: NDArray[np.float64]
+    true: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    gathered: DynamicRange
+
+
+class WithoutNoise(SourceWrapper):
+    """The expected counts of a simulation in place of its photons."""
+
+    def __init__(self, simulator: Any) -> None:
+        super().__init__(simulator)
+        truth = simulator.truth()
+        self._scene, self._motion = truth["scene"], truth["homographies"]
+
+    def view(self, index: int) -> NDArray[np.float32]:
+        """Return the flux of the scene in a frame."""
+        height, width = self.info.frame_shape
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpPerspective(self._scene, self._motion[index], (width, height), flags=flags)
+        return np.asarray(seen, np.float32)
+
+    def counts(self, span: FrameSpan) -> Any:
+        """Sum the expected counts of a span."""
+        return sum(-np.expm1(-self.view(index).astype(np.float64)) for index in range(span.start, span.stop)).astype(np.float32)
+
+
+def simulated(n_frames: int, seed: int, rms_px: float, dark: float, folder: Path) -> dict[str, Any]:
+    """Return the spec of a simulation whose brightest pixel has the flux `BRIGHTEST`."""
+    shape = {"width": SCENE[1], "height": SCENE[0], "seed": seed}
+    scene = scene_flux(NightScene(**shape), 1.0)
+    camera = {
+        "scene": {"kind": "night", **shape},
+        "path": {"kind": "hand-shake", "shake": {"rms_px": max(rms_px, 1e-6), "roll_rms_deg": 0.1 if rms_px else 0.0}},
+        "flux": BRIGHTEST / float(scene.max()),
+        "n_frames": n_frames,
+        "frame_shape": list(SHAPE),
+        "seed": seed,
+        "sensor": {"dark_rate": dark},
+    }
+    corrections: list[Any] = []
+    if dark:
+        rates = folder / "dark.npy"
+        np.save(rates, np.full(SHAPE, dark, np.float32))
+        corrections = [{"dark-counts": {"dark": str(rates)}}]
+    return {"version": 1, "source": {"use": "simulator", "with": camera}, "corrections": corrections}
+
+
+def uncorrected(source: Any) -> Any:
+    """Return the simulator inside the wrappers of a source."""
+    while hasattr(source, "wrapped"):
+        source = source.wrapped
+    return source
+
+
+def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, folder: Path) -> Measured:
+    """Simulate and render one capture."""
+    with open_source(parse_spec(simulated(n_frames, seed, rms_px, dark, folder))) as source:
+        clean_frames = WithoutNoise(uncorrected(source))
+        motion: NDArray[np.float64] = uncorrected(source).truth()["homographies"]
+        to_reference = normalised(inverse(motion[n_frames // 2]) @ motion)
+        trajectory, span = FrameTrajectory(to_reference), source.info.span
+        canvas: Canvas = canvas_of_box((12, 12, SHAPE[1] - 12, SHAPE[0] - 12), 1.0)
+        noise = CanvasNoise.of(source, trajectory, span, canvas)
+        panorama = render(source, trajectory, span, canvas, TOLERANCE_PX, Context(2))
+        if rms_px:
+            clean = render(clean_frames, trajectory, span, canvas, TOLERANCE_PX, Context(2))
+            # Of frames without noise, half a dark frame more is a bias.
+            weight = clean.weight.astype(np.float64)
+            lit = -np.expm1(-clean.flux.astype(np.float64)) * (weight + 0.5) / weight
+            true = -np.log1p(-np.minimum(lit, 1 - 1e-9))
+        else:
+            true = clean_frames.view(n_frames // 2)[12:-12, 12:-12].astype(np.float64)
+    gathered = DynamicRange(noise)
+    gathered.add(panorama.flux, panorama.weight, 0, 0)
+    std = noise.std(panorama.flux, panorama.weight)
+    bound = np.sqrt(np.expm1(true + dark) / panorama.weight)
+    return Measured(name, panorama.flux.astype(float), std.astype(float), true, bound, gathered)
+
+
+def table(found: Measured) -> bool:
+    """Print the decades of flux; return whether the judged ones hold what is asked."""
+    gathered = found.gathered
+    print(f"\n{found.name}: {gathered.decibels:.0f} dB of {gathered.measurable_decibels:.0f} dB")
+    print("flux             pixels   error / bound   bias / bound   within 2 std")
+    error = found.flux - found.true
+    edges = 10.0 ** np.arange(np.log10(LOWEST), np.log10(HIGHEST) + 0.1)
+    parts = [(low, high, (found.true >= low) & (found.true < high)) for low, high in pairwise(edges)]
+    parts.append((*JUDGED, (found.true >= JUDGED[0]) & (found.true < JUDGED[1])))
+    for low, high, part in parts:
+        if not part.any():
+            continue
+        relative = error[part] / found.bound[part]
+        rms, within = float(np.sqrt((relative**2).mean())), float((np.abs(error[part]) <= 2 * found.std[part]).mean())
+        print(f"{low:7.0e} to {high:5.0e} {part.sum():8d} {rms:15.3f} {relative.mean():+14.3f} {100 * within:13.1f} %")
+    finite = bool(np.isfinite(found.flux).all() and np.isfinite(found.std).all())
+    are = "are finite" if finite else "are NOT finite"
+    print(f"saturated: {100 * gathered.saturated_share:.3f} %; flux and standard deviation {are}")
+    return finite and rms <= LARGEST_ERROR and within >= LEAST_WITHIN
+
+
+def main() -> int:
+    """Print a table for each capture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=100_000, help="frames over each point")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    given = parser.parse_args()
+    holds = True
+    for seed in given.seeds:
+        with TemporaryDirectory() as folder:
+            for name, rms_px, dark in (("still", 0.0, 0.0), ("trembling", 3.0, 0.0), ("trembling, dark counts", 3.0, DARK)):
+                found = measured(f"{name}, seed {seed}", given.frames, seed, rms_px, dark, Path(folder))
+                holds &= table(found)
+    asked = f"error at most {LARGEST_ERROR} of the bound, {100 * LEAST_WITHIN:.0f} % within 2 std"
+    print(f"\n{'holds' if holds else 'FAILS'}: {asked}")
+    return 0 if holds else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
