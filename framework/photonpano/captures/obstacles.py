@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from photonpano.errors import LocationError
 from photonpano.locating.phase import correlation_peaks
-from photonpano.protocols import Source
-from photonpano.values import Counts, Decision, FrameSpan
+from photonpano.merging.accumulate import weights_of
+from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source
+from photonpano.values import Decision, FrameSpan
 
 _PLACES, _FRAMES = 5, 256
 """Five spans of at most 256 frames are looked at."""
@@ -27,6 +30,8 @@ _MOST_PEAKS = 200
 """Most peaks that are compared."""
 _REACH = 1 / 3
 """Largest shift that is looked at, as a share of the frame."""
+_FILTER_BLUR_PX = 1.0
+"""Standard deviation of the Gaussian that blurs a colour filter array."""
 _STANDING = 0.3
 """Share of the frame from which what stands still is named."""
 
@@ -82,11 +87,24 @@ def _repetition_within(source: Source, span: FrameSpan) -> float | None:
     if middle == span.start:
         return None
     parts = FrameSpan(span.start, middle), FrameSpan(middle, span.stop)
-    first, second = (np.where(source.valid, source.counts(part), 0) for part in parts)
-    return repetition_px(first, second)
+    return repetition_px(*(_sum(source, part) for part in parts))
 
 
-def repetition_px(first: Counts, second: Counts) -> float | None:
+def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
+    """Sum the frames of a span; colours are made alike, and blurred, so that their filter array is not seen."""
+    counts = source.counts(span)
+    if not isinstance(source, ColouredSource):
+        return np.where(source.valid, counts, 0)
+    weights = weights_of(source)
+    assert weights is not None
+    assert isinstance(source, LinearlyCorrectedSource)
+    lit, near = (
+        ndimage.gaussian_filter(image, _FILTER_BLUR_PX) for image in (source.corrected(counts, len(span)) * weights, weights)
+    )
+    return np.asarray(lit / np.maximum(near, 1e-6))
+
+
+def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
     """Return the distance after which an image repeats; None if it does not.
 
     Two sums of frames are compared, so that photon noise, which they do not share, plays no part.

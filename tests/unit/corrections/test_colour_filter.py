@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from photonpano import ColouredSource, FrameSpan, InputError, LinearlyCorrectedSource, WeightedSource
+from photonpano.captures.obstacles import obstacles
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.reading import COLOURS, bayer_array
 from photonpano.testing import MemorySource
@@ -86,6 +87,11 @@ def test_flux_of_clear_pixels_is_known_as_a_mix_of_the_others(mosaic: np.ndarray
     source = corrected_source(behind(mosaic, flux), corrections({"colour-filter": {"pattern": "pattern.npy", "keep": "all"}}))
     assert list(source.colours()) == ["red", "green", "blue", "clear"]
     assert source.clear_mix() == pytest.approx(np.ones(3), abs=0.15)
+
+
+def test_filter_array_is_no_repeating_scene(grey_scene: MemorySource, corrections: Callable) -> None:
+    assert "repeats every 2 px" in " ".join(obstacles(grey_scene, ()))
+    assert obstacles(corrected_source(grey_scene, corrections(ALL)), ()) == []
 
 
 def test_moved_pixels_keep_their_colours(grey_scene: MemorySource, corrections: Callable) -> None:
