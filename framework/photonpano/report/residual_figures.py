@@ -121,6 +121,23 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
         return svg_of(figure, "shifts")
 
 
+def light_over_time(residuals: Residuals) -> str | None:
+    """Draw the gain of the light of the spans; None in steady light."""
+    gain = residuals.light
+    if np.ptp(gain) == 0:
+        return None
+    with plain_figure(WIDTH_IN, 2.4) as figure:
+        axes = figure.subplots()
+        axes.axhline(1, color=MUTED, linewidth=1, linestyle="--")
+        axes.plot(residuals.instants, gain, color=SERIES[0])
+        axes.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
+        axes.set_ylim(0, 1.05 * float(gain.max()))
+        axes.set_ylabel("light / mean")
+        axes.set_xlabel("frame")
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        return svg_of(figure, "light")
+
+
 def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     """Return the power spectrum of the shifts of short spans, divided by that of their photon noise.
 

@@ -26,6 +26,13 @@ def test_figures_use_colour_variables_of_page(residuals):
         assert len(svg) < 120_000
 
 
+def test_light_is_drawn_only_if_it_changes(residuals):
+    assert residual_figures.light_over_time(residuals) is None
+    svg = residual_figures.light_over_time(replace(residuals, light=np.linspace(0.5, 1.5, len(residuals.spans))))
+    ElementTree.fromstring(svg)
+    assert "light / mean" in svg
+
+
 def test_spectrum_of_noise_is_one(residuals):
     frequencies, power = residual_figures.spectrum_over_noise(residuals)
     assert (len(frequencies), frequencies[-1]) == (len(power), pytest.approx(1 / 32, rel=0.01))
