@@ -145,6 +145,13 @@ def prepare(folder: Path, seed: int = 0) -> None:
     write_spec(folder, seed)
 
 
+def warm_up(folder: Path) -> None:
+    """Run once in this process, so that those forked from it find the machine code loaded."""
+    from photonpano import load_spec, run
+
+    run(load_spec(folder / "scan.yaml"))
+
+
 def write_spec(folder: Path, seed: int) -> None:
     """Write the spec; its seed distinguishes the runs."""
     (folder / "scan.yaml").write_text(SPEC.format(seed=seed))
@@ -394,6 +401,7 @@ def main() -> int:
         simulation = multiprocessing.get_context("spawn").Process(target=prepare, args=(folder,))
         simulation.start()  # in a process of its own: a forked process keeps the locks of threads that it has not got
         simulation.join()
+        warm_up(folder)
         more = {"races": {"at_once": options.at_once}, "cost": {"spec": options.spec}}.get(options.trial, {})
         wrong: list[str] = globals()[options.trial](folder, options.number, options.seed, **more)
     print(*wrong, sep="\n")
