@@ -7,6 +7,7 @@ import json
 import os
 import socket
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -15,6 +16,8 @@ from typing import TypedDict
 
 from photonpano.errors import OutputError
 
+_NOTE_S = 2.0
+"""How long to wait for the note of a process that has just taken a lock."""
 _held: dict[Path, int] = {}
 """Open files that this process uses until its end."""
 
@@ -58,7 +61,7 @@ def _acquired(path: Path, what: str) -> int:
                 raise OutputError(f"{path} is not a file of photonpano; remove it, or choose another folder")
             mine = claimed(descriptor)
             if mine is False or (mine is None and _may_live(_note(descriptor))):
-                raise OutputError(_refusal(path, what, _note(descriptor)))
+                raise OutputError(_refusal(path, what, _note_soon(descriptor)))
             if is_at(descriptor, path):  # the holder before may have removed it meanwhile
                 _write_note(descriptor)
                 return descriptor
@@ -125,6 +128,14 @@ def _note(descriptor: int) -> Holder | None:
         holder["pid"], holder["host"], holder["process_start"], holder["since"]
     except (OSError, ValueError, TypeError, KeyError):
         return None
+    return holder
+
+
+def _note_soon(descriptor: int) -> Holder | None:
+    """Return the note of a holder, who may have taken the lock a moment ago."""
+    end = time.monotonic() + _NOTE_S
+    while (holder := _note(descriptor)) is None and time.monotonic() < end:
+        time.sleep(0.01)
     return holder
 
 
