@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -9,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -299,6 +301,18 @@ def test_second_run_into_a_folder_is_refused_with_the_first(tmp_path: Path) -> N
         f"{holder['since']}; wait for it, or choose another folder with --output"
     )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_refusal_waits_for_the_note_of_a_lock_that_was_just_taken(tmp_path: Path) -> None:
+    note = {"host": socket.gethostname(), "pid": 7, "process_start": "1", "since": "2026-01-01T00:00:00+00:00"}
+    lock = tmp_path / ".scan.lock"
+    writes = threading.Timer(0.1, lock.write_text, [json.dumps(note)])
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        writes.start()
+        with pytest.raises(OutputError, match=f"process 7 on {socket.gethostname()} has been writing it since 2026-01-01"):
+            run_into(tmp_path / "scan")
+        writes.join()
 
 
 _STOPS = """
