@@ -22,7 +22,11 @@ from matplotlib.figure import Figure
 from photonpano import FrameSpan, Group, StageContext, StreamInfo, discover, evaluate, load_spec, open_source, parse_spec, run
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.context import Context
+from photonpano.evaluation.images import true_panorama
+from photonpano.evaluation.inputs import load_run_trajectory, load_truth
+from photonpano.evaluation.trajectory import corner_errors
 from photonpano.geometry import (
+    Canvas,
     FrameTrajectory,
     corner_displacements,
     corners,
@@ -106,6 +110,21 @@ TREMOR = {
     },
 }
 """The camera trembles faster than groups of 180 frames."""
+FINE = {
+    "version": 1,
+    "source": {
+        "use": "simulator",
+        "with": {
+            "scene": {"kind": "street", "width": 2400, "height": 1600},
+            "scene_scale": 2,
+            "path": {"kind": "loop", "length_px": 160, "centre": [900, 1000], "shake": {"rms_px": 0.6, "roll_rms_deg": 0.02}},
+            "flux": 0.2,
+            "n_frames": 6000,
+            "frame_shape": [128, 160],
+        },
+    },
+}
+"""A camera whose pixels average a scene that is twice as fine."""
 REFINERS = {"without": ("tab:orange", "[]"), "with": ("tab:blue", "short-spans")}
 """Runs without and with the refiner, with the colours of their lines."""
 GROUP_SIZE = 125
@@ -158,6 +177,10 @@ def main() -> None:
     save("tremor.png", tremor(folder, trembling))
 
     save("night.png", night())
+
+    fine = written(parse_spec(FINE), folder / "fine.npy")
+    finish(parse_spec(fine_spec(fine, "super-resolution"), output=in_folder(folder, "fine")), "super-resolution", fine)
+    save("super-resolution.png", super_resolution(folder, fine))
 
     video = filmed(parse_spec(HIGH_SPEED), folder / "high-speed.mp4")
     source = {"use": "video", "with": {"path": str(video.absolute()), "frame_rate_hz": 500}}
@@ -357,6 +380,36 @@ def tremor(folder: Path, cube: Path) -> Picture:
     drawn = FigureCanvasAgg(figure)
     drawn.draw()
     return np.asarray(drawn.buffer_rgba())[..., 2::-1]
+
+
+def fine_spec(cube: Path, renderer: str, scale: float = 2.0) -> dict[str, Any]:
+    """Return the spec of the capture whose scene is finer than the sensor."""
+    source = {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96_800}}
+    return {"version": 1, "source": source, "render": {"use": renderer, "scale": scale}}
+
+
+def super_resolution(folder: Path, cube: Path) -> Picture:
+    """Return a part of the panorama: interpolated, merged on a fine grid, by super-resolution, and the true scene."""
+    directory = in_folder(folder, "fine")
+    flux, truth = tifffile.imread(directory / "panorama.tiff"), load_truth(truth_path(cube))
+    found = load_run_trajectory(directory)
+    canvas = Canvas(*flux.shape, found.canvas)
+    assert truth.scene is not None
+    alignment = corner_errors(found.homographies, truth.homographies, found.frame_shape, found.located).alignment
+    scene = true_panorama(truth.scene, canvas, alignment)
+    with open_source(parse_spec(fine_spec(cube, "merge"))) as source:
+        trajectory, span = FrameTrajectory(found.homographies), source.info.span
+        small = plan_canvas(trajectory, span, source.info.frame_shape, 1.0, 2**31)
+        coarse, merged = (render(source, trajectory, span, each, 0.125, Context(2)).flux for each in (small, canvas))
+    to_small = small.transform @ np.linalg.inv(canvas.transform)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    bicubic = cv2.warpPerspective(np.nan_to_num(coarse), to_small, flux.shape[::-1], flags=flags)
+    middle = flux.shape[0] // 2, flux.shape[1] // 2
+    part = np.s_[middle[0] - 75 : middle[0] + 75, middle[1] - 75 : middle[1] + 75]
+    white = float(np.nanquantile(scene[part], 0.995))
+    names = {"scale 1, interpolated": bicubic, "merge": merged, "super-resolution": flux, "true scene": scene}
+    shown = {name: np.repeat(np.repeat(picture(image[part], white), 2, 0), 2, 1) for name, image in names.items()}
+    return beside([labelled(image, name) for name, image in shown.items()])
 
 
 def between_knots(

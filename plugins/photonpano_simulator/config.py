@@ -268,6 +268,20 @@ class SimulationConfig(Config):
     path: Annotated[PanPath | ScanPath | LoopPath | SplinePath | HandShakePath | FilePath, Field(discriminator="kind")] = Field(
         PanPath(), description="the path of the camera"
     )
+    scene_scale: int = Field(
+        1,
+        ge=1,
+        le=8,
+        description="pixels of the scene along the side of a pixel of a frame; from 2 on, pixels of a frame have an area. "
+        "Lengths of the path stay in px of a frame",
+    )
+    fill_factor: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="share of the area of a pixel that is sensitive to light; its side is rounded to whole pixels of the "
+        "scene. At scene_scale 1, pixels are points",
+    )
     flux: float = Field(
         0.5,
         gt=0,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import apply, inverse, normalised
+from photonpano.geometry import apply, inverse, normalised, rescaling
 from photonpano.reading import read_array
 from photonpano_simulator.config import (
     FilePath,
@@ -43,10 +43,12 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
     if isinstance(path, FilePath):
         homographies = _read_homographies(path.file, config.n_frames)
     else:
-        middle = _middle(scene_shape)
-        target = middle if path.centre is None else np.asarray(path.centre, dtype=np.float64)
+        to_scene = rescaling(config.scene_scale)
+        in_frame_px = scene_shape[0] / config.scene_scale, scene_shape[1] / config.scene_scale
+        middle = _middle(in_frame_px)
+        target = middle if path.centre is None else apply(inverse(to_scene), np.array([path.centre], np.float64))[0]
         rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
-        homographies = _intrinsics(scene_shape, focal) @ rotations @ np.linalg.inv(frame)
+        homographies = to_scene @ _intrinsics(in_frame_px, focal) @ rotations @ np.linalg.inv(frame)
     if path.shake is not None:
         shaking = _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
         homographies = homographies @ frame @ shaking @ np.linalg.inv(frame)
@@ -121,12 +123,12 @@ def _at_constant_speed(points: FloatArray, n_frames: int) -> FloatArray:
     return np.stack([np.interp(wanted, travelled, coordinate) for coordinate in points.T], axis=1)
 
 
-def _middle(shape: tuple[int, int]) -> FloatArray:
+def _middle(shape: tuple[float, float]) -> FloatArray:
     height, width = shape
     return np.array([(width - 1) / 2, (height - 1) / 2])
 
 
-def _intrinsics(shape: tuple[int, int], focal: float) -> FloatArray:
+def _intrinsics(shape: tuple[float, float], focal: float) -> FloatArray:
     x, y = _middle(shape)
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, SourceContext, StreamInfo
-from photonpano.geometry import apply, corner_displacements, corners, inverse
+from photonpano.geometry import apply, corner_displacements, corners, inverse, translation
 from photonpano.reading import Closing
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
 from photonpano_simulator.delivery import delivered
@@ -24,7 +24,8 @@ class SimulatorSource(Closing):
     """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
 
     A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread. The flux
-    between the pixels of the scene is interpolated linearly; pixels of the camera have no extent.
+    between the pixels of the scene is interpolated linearly. Pixels of the camera have an area if the scene is finer than they
+    are: its flux is averaged over whole pixels of the scene, and the averages are interpolated.
 
     Raises:
         InputError: a file cannot be used, the camera path leaves the scene, or frames are dropped that do not exist.
@@ -38,6 +39,10 @@ class SimulatorSource(Closing):
         self._scene = scene_flux(config.scene, flux, in_colour=filters is not None)
         height, width = self._scene.shape[:2]
         self._homographies = camera_path(config, (height, width), self._seed)
+        # The side of the area of a pixel, in px of the scene. Averages over it are sampled where their middles lie.
+        side = max(1, round(config.scene_scale * config.fill_factor**0.5))
+        self._averages = _averaged(self._scene, side)
+        self._to_averages = translation(-(side - 1) / 2, -(side - 1) / 2)
         self._taken = delivered(config)
         self._lens = config.lens
         self._points = None
@@ -47,7 +52,7 @@ class SimulatorSource(Closing):
         self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
         self._light = config.drift ** np.linspace(0, 1, config.n_frames)
         self._lamps = shares(config.lamps, (height, width))
-        self._lit_parts = [np.ascontiguousarray((self._scene.T * share.T).T) for share in self._lamps]
+        self._lit_parts = [_averaged(np.ascontiguousarray((self._scene.T * share.T).T), side) for share in self._lamps]
         self._lamp_light = np.zeros((len(config.lamps), config.n_frames))
         for place, lamp in enumerate(config.lamps):
             self._lamp_light[place] = brightness(lamp, config.n_frames, config.frame_rate_hz)
@@ -135,7 +140,7 @@ class SimulatorSource(Closing):
 
     def _lit_view(self, index: int, homography: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the flux of the scene in a frame, in the light of the lamps: (H, W)."""
-        flux = self._view(self._scene, homography)
+        flux = self._view(self._averages, homography)
         for part, light in zip(self._lit_parts, self._lamp_light[:, index], strict=True):
             flux += np.float32(light - 1) * self._view(part, homography)
         return flux
@@ -156,6 +161,7 @@ class SimulatorSource(Closing):
     def _view(self, scene: NDArray[np.float32], homography: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the flux of a scene in a frame, (H, W)."""
         height, width = self.info.frame_shape
+        homography = self._to_averages @ homography
         # The path lies inside the scene, up to rounding errors.
         border = cv2.BORDER_REPLICATE
         if self._points is None:
@@ -169,3 +175,11 @@ class SimulatorSource(Closing):
         if self._filters is not None:
             view = (view * self._filters).sum(axis=-1)
         return view.astype(np.float32, copy=False)
+
+
+def _averaged(scene: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Return the averages of squares of pixels of a scene, each where its first pixel lies."""
+    if side == 1:
+        return scene
+    averages = cv2.boxFilter(scene, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(averages, np.float32)

@@ -39,6 +39,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "constant-groups": GROUPS,
     "sliding-window": GROUPS,
     "super-resolution": GROUPS,
+    "gradual-super-resolution": GROUPS,
     "coarse-to-fine": GROUPS,
     "keypoints": GROUPS,
     "orb": GROUPS,
@@ -146,7 +147,7 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
     assert all(level["located"] == level["groups"] for level in record["levels"])
     assert groups[1] == (groups[0] if name in SAME_GROUPS else 2 * groups[0] + 1)
     assert ({level["scale"] for level in record["levels"]} == {0.5, 1}) == (name == "coarse-to-fine")
-    assert record["panorama"]["scale"] == (2 if name == "super-resolution" else 1)
+    assert record["panorama"]["scale"] == (2 if name.endswith("super-resolution") else 1)
     assert ("group_size" in {decision["what"] for decision in record["decisions"]}) == (name == "photograph")
     assert record["spec"]["merge"]["with"].get("compensate", True) == (name != "naive-average")
     assert any(level["revisits"]["located"] for level in record["levels"]) == (name == "revisits")

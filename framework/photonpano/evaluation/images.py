@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photonpano.geometry import Canvas, apply
+from photonpano.geometry import Canvas, apply, translation
 from photonpano.photometry import linear_to_srgb
 from photonpano.values import BoolArray, FluxImage, Homography
 
@@ -117,6 +117,8 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
 def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> FluxImage:
     """Return the true scene on the canvas of a panorama, interpolated bilinearly; NaN outside of the scene.
 
+    A scene that is finer than the canvas is averaged over the areas of its pixels, rounded to whole pixels of the scene.
+
     Args:
         scene: (H, W), true flux on the true plane; or (H, W, 3).
         canvas: the pixel grid of the panorama, whose transform maps the estimated reference plane to it.
@@ -125,6 +127,8 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> Fl
     from scipy.ndimage import map_coordinates
 
     to_scene = alignment @ np.linalg.inv(canvas.transform)
+    scene, offset = _averaged(scene, _pixels_along(to_scene, canvas))
+    to_scene = translation(-offset, -offset) @ to_scene
     image = np.empty((*canvas.shape, *scene.shape[2:]), dtype=np.float32)
     columns = np.arange(canvas.width)
     for top in range(0, canvas.height, _ROWS):
@@ -135,6 +139,24 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> Fl
             sampled = map_coordinates(single, [y, x], order=1, mode="constant", cval=np.nan, output=np.float32)
             into[rows] = sampled.reshape(len(rows), canvas.width)
     return image
+
+
+def _pixels_along(to_scene: Homography, canvas: Canvas) -> int:
+    """Return the pixels of the scene along the side of a pixel in the middle of a canvas."""
+    middle = np.array([(canvas.width - 1) / 2, (canvas.height - 1) / 2])
+    here, right, below = apply(to_scene, middle + np.array([[0, 0], [1, 0], [0, 1]]))
+    (a, b), (c, d) = right - here, below - here
+    return max(1, round(float(np.sqrt(abs(a * d - b * c)))))
+
+
+def _averaged(scene: FluxImage, side: int) -> tuple[FluxImage, float]:
+    """Return the averages of squares of pixels, and how far their middles lie from their first pixels."""
+    import cv2
+
+    if side == 1:
+        return scene, 0.0
+    averages = cv2.boxFilter(scene, cv2.CV_32F, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(averages, np.float32), (side - 1) / 2
 
 
 def _colours(image: FluxImage) -> list[FluxImage]:

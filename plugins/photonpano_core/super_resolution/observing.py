@@ -101,6 +101,13 @@ def expected(
 
 
 @compiled
+def _lit_share(light: np.float32) -> np.float32:
+    """Return `1 - exp(-light)`, exact in float32 for a faint light too."""
+    half = np.float32(0.5)
+    return light - half * light * light if light < np.float32(2e-3) else np.float32(1) - np.exp(-light)
+
+
+@compiled
 def photon_ratio(
     lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
 ) -> None:
@@ -113,7 +120,7 @@ def photon_ratio(
         binary: whether counts are of pixels that are 1 with one photon or more; otherwise the ratio is k / mean.
         into: (H, W) output.
     """
-    one, least = np.float32(1), np.float32(1e-9)
+    least = np.float32(1e-9)
     for y in range(lit.shape[0]):
         k, n, m, out = lit[y], seen[y], mean[y], into[y]
         for x in range(len(k)):
@@ -121,7 +128,7 @@ def photon_ratio(
             if k[x] <= 0 or n[x] <= 0:
                 out[x] = np.float32(0)
             elif binary:
-                out[x] = k[x] / (one - np.exp(-light))
+                out[x] = k[x] / _lit_share(light)
             else:
                 out[x] = k[x] / light
 
@@ -131,7 +138,7 @@ def log_likelihood(
     lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
 ) -> None:
     """Return the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
-    one, least = np.float32(1), np.float32(1e-9)
+    least = np.float32(1e-9)
     for y in range(lit.shape[0]):
         k, n, m, out = lit[y], seen[y], mean[y], into[y]
         for x in range(len(k)):
@@ -139,6 +146,6 @@ def log_likelihood(
             if n[x] <= 0:
                 out[x] = np.float32(0)
             elif binary:
-                out[x] = k[x] * np.log(one - np.exp(-light)) - (n[x] - k[x]) * light
+                out[x] = k[x] * np.log(_lit_share(light)) - (n[x] - k[x]) * light
             else:
                 out[x] = k[x] * np.log(light) - n[x] * light

@@ -41,6 +41,9 @@ _FEWEST_FRAMES = 1.0
 """Pixels that fewer frames saw are unknown."""
 _GATHERING = 5
 """One part in 5 of the time is spent on sorting photons, about."""
+_ENOUGH = 0.9
+"""The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
+from frames held out, so that the most likely round is a noisy one."""
 _SIGNIFICANT = 2.0
 """Held-out frames show detail if they are likelier with it than without by this many standard errors."""
 
@@ -57,8 +60,8 @@ class _Chosen:
 class SuperResolutionRenderer:
     """Maximises the probability of the flux on the canvas, given the photons and a prior: see `rounds_of`.
 
-    Some frames are held out on three squares, where the estimate of each round predicts them. The round whose prediction is the
-    likeliest is the last one.
+    Some frames are held out on three squares, where the estimate of each round predicts them. The first round whose prediction
+    is nearly the likeliest is the last one.
     """
 
     def __init__(self, config: SuperResolutionConfig, threads: int, decide: Decide) -> None:
@@ -175,13 +178,14 @@ class SuperResolutionRenderer:
         if not scores:
             return len(STRENGTHS) // 2
         total = np.sum(scores, axis=0)
-        n_rounds = int(np.argmax(total)) + 1
-        losses = ", ".join(f"{each:.0f}" for each in total - total.max())
+        gains = total - total[0]
+        n_rounds = int(np.argmax(gains >= _ENOUGH * gains.max())) + 1
+        listed = ", ".join(f"{each:.0f}" for each in gains)
         self._decide(
             "super_resolution.rounds",
             n_rounds,
-            f"of {len(STRENGTHS)}, each with a weaker prior: it predicts frames held out best; their log-likelihood by round, "
-            f"relative to it: {losses}",
+            f"of {len(STRENGTHS)}, each with a weaker prior: the first that predicts frames held out nearly as well as the "
+            f"best; their log-likelihood by round, relative to the first: {listed}",
         )
         gain, error = float(detail[0]), float(np.sqrt(detail[1]))
         supported = gain > _SIGNIFICANT * error

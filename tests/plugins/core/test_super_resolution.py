@@ -92,7 +92,7 @@ def test_super_resolution_exceeds_interpolated_panorama_by_3_db() -> None:
     assert (what, supported, yes) == ("super_resolution.rounds", "super_resolution.supported", True)
     assert 1 <= value <= 6
     assert reason.startswith(
-        "of 6, each with a weaker prior: it predicts frames held out best; their log-likelihood by round, "
+        "of 6, each with a weaker prior: the first that predicts frames held out nearly as well as the best; "
     )
 
 
@@ -218,3 +218,16 @@ def test_canvas_beside_the_frames_is_unseen() -> None:
     panorama = renderer.render(source, motion, source.info.span, canvas, 0.125, done.append)
     assert (panorama.weight == 0).all()
     assert (sum(done), decisions) == (source.info.n_frames, [])
+
+
+def test_black_parts_of_a_scene_are_estimated_and_predicted(caplog: pytest.LogCaptureFixture) -> None:
+    """Where no photon falls, likelihoods stay finite: the smallest flux is below the precision of 1 - exp(-flux)."""
+    scene = fine_scene().copy()
+    scene[:, : 28 * FINE] = 0
+    source, motion = capture(scene)
+    decisions: list = []
+    panorama = rendered(source, motion, decisions)
+    assert np.isfinite(panorama.flux[INNER]).all()
+    assert panorama.flux[INNER][:, :20].max() < 1e-3
+    assert "nan" not in "".join(reason for _, _, reason in decisions)
+    assert decisions[0][1] > 1

@@ -135,3 +135,32 @@ def test_span_beyond_the_end_is_refused(simulated: Simulated) -> None:
             with pytest.raises(InputError) as caught:
                 read(FrameSpan(40, 51))
             assert str(caught.value) == "frames 40 to 50 were requested, but the capture has 50 frames (0 to 49)"
+
+
+@pytest.mark.parametrize(("fill_factor", "side"), [(1.0, 4), (0.25, 2), (0.05, 1)])
+def test_pixels_before_a_finer_scene_average_it_over_their_areas(simulated: Simulated, fill_factor: float, side: int) -> None:
+    keys = {"scene_scale": 4, "fill_factor": fill_factor, "path": {"kind": "pan", "length_px": 1e-9}, "flux": 0.3}
+    with simulated(n_frames=2000, frame_shape=(24, 32), **keys) as source:
+        truth = source.truth()
+        lit = source.counts(source.info.span) / 2000
+    scene, to_scene = truth["scene"], truth["homographies"][0]
+    assert to_scene[0, 0] == pytest.approx(4, rel=1e-3)
+    expected = np.zeros(lit.shape)
+    for row in range(lit.shape[0]):
+        for column in range(lit.shape[1]):
+            u, v, depth = to_scene @ (column, row, 1)
+            x, y = np.floor(np.array([u, v]) / depth - (side - 1) / 2 + 1e-3).astype(int)
+            expected[row, column] = scene[y : y + side, x : x + side].mean()
+    assert np.corrcoef(lit.ravel(), -np.expm1(-expected).ravel())[0, 1] > 0.97
+
+
+def test_path_of_a_finer_scene_is_in_pixels_of_a_frame(simulated: Simulated) -> None:
+    keys = {"scene": {"kind": "street", "width": 600, "height": 400}, "path": {"kind": "pan", "length_px": 40}}
+    with simulated(**keys) as coarse, simulated(scene_scale=2, **keys) as fine:
+        middles = [
+            np.array([h @ (25.5, 19.5, 1) / (h @ (25.5, 19.5, 1))[2] for h in source.truth()["homographies"]])
+            for source in (coarse, fine)
+        ]
+    moved, moved_fine = (np.linalg.norm(each[-1] - each[0]) for each in middles)
+    assert (moved, moved_fine) == (pytest.approx(40, rel=1e-3), pytest.approx(80, rel=1e-3))
+    np.testing.assert_allclose(middles[0].mean(axis=0), middles[1].mean(axis=0), atol=0.1)

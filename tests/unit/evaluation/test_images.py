@@ -119,3 +119,17 @@ def test_true_panorama_samples_scene_through_canvas_and_alignment():
     # Canvas (20, 10) is reference ((20.5 / 2 - 0.5) - 3, (10.5 / 2 - 0.5) - 1) = (6.75, 3.75), and scene (12.25, 7.75).
     assert image[10, 20] == pytest.approx(2 * 12.25 + 3 * 7.75, rel=1e-6)
     assert np.isnan(image[299]).all()
+
+
+def test_true_panorama_of_a_finer_scene_averages_the_area_of_each_pixel():
+    """A scene with four pixels a side of a pixel of the canvas: stripes of two px vanish, and means stay in their places."""
+    scene = np.random.default_rng(0).random((48, 64)).astype(np.float32)
+    image = true_panorama(scene, Canvas(12, 16, np.eye(3)), rescaling(4))
+    np.testing.assert_allclose(image[:-1, :-1], scene.reshape(12, 4, 16, 4).mean(axis=(1, 3))[:-1, :-1], rtol=1e-5)
+
+
+def test_true_panorama_at_the_resolution_of_the_scene_is_the_scene():
+    """A panorama of scale 2 of a scene with two pixels a side of a pixel of a frame."""
+    scene = np.random.default_rng(0).random((48, 64)).astype(np.float32)
+    image = true_panorama(scene, Canvas(48, 64, rescaling(2)), rescaling(2))
+    np.testing.assert_allclose(image, scene, rtol=1e-5)

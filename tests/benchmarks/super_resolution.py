@@ -1,0 +1,178 @@
+"""Measure super-resolution at twice the resolution of the sensor, along the estimated motion.
+
+    python tests/benchmarks/super_resolution.py --scene facade.jpg --scene stream.jpg --output table.md
+
+For each scene and flux, 10,000 frames of 128x160 px are simulated, whose pixels average the scene over their areas. A run
+estimates the motion and renders at scale 2. Scores are PSNR in dB, in sRGB, against the true scene, over the same
+pixels. Compared are:
+
+- bicubic: the panorama of scale 1 along the same motion, interpolated;
+- Richardson-Lucy: the merge of scale 2, deconvolved with the area of a pixel; the number of its steps is chosen with the truth;
+- true motion: super-resolution along the true motion;
+- thin: super-resolution and bicubic where at most a fifth as many frames as usual saw a pixel.
+
+`--large` measures the time and the memory of a canvas of 2,048x1,365 px at scale 2 instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from photonpano import parse_spec, run, simulate
+from photonpano.api.runs import evaluate
+from photonpano.context import Context
+from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
+from photonpano.evaluation.inputs import load_panorama, load_run_trajectory, load_truth
+from photonpano.evaluation.trajectory import corner_errors
+from photonpano.geometry import Canvas, FrameTrajectory
+from photonpano.merging.panorama import plan_canvas, render
+from photonpano.pipeline.components import open_source
+
+FLUXES = (0.5, 0.1, 0.02)
+STEPS = 60
+"""Steps of Richardson-Lucy, of which the best is taken."""
+THIN = 0.2
+HEAD = (
+    "| scene | flux | motion px | bicubic | Richardson-Lucy | super-resolution | true motion | thin: bicubic | thin | rounds |"
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", action="append", type=Path, required=True, help="a photograph; give several")
+    parser.add_argument("--flux", action="append", type=float, help="photons per pixel per frame; by default 0.5, 0.1 and 0.02")
+    parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--large", action="store_true", help="measure time and memory of a large canvas")
+    parser.add_argument("--output", type=Path, help="write the table to this file")
+    options = parser.parse_args()
+    lines = [HEAD, "|" + " --- |" * (HEAD.count("|") - 1)]
+    for scene in options.scene:
+        if options.large:
+            print(large(scene, options.frames, options.seed), flush=True)
+            continue
+        for flux in options.flux or FLUXES:
+            lines.append(row(scene, flux, options.frames, options.seed))
+            print(lines[-1], flush=True)
+    if options.output:
+        options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def simulated(folder: Path, scene: Path, flux: float, frames: int, seed: int, **keys: Any) -> Path:
+    """Simulate a capture; its truth lies beside it."""
+    capture = folder / "capture.npy"
+    simulator = {
+        "scene": {"kind": "photo", "file": str(scene), "width": 1200},
+        "scene_scale": 2,
+        "path": {"kind": "loop", "length_px": 160.0, "shake": {"rms_px": 0.6, "roll_rms_deg": 0.02}},
+        "flux": flux,
+        "n_frames": frames,
+        "frame_shape": [128, 160],
+        "seed": seed,
+    }
+    simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": simulator | keys}}), capture)
+    return capture
+
+
+def spec_of(capture: Path, **sections: Any) -> dict[str, Any]:
+    source = {"use": "packed-npy", "with": {"path": str(capture), "frame_rate_hz": 96_800.0}}
+    return {"version": 1, "source": source, "render": {"use": "super-resolution", "scale": 2.0}} | sections
+
+
+def row(scene: Path, flux: float, frames: int, seed: int) -> str:
+    """Measure a scene at a flux."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        capture = simulated(folder, scene, flux, frames, seed)
+        plan = parse_spec(spec_of(capture), output=folder / "run")
+        record = run(plan).record
+        scores = evaluate(folder / "run", capture.with_name("capture.truth.npz"))
+        truth, found = load_truth(capture.with_name("capture.truth.npz")), load_run_trajectory(folder / "run")
+        flux_image, weight = load_panorama(folder / "run")
+        canvas = Canvas(*flux_image.shape[:2], found.canvas)
+        motion = corner_errors(found.homographies, truth.homographies, found.frame_shape, found.located)
+        assert truth.scene is not None
+        white, true_image = white_flux(truth.scene), true_panorama(truth.scene, canvas, motion.alignment)
+        with open_source(plan) as source:
+            trajectory, span = FrameTrajectory(found.homographies), source.info.span
+            small = plan_canvas(trajectory, span, source.info.frame_shape, 1.0, 2**31)
+            merged = render(source, trajectory, span, small, 0.125, Context(2))
+            fine = render(source, trajectory, span, canvas, 0.125, Context(2))
+        to_small = small.transform @ np.linalg.inv(canvas.transform)
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        size = canvas.width, canvas.height
+        bicubic = cv2.warpPerspective(np.nan_to_num(merged.flux), to_small, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        usual = covered(weight) & covered(fine.weight) & np.isfinite(true_image)
+        usual = cv2.erode(usual.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+        thin = usual & (weight < THIN * np.median(weight[usual]))
+
+        def psnr(image: np.ndarray, where: np.ndarray = usual) -> float:
+            return image_score(image, true_image, where, white).psnr_db if where.any() else float("nan")
+
+        deconvolved = richardson_lucy(np.nan_to_num(fine.flux), lambda image: psnr(image))
+        decided = {each["what"]: each["value"] for each in record["decisions"]}
+        assert scores.oracle is not None
+        assert scores.panorama is not None
+        along_truth = psnr(flux_image) + scores.oracle.psnr_db - scores.panorama.psnr_db
+        cells = [
+            scene.stem,
+            f"{flux:g}",
+            f"{motion.mean_px:.3f}",
+            f"{psnr(bicubic):.1f}",
+            f"{deconvolved:.1f}",
+            f"**{psnr(flux_image):.1f}**",
+            f"{along_truth:.1f}",
+            f"{psnr(bicubic, thin):.1f}",
+            f"{psnr(flux_image, thin):.1f}",
+            f"{decided['super_resolution.rounds']}",
+        ]
+        return f"| {' | '.join(cells)} |"
+
+
+def richardson_lucy(image: np.ndarray, score: Any) -> float:
+    """Deconvolve a merge of scale 2 with the area of a pixel, and return the best score of all steps."""
+    kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25]).astype(np.float32)  # a box of 2 px, at any place in a cell
+    best, estimate = -np.inf, image.astype(np.float32) + 1e-6
+    for _ in range(STEPS):
+        seen = cv2.filter2D(estimate, cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE)
+        ratio = cv2.filter2D(image / np.maximum(seen, 1e-6), cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE)
+        estimate = estimate * ratio
+        best = max(best, score(estimate))
+    return float(best)
+
+
+def large(scene: Path, frames: int, seed: int) -> str:
+    """Measure the time and the memory of rendering a canvas of about 2,048x1,365 px along the true motion."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = {"kind": "scan", "length_px": 5000.0, "rows": 6, "row_spacing_px": 85.0}
+        keys = {"frame_shape": [254, 496], "path": path, "scene": {"kind": "photo", "file": str(scene), "width": 2200}}
+        capture = simulated(folder, scene, 0.5, frames, seed, **keys)
+        truth = load_truth(capture.with_name("capture.truth.npz"))
+        plan = parse_spec(spec_of(capture), output=folder / "run")
+        from photonpano.pipeline.components import build_renderer
+
+        with open_source(plan) as source:
+            middle = len(truth.homographies) // 2
+            motion = np.linalg.inv(truth.homographies[middle]) @ truth.homographies
+            trajectory = FrameTrajectory(motion / motion[:, 2:, 2:])
+            renderer = build_renderer(plan, source, [])
+            canvas = plan_canvas(trajectory, source.info.span, source.info.frame_shape, 2.0, 2**31)
+            start = time.perf_counter()
+            render(source, trajectory, source.info.span, canvas, 0.125, Context(renderer.component._threads), renderer)
+            seconds = time.perf_counter() - start
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        return f"{canvas.width}x{canvas.height} px from {frames} frames: {seconds:.0f} s, peak memory {peak:.2f} GiB"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
