@@ -21,6 +21,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
 SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}
 SMALL_STREET = SMALL | {"source.with.scene": "{kind: street, width: 1024, height: 682}"}
 GROUPS = {"resample.with.group_size": 50}
+UNREFINED = GROUPS | {"refine": "[]"}
 SMALL_NIGHT = {
     "source.with.n_frames": 600,
     "source.with.frame_shape": "[128, 160]",
@@ -35,25 +36,25 @@ CAPTURES = {
 """Specs to simulate, with overrides that make them small. The group size is checked, though it is not used."""
 RUNS: dict[str, dict[str, Any]] = {
     "scan": GROUPS,
-    "naive-average": GROUPS,
-    "constant-groups": GROUPS,
-    "sliding-window": GROUPS,
+    "naive-average": UNREFINED,
+    "constant-groups": UNREFINED,
+    "sliding-window": UNREFINED,
     "super-resolution": GROUPS,
     "gradual-super-resolution": GROUPS,
-    "coarse-to-fine": GROUPS,
-    "keypoints": GROUPS,
-    "orb": GROUPS,
-    "ecc": GROUPS,
-    "translation": GROUPS,
+    "coarse-to-fine": UNREFINED,
+    "keypoints": UNREFINED,
+    "orb": UNREFINED,
+    "ecc": UNREFINED,
+    "translation": UNREFINED,
     "smoothing-spline": GROUPS,
-    "fallback": GROUPS,
-    "kornia": GROUPS,
-    "chain": GROUPS,
-    "colmap": GROUPS,
+    "fallback": UNREFINED,
+    "kornia": UNREFINED,
+    "chain": UNREFINED,
+    "colmap": UNREFINED,
     "demo": GROUPS,
-    "swissspad": GROUPS | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
+    "swissspad": UNREFINED | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
     "sums": {"resample.with.group_size": 25},
-    "visionsim": GROUPS,
+    "visionsim": UNREFINED,
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
     "colour": SMALL_STREET | {"resample.with.group_size": 60},

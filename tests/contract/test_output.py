@@ -124,6 +124,7 @@ def test_record_names_source_components_and_versions(record: dict[str, Any], sma
         ("locate", "opencv-sift"),
         ("interpolate", "smoothing-spline"),
         ("refine", "short-spans"),
+        ("render", "merge"),
     ]
     assert all(plugin["plugin"] == "photonpano" and plugin["version"] for plugin in record["plugins"])
     assert {"python", "numpy", "opencv-python-headless", "scipy"} <= set(record["libraries"])

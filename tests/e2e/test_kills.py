@@ -10,7 +10,7 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "kills.py"
 
 
 def test_killed_runs_end_with_the_same_bytes() -> None:
-    command = [sys.executable, str(SCRIPT), "--moments", "2", "--writing", "1", "--seed", "1"]
+    command = [sys.executable, str(SCRIPT), "--moments", "1", "--writing", "1", "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 of 2 runs ended with the same bytes and left nothing behind" in done.stdout
+    assert "1 of 1 runs ended with the same bytes and left nothing behind" in done.stdout

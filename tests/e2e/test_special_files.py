@@ -136,7 +136,7 @@ def test_deeply_nested_record_is_one_sentence(folder: Path, small_run: RunResult
         ),
         (SOURCE + "refine: [" + "short-spans," * 4000 + "]", "expected at most 16 refiners, got a list of 4000"),
         (SOURCE + "seed: " + "7" * 2**18, "scan.yaml: not a spec: longer than 262144 bytes"),
-        (SOURCE + "run: {seed: '" + "7" * 260_000 + "'}", "scan.yaml:3:7: run.seed: expected"),
+        (SOURCE + "run: {seed: '" + "7" * 260_000 + "'}", "scan.yaml:3:13: run.seed: expected"),
     ],
     ids=["values", "depth", "chain", "refiners", "file", "text"],
 )

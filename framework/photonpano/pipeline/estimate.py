@@ -64,13 +64,14 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     levels = build_levels(plan, source, decisions)
     timeline = timeline_of(source, context)
     results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline)
-    known, later = results[0].trajectory, levels[1:]
+    first, later = results, levels[1:]
+    known = first[0].trajectory
     if vignette := vignette_of(plan, source, known):
         decisions.append(vignette.decision)
         source, context = divided_by(source, vignette), replace(context, checkpoints=context.checkpoints.within(vignette))
         if not later:
             results, later = [], levels
-    lit = _lit(plan, source, levels, known, reference, timeline, context)
+    lit = _lit(plan, source, levels, first, reference, timeline, context)
     if lit is not None:
         source, context, first, decision = lit
         decisions.append(decision)
@@ -88,20 +89,21 @@ def _lit(
     plan: Plan,
     source: Source,
     levels: Sequence[Level],
-    known: Trajectory,
+    steady: Sequence[LevelResult],
     reference: int,
     timeline: Timeline,
     context: Context,
 ) -> tuple[Source, Context, list[LevelResult], Decision] | None:
     """Measure the light of a capture along a motion, and estimate the first level again in this light.
 
-    `light: steady` measures it, too, and warns if it changes. The first motion was estimated in light that seemed steady, so
-    that the light is measured once more along the second one.
+    `light: steady` measures it, too, and warns if it changes. The first motion, of the results `steady`, was estimated in light
+    that seemed steady, so that the light is measured once more along the second one. `light: auto` takes the light for steady
+    if the photons are explained worse in the light that was found.
 
     Returns:
         The capture in its light, its context, the first level in it, and the decision; None if the light is steady.
     """
-    changing = plan.light.mode == "changing"
+    changing, known = plan.light.mode == "changing", steady[0].trajectory
     light = measure_light(source, known, context) if changing else find_light(source, known, context)
     if light is None:
         return None
@@ -114,6 +116,11 @@ def _lit(
         known = results[0].trajectory
         if not final:
             light = measure_light(source, known, context)
+    if not changing:
+        before = _look(plan, source, steady, reference, context)
+        if worse := _look(plan, in_this, results, reference, within).worse_than(before):
+            logger.debug("the light is taken for steady: in the light that was found, %s", worse)
+            return None
     return in_this, within, results, decision_of(light, source.info.frame_rate_hz)
 
 

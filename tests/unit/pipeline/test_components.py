@@ -14,6 +14,7 @@ from photonpano import (
     LocatorContribution,
     MergerContribution,
     PluginError,
+    RendererContribution,
     Requirement,
     ResamplerContribution,
     Response,
@@ -23,7 +24,7 @@ from photonpano import (
     StreamInfo,
 )
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
+from photonpano.pipeline.components import build_levels, build_renderer, build_source, foreseen_groups, scale_of
 from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec
@@ -44,7 +45,7 @@ class Built:
 
     def nothing(self, *_: Any) -> None: ...
 
-    counts = frames = close = groups = merge = describe = register = fit = refine = nothing
+    counts = frames = close = groups = merge = describe = register = fit = refine = render = nothing
 
 
 KINDS: list[Any] = [
@@ -53,8 +54,9 @@ KINDS: list[Any] = [
     MergerContribution,
     LocatorContribution,
     InterpolatorContribution,
+    RendererContribution,
 ]
-SECTIONS = ("source", "resample", "merge", "locate", "interpolate")
+SECTIONS = ("source", "resample", "merge", "locate", "interpolate", "render")
 
 
 def plan(levels: Any = 1, **changes: Any) -> Plan:
@@ -151,11 +153,17 @@ def broken(*_: Any) -> Any:
     raise RuntimeError("no such device")
 
 
+def build_all(made: Plan) -> None:
+    source = build_source(made)
+    build_levels(made, source, [])
+    build_renderer(made, source, [])
+
+
 @pytest.mark.parametrize("kind", [kind.kind for kind in KINDS])
 def test_component_that_cannot_be_built_is_named(kind: str) -> None:
     made = plan(**{kind: {"build": broken}})
     with pytest.raises(PluginError) as caught:
-        build_levels(made, build_source(made), [])
+        build_all(made)
     assert str(caught.value) == f"{kind} 'toy' of toys 1.0 could not be built: RuntimeError: no such device"
 
 
