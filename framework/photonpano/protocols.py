@@ -1,4 +1,4 @@
-"""The interfaces of the seven components that plugins build."""
+"""The interfaces of the eight components that plugins build."""
 
 from __future__ import annotations
 
