@@ -73,10 +73,6 @@ class SourceWrapper(Closing):
         del shape
         return method(span)
 
-    def around(self, source: Source) -> Source:
-        """Return the same wrapper around the source of one colour; a wrapper of a `ColouredSource` has to know how."""
-        raise NotImplementedError(f"{type(self).__name__} does not wrap sources in colour")
-
 
 class PackedWrapper(SourceWrapper):
     """A wrapper of a `PackedSource`."""
@@ -108,7 +104,13 @@ class WeightedWrapper(SourceWrapper):
 
 
 class ColouredWrapper(SourceWrapper):
-    """A wrapper of a `ColouredSource`, whose sources it wraps as well."""
+    """A wrapper of a `ColouredSource`, whose sources it wraps as well.
+
+    Attributes:
+        around: returns the same wrapper around the source of one colour; the class that inherits has this method.
+    """
+
+    around: Callable[[Source], Source]
 
     def colours(self) -> Mapping[str, Source]:
         """Return a source for each colour: see `ColouredSource`."""

@@ -25,6 +25,7 @@ from photonpano.geometry import Canvas, FrameTrajectory, inverse, normalised, tr
 from photonpano.lighting import find_light, in_light
 from photonpano.merging.panorama import render
 from photonpano.pipeline.components import open_source
+from photonpano.protocols import KnowsTruth
 from photonpano.values import FloatArray, Light
 
 Settings: TypeAlias = dict[str, Any]
@@ -143,7 +144,8 @@ def false_alarm(seed: int) -> bool:
     keys = {"scene": scene, "path": path, "seed": seed, "flux": flux, "frame_shape": [64, 96], "n_frames": 1000}
     plan = parse_spec({"version": 1, "source": {"use": "simulator", "with": keys}})
     with open_source(plan) as source:
-        homographies = source.truth()["homographies"]  # type: ignore[attr-defined]
+        assert isinstance(source, KnowsTruth)
+        homographies = np.asarray(source.truth()["homographies"], float)
         wrong = np.array([translation(*each) for each in _wander(rng, len(homographies))])
         motion = normalised(inverse(homographies[500]) @ homographies @ wrong)
         return find_light(source, FrameTrajectory(motion), Context(2)) is not None

@@ -34,7 +34,7 @@ _FLUX = np.array([[0.0, 0.01, 0.3], [0.3, 0.01, np.nan]], np.float32)
 def attributed(source: Source, origin: str) -> AttributedSource:
     """Return a source whose errors name the plugin, whether a merger, the renderer or a preview reads it.
 
-    It has the methods `packed`, `corrected` and `truth` if the source has them.
+    It has the optional methods that the source has. Of a `ColouredSource`, the sources of the colours name the plugin, too.
 
     Args:
         source: the source.
@@ -92,6 +92,10 @@ class AttributedSource(SourceWrapper):
     def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
         """See `SourceWrapper`: reads packed frames."""
         return self._checked("packed", method, span, shape, 255)
+
+    def around(self, source: Source) -> AttributedSource:
+        """See `ColouredWrapper`."""
+        return attributed(source, self._origin)
 
     def close(self) -> None:
         """Close the source; a failure is logged, since what was read from it is not affected."""

@@ -11,6 +11,7 @@ import pytest
 from photonpano import FrameSpan, InputError, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
 from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import AttributedTrajectory
+from photonpano.protocols import ColouredSource
 
 ORIGIN = "source 'toy' of toys 1.0"
 SPAN = FrameSpan(2, 5)
@@ -51,6 +52,17 @@ def test_attributed_source_has_the_optional_methods_of_the_source(source: Any) -
     source.packed = raising(OSError("gone"))
     with pytest.raises(PluginError, match=r"failed at frames 2 to 4: OSError: gone"):
         attributed(source, ORIGIN).packed(SPAN)
+
+
+def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type) -> None:
+    red = memory_source(source.frames(FrameSpan(0, 8)))
+    red.counts = raising(OSError("gone"))
+    source.colours = lambda: {"red": red}
+    source.clear_mix = lambda: np.ones(3)
+    named = attributed(source, ORIGIN)
+    assert isinstance(named, ColouredSource)
+    with pytest.raises(PluginError, match=r"toys 1\.0.* failed at frames 2 to 4: OSError: gone"):
+        named.colours()["red"].counts(SPAN)
 
 
 def test_attributed_source_closes_the_source(source: Any) -> None:
