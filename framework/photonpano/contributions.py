@@ -264,11 +264,14 @@ class RendererContribution(StageContribution):
     Attributes:
         bytes_per_pixel: peak memory of rendering for a pixel of the canvas. The framework renders a canvas that exceeds the
             memory of the run in tiles.
+        divides_by_light: whether it divides by the gains of a `LitSource`, as `photonpano.merging.accumulate` does. If not, a
+            run in changing light warns that the panorama shows the light of the moment.
     """
 
     kind: ClassVar[str] = "renderer"
     build: Callable[[Any, StageContext], Renderer]
     bytes_per_pixel: int = 40
+    divides_by_light: bool = False
 
     def __post_init__(self) -> None:
         StageContribution.__post_init__(self)

@@ -157,6 +157,7 @@ def photonpano_renderers() -> Iterator[RendererContribution]:
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=MergeConfig,
         build=_build_merge,
+        divides_by_light=True,
     )
     yield RendererContribution(
         name="super-resolution",

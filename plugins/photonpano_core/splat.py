@@ -5,9 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FloatArray, FrameSpan, Group, InputError, LinearlyCorrectedSource, Source, Trajectory, VirtualExposure
+from photonpano import (
+    FloatArray,
+    FrameSpan,
+    Group,
+    InputError,
+    LinearlyCorrectedSource,
+    LitSource,
+    Source,
+    Trajectory,
+    VirtualExposure,
+)
 from photonpano.geometry import apply, corners, inverse
-from photonpano.merging import PhotonSum
+from photonpano.merging import PhotonSum, gain_image
 from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 from photonpano_core.splatting import add_coverage, splat
 
@@ -22,7 +32,8 @@ class SplatMerger:
 
     Frames are not summed before they are warped, so that no photon is misplaced. Dark pixels cost nothing: the time per frame
     grows with the number of its photons, not with the motion. The weight is the warp of frames of ones, so that the quotient is
-    not biased at masks, at borders and where the grid is finer than a frame.
+    not biased at masks, at borders and where the grid is finer than a frame. In changing light it is multiplied by the mean
+    gain of the group.
     """
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
@@ -43,6 +54,10 @@ class SplatMerger:
             to_grid = to_exposure(group, trajectory, scale) @ trajectory.at(frames)
             to_grid /= np.cbrt(np.linalg.det(to_grid))[:, None, None]
             photons = _splatted(source, group.span, to_grid, exposure_shape(source, scale))
+            if isinstance(source, LitSource):
+                to_plane = inverse(to_exposure(group, trajectory, scale))
+                gain = gain_image(source.light, group.span, to_plane, exposure_shape(source, scale))
+                photons = PhotonSum(photons.counts, photons.weight * gain)
         return exposure_of(photons, source, group, scale)
 
 

@@ -3,6 +3,7 @@
 from photonpano.merging.accumulate import PhotonSum, accumulate, divided
 from photonpano.merging.binning import binned_mean, binning_of
 from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
+from photonpano.merging.light import gain_image
 from photonpano.merging.merge_renderer import MergeRenderer
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "chunks_of",
     "clipped",
     "divided",
+    "gain_image",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import attributing, shown
 from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
-from photonpano.protocols import Resampler, Source
+from photonpano.protocols import Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from photonpano.pipeline.exports import AttributedExporter
     from photonpano.pipeline.renderers import AttributedRenderer
     from photonpano.residuals.refinement import NamedRefiner
+
+logger = logging.getLogger(__name__)
 
 HALVED_LEVELS = 2
 """With `scale: auto`, the first two levels are located at half size."""
@@ -152,6 +155,11 @@ def build_renderer(plan: Plan, source: Source, decisions: list[Decision]) -> Att
         source.info, source.response, plan.run.seed, thread_count(plan.run.threads), decide=_recorder(decisions)
     )
     assert isinstance(contribution, RendererContribution)
+    if light_of(source) is not None and not contribution.divides_by_light:
+        logger.warning(
+            f"{choice.label} does not divide by the light, which changes: the panorama shows each place in the mean light of "
+            "the frames that saw it; render with {use: merge} to divide by it"
+        )
     return AttributedRenderer(_built(choice, context), choice.label, contribution.bytes_per_pixel)
 
 

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError, Trajectory, VirtualExposure
+from photonpano import FrameSpan, Group, InputError, Light, Trajectory, VirtualExposure
 from photonpano.geometry import inverse, rescaling
+from photonpano.lighting import in_light
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.photon_mle import PhotonMleMerger
@@ -190,3 +191,11 @@ def test_splat_refuses_source_with_corrected_sums() -> None:
             "splat warps photons one by one, so that dark counts cannot be subtracted, nor pixels interpolated; merge with "
             "photon-mle, or use only corrections that move or mask pixels"
         )
+
+
+def test_splat_divides_by_mean_gain_of_group(memory_source: type, frames: np.ndarray, rigid: Trajectory) -> None:
+    gain = 1 + 0.8 * np.cos(np.arange(N) / 3)
+    plain = SplatMerger().merge(memory_source(frames), GROUP, rigid, 1.0)
+    lit = SplatMerger().merge(in_light(memory_source(frames), Light.of_frames(gain)), GROUP, rigid, 1.0)
+    np.testing.assert_allclose(lit.weight, plain.weight * gain[2 : N - 2].mean(), rtol=1e-5)
+    np.testing.assert_allclose(counts_of(lit), counts_of(plain), atol=1e-3)

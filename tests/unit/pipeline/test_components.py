@@ -23,12 +23,14 @@ from photonpano import (
     StageContext,
     StreamInfo,
 )
+from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_renderer, build_source, foreseen_groups, scale_of
 from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec
-from photonpano.values import Decision
+from photonpano.testing import MemorySource
+from photonpano.values import Decision, Light
 
 
 class Keys(Config):
@@ -157,6 +159,19 @@ def build_all(made: Plan) -> None:
     source = build_source(made)
     build_levels(made, source, [])
     build_renderer(made, source, [])
+
+
+@pytest.mark.parametrize(("divides", "lit"), [(False, True), (True, True), (False, False)])
+def test_renderer_that_ignores_changing_light_is_named(divides: bool, lit: bool, caplog: pytest.LogCaptureFixture) -> None:
+    source: Any = MemorySource(np.zeros((4, 8, 16)))
+    if lit:
+        source = in_light(source, Light.of_frames(np.array([0.5, 1, 1, 1.5])))
+    build_renderer(plan(renderer={"divides_by_light": divides}), source, [])
+    warning = (
+        "renderer 'toy' of toys 1.0 does not divide by the light, which changes: the panorama shows each place in the mean "
+        "light of the frames that saw it; render with {use: merge} to divide by it"
+    )
+    assert caplog.messages == ([warning] if lit and not divides else [])
 
 
 @pytest.mark.parametrize("kind", [kind.kind for kind in KINDS])
