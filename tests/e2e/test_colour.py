@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from photonpano import InputError, evaluate, parse_spec, preview, run
+from photonpano import InputError, SpecError, evaluate, parse_spec, preview, run
 from photonpano.captures.writing import truth_path
 from photonpano.pipeline.run import RunResult
 
@@ -54,6 +54,16 @@ def test_picture_is_in_colour_and_balanced(coloured: RunResult) -> None:
     assert picture[..., 0].mean() < 0.1 * picture[..., 2].mean()  # blue first
     assert np.nanmean(flux[..., 2]) > 0.5 * np.nanmean(flux[..., 0])
     assert "<img" in (coloured.directory / "report.html").read_text(encoding="utf-8")
+
+
+def test_white_balance_of_a_grey_capture_is_refused(spec: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(SpecError) as caught:
+        run(parse_spec({**spec, "corrections": []}, output=tmp_path / "grey"))
+    assert str(caught.value) == (
+        "render.white_balance: the capture is grey; remove this key, or name the colour filter: "
+        "corrections: [{colour-filter: {...}}]"
+    )
+    assert not (tmp_path / "grey").exists()
 
 
 def test_motion_is_that_of_a_grey_capture_and_the_panorama_near_the_oracle(coloured: RunResult, capture: Path) -> None:

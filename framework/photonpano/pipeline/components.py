@@ -18,7 +18,7 @@ from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import attributing, shown
 from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
-from photonpano.protocols import Resampler, Source, light_of
+from photonpano.protocols import ColouredSource, Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
@@ -45,11 +45,15 @@ def open_source(plan: Plan) -> Iterator[Source]:
 
     Raises:
         InputError: the capture cannot be used as it is.
-        SpecError: a stage does not suit it.
+        SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
     """
     built = build_source(plan)
     with without_still_pixels(built) if plan.corrects_itself else built as source:
-        if problems := check_stream(plan, source.info):
+        problems = check_stream(plan, source.info)
+        if plan.render.white_balance != "none" and not isinstance(source, ColouredSource):
+            message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
+            problems.append(plan.place("render.white_balance").problem(message))
+        if problems:
             raise SpecError(problems)
         yield source
 
