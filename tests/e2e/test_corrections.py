@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import photonpano
 from photonpano import FrameSpan, SpecError, evaluate, open_source, run
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.cli.app import app
@@ -195,3 +196,7 @@ def test_run_divides_by_vignette(simulated: Callable[..., Path], tmp_path: Path)
         errors[name] = scored(spec | {"corrections": "auto"}, capture, tmp_path / name).trajectory.mean_px
     assert errors["divided"] < 1.5 * errors["clean"] + 0.02
     assert errors["as read"] > 2 * errors["divided"]
+    again = photonpano.render(tmp_path / "divided" / "run", tmp_path / "again")
+    whole = json.loads((tmp_path / "divided" / "run" / "run.json").read_text())
+    assert "vignette.npz" in whole["files"]
+    assert again.record["files"] == {name: each for name, each in whole["files"].items() if name != "report.html"}

@@ -7,18 +7,16 @@ import time
 from pathlib import Path
 
 from photonpano.api.captures import simulate
+from photonpano.api.opened_run import opened_run
 from photonpano.context import Context, Progress, Quiet
 from photonpano.evaluation import Evaluation
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.geometry import Canvas
-from photonpano.lighting import in_light_of
 from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render
-from photonpano.pipeline.components import build_renderer, open_source
+from photonpano.pipeline.components import build_renderer
 from photonpano.pipeline.run import run
 from photonpano.protocols import Trajectory
-from photonpano.record.contents import finish_run_folder, require_same_frames
-from photonpano.record.run_json import read_record
 from photonpano.registry import Catalog
 from photonpano.specs import parse_spec
 from photonpano.threads import thread_count
@@ -46,19 +44,14 @@ def evaluate(
     """
     if not oracle:
         return evaluate_folder(run_folder, truth)
-    folder = Path(run_folder)
-    finish_run_folder(folder)
-    record = read_record(folder)
-    plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog)
-    with open_source(plan) as source:
-        require_same_frames(folder, record, source)
-        lit = in_light_of(source, folder)
+    with opened_run(Path(run_folder), catalog) as opened:
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
+            source, plan = opened.source, opened.plan
             context = Context(thread_count(plan.run.threads), progress or Quiet())
-            renderer = build_renderer(plan, lit, [])
-            images = render(lit, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
-            return composed(images, lit)
+            renderer = build_renderer(plan, source, [])
+            images = render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
+            return composed(images, source)
 
         return evaluate_folder(run_folder, truth, along_truth)
 

@@ -18,6 +18,7 @@ from photonpano.cli.explain import explain
 from photonpano.cli.info import info
 from photonpano.cli.plugins import plugins
 from photonpano.cli.preview import preview
+from photonpano.cli.render import render
 from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
@@ -46,7 +47,10 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-_COMMANDS = (run, check, check_run, verify, explain, info, preview, convert, simulate, dark, evaluate, clean, schema, warm_up)
+_COMMANDS = (
+    *(run, check, check_run, verify, render, explain, info, preview, convert),
+    *(simulate, dark, evaluate, clean, schema, warm_up),
+)
 for command in _COMMANDS:
     app.command()(command)
 app.add_typer(plugins, name="plugins")

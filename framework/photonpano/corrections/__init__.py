@@ -17,7 +17,8 @@ from photonpano.corrections.masks import Mask
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.source import CorrectedSource, corrected_source
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
-from photonpano.corrections.vignette import VIGNETTE_DECISION, Vignette, divided_by, estimate_vignette
+from photonpano.corrections.vignette import Vignette, divided_by, estimate_vignette
+from photonpano.corrections.vignette_file import read_vignette, write_vignette
 
 _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
@@ -30,7 +31,6 @@ CORRECTIONS = {correction.name: correction for correction in _ALL}
 
 __all__ = [
     "CORRECTIONS",
-    "VIGNETTE_DECISION",
     "CorrectedSource",
     "Correction",
     "DarkCounts",
@@ -45,6 +45,8 @@ __all__ = [
     "hot_in_the_dark",
     "measure_dark",
     "read_dark",
+    "read_vignette",
     "without_still_pixels",
     "write_dark",
+    "write_vignette",
 ]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photonpano.geometry import FrameTrajectory
 from photonpano.motion.loop import LevelResult
 from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, FloatArray, FrameSpan, StreamInfo
@@ -20,7 +21,7 @@ class FrameMotion:
         Homographies map frame pixels to reference pixels; points are (x, y), integers are pixel centres.
 
     Attributes:
-        trajectory: the homography of any instant.
+        trajectory: the homography of any instant, from those of the frames: what a run stores is all that it renders along.
         span: the frames from the first to the last that a located exposure holds.
         homographies: (T, 3, 3), one for each frame.
         located: (T,), False outside `span`.
@@ -50,4 +51,6 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     frames, span = np.arange(stream.n_frames), last.located.covered
     located = (span.start <= frames) & (frames < span.stop)
     std_px = np.where(located, last.uncertainty.at(frames), np.inf)
-    return FrameMotion(last.trajectory, span, last.trajectory.at(frames), located, std_px, reference, stream.frame_shape)
+    homographies = last.trajectory.at(frames)
+    trajectory = FrameTrajectory(homographies)
+    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape)

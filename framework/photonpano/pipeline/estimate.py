@@ -36,6 +36,7 @@ class Estimate:
         results: of all levels.
         timeline: where frames repeat, and where the image jumps.
         look: the motion, the panorama along it, and what that does not explain.
+        vignette: by which the source is divided.
     """
 
     source: Source
@@ -43,6 +44,7 @@ class Estimate:
     results: list[LevelResult]
     timeline: Timeline
     look: Look
+    vignette: Vignette | None
 
 
 def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Context) -> Estimate:
@@ -78,7 +80,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         known = first[0].trajectory
         results, later = first, levels[1:]
     results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
-    found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context))
+    found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context), vignette)
     if cuts := find_cuts(source, found.look, context):
         found = _cut_at(cuts, plan, found)
     decisions += found.timeline.decisions

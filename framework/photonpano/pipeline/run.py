@@ -17,16 +17,16 @@ from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
 from photonpano.corrections import CorrectedSource, FilteredSource
 from photonpano.errors import InputError, OutputError
-from photonpano.merging.panorama import RenderedPanorama, render_panorama
+from photonpano.merging.panorama import RenderedPanorama
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
-from photonpano.pipeline.components import build_exporters, build_refiners, build_renderer, open_source
+from photonpano.pipeline.components import build_refiners, open_source
 from photonpano.pipeline.estimate import estimate
-from photonpano.pipeline.exports import export_all
 from photonpano.pipeline.observers import Observers
+from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import RunFolder, run_folder
-from photonpano.protocols import Source, light_of
+from photonpano.protocols import Source
 from photonpano.record.run_json import peak_memory_bytes, record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
@@ -115,28 +115,15 @@ def run(
         explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)
         verdict = judge(explained, found.results, decisions)
         motion = explained.motion
-        renderer, exporters = build_renderer(plan, source, decisions), build_exporters(plan, source, decisions)
-        panorama = render_panorama(
-            renderer,
-            source,
-            motion.trajectory,
-            motion.span,
-            plan.render,
-            memory,
-            folder.write_tile,
-            context,
-            renderer.bytes_per_pixel,
-            explained.panorama if renderer.merges else None,
-        )
-        renderer.require_seen(panorama.coverage_share)
+        rendering = render_into(folder, plan, source, found.vignette, motion, context, explained.panorama)
+        panorama, rendered = rendering.panorama, rendering.decisions
         observers.rendered(panorama.canvas, panorama.seconds)
-        folder.write_results(panorama, motion)
-        export_all(exporters, folder.staging, panorama)
-        if (light := light_of(source)) is not None:
-            folder.write_light(light)
         seconds = time.perf_counter() - start
         record = folder.commit(
-            record_of(plan, source.info, decisions, found.results, explained, verdict, panorama, seconds, depends_on["capture"])
+            record_of(
+                *(plan, source.info, decisions, found.results, explained, verdict, panorama, rendered, seconds),
+                depends_on["capture"],
+            )
         )
         work.finish()
         record = _with_report(folder, record, explained, panorama)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import tifffile
 
+from photonpano.corrections import Vignette, write_vignette
 from photonpano.errors import OutputError
 from photonpano.folders import (
     finish_replacement,
@@ -81,6 +82,11 @@ class RunFolder:
         """Write light.npz."""
         with _writing(self.directory):
             write_light(self.staging, light)
+
+    def write_vignette(self, vignette: Vignette) -> None:
+        """Write vignette.npz."""
+        with _writing(self.directory):
+            write_vignette(self.staging, vignette)
 
     def write_report(self, page: str) -> None:
         """Write report.html."""

@@ -21,7 +21,12 @@ from photonpano.record.schema import FileContent
 logger = logging.getLogger(__name__)
 
 RECORD = "run.json"
-RESULTS = frozenset({"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "light.npz", "report.html", RECORD})
+RESULTS = frozenset(
+    {
+        *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "light.npz", "vignette.npz", "report.html"),
+        RECORD,
+    }
+)
 """The files of a run. Runs of older versions do not list theirs."""
 
 

@@ -53,6 +53,7 @@ def record_of(
     explained: Explained,
     verdict: Verdict,
     panorama: RenderedPanorama,
+    rendered: Sequence[Decision],
     seconds: float,
     capture: CaptureRecord,
 ) -> RunRecord:
@@ -66,6 +67,7 @@ def record_of(
         explained: the motion of every frame, and what refiners did.
         verdict: whether it is trusted.
         panorama: the panorama.
+        rendered: the choices of renderer and exporters.
         seconds: time that the run took.
         capture: its fingerprint.
     """
@@ -88,9 +90,9 @@ def record_of(
         },
         "plugins": plugin_records(plan),
         "libraries": library_versions(plan),
-        "decisions": [DecisionRecord(what=each.what, value=each.value, reason=each.reason) for each in decisions],
+        "decisions": decision_records([*decisions, *rendered]),
         "levels": [level_record(result) for result in levels],
-        "panorama": panorama_record(plan, panorama),
+        "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
         "verdict": verdict_record(verdict),
@@ -193,8 +195,13 @@ def level_record(result: LevelResult) -> LevelRecord:
     }
 
 
-def panorama_record(plan: Plan, panorama: RenderedPanorama) -> PanoramaRecord:
-    """Describe the panorama."""
+def decision_records(decisions: Sequence[Decision]) -> list[DecisionRecord]:
+    """Describe what was chosen from the capture."""
+    return [DecisionRecord(what=each.what, value=each.value, reason=each.reason) for each in decisions]
+
+
+def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[Decision]) -> PanoramaRecord:
+    """Describe the panorama, and name the choices of renderer and exporters."""
     record: PanoramaRecord = {
         "height": panorama.canvas.height,
         "width": panorama.canvas.width,
@@ -203,6 +210,7 @@ def panorama_record(plan: Plan, panorama: RenderedPanorama) -> PanoramaRecord:
         "white_flux": panorama.white_flux,
         "coverage_share": panorama.coverage_share,
         "seconds": round(panorama.seconds, 3),
+        "decisions": [each.what for each in rendered],
     }
     if (found := panorama.dynamic_range) is not None:
         record["dynamic_range_db"] = _rounded(found.decibels)

@@ -102,7 +102,8 @@ class PanoramaRecord(TypedDict):
     `picture_reduction` is the factor by which the PNG is smaller than the panorama, 1 unless that was rendered in tiles.
     `dynamic_range_db` is the ratio of the highest and the lowest flux that exceed their standard deviation, and
     `measurable_range_db` what the mean number of frames over a pixel can measure, both None where nothing exceeds its noise;
-    `saturated_share` is the share of the seen pixels that were lit in every frame.
+    `saturated_share` is the share of the seen pixels that were lit in every frame. `decisions` are the names of those that
+    renderer and exporters took.
     """
 
     height: int
@@ -115,6 +116,7 @@ class PanoramaRecord(TypedDict):
     dynamic_range_db: NotRequired[float | None]
     measurable_range_db: NotRequired[float | None]
     saturated_share: NotRequired[float]
+    decisions: Sequence[str]
 
 
 class RefinementRecord(TypedDict):
@@ -163,6 +165,7 @@ class RunRecord(TypedDict):
 
     `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none; `peak_memory_bytes` is None where the
     system does not report it. `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
+    `rendered_from` is the run folder whose motion was rendered again.
     """
 
     photonpano: str
@@ -185,3 +188,4 @@ class RunRecord(TypedDict):
     peak_memory_bytes: int | None
     capture: CaptureRecord
     files: NotRequired[Mapping[str, FileContent]]
+    rendered_from: NotRequired[str]

@@ -130,7 +130,7 @@ def test_check_run_refuses_folder_that_is_no_run(finished: Path, tmp_path: Path)
 def test_check_run_refuses_run_without_located_frames(finished: Path) -> None:
     change(finished, lambda record: record.pop("files"))
     change_trajectory(finished, located=np.zeros(300, np.bool_))
-    assert error_of(finished) == f"{finished}: the run located no frame, so that there is nothing to judge"
+    assert error_of(finished) == f"{finished}: the run located no frame, so that it has no panorama"
 
 
 def test_check_run_refuses_files_of_two_runs(finished: Path) -> None:

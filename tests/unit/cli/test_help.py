@@ -45,6 +45,7 @@ def test_commands_are_complete() -> None:
         "run",
         "check",
         "check-run",
+        "render",
         "verify",
         "explain",
         "info",

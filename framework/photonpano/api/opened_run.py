@@ -1,0 +1,122 @@
+"""Open a finished run: its capture, as the run has seen it, and its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from photonpano.corrections import Vignette, divided_by, read_vignette
+from photonpano.errors import InputError, SpecError
+from photonpano.evaluation import RunTrajectory, load_run_trajectory
+from photonpano.geometry import FrameTrajectory
+from photonpano.lighting import in_light_of
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.pipeline.components import open_source
+from photonpano.protocols import Source
+from photonpano.record.contents import require_one_run, require_same_frames
+from photonpano.record.run_json import read_record
+from photonpano.record.schema import RunRecord
+from photonpano.registry import Catalog
+from photonpano.specs import Plan, parse_spec
+from photonpano.values import FrameSpan, StreamInfo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenedRun:
+    """A finished run, with its capture.
+
+    Attributes:
+        folder: the run folder.
+        record: its run.json.
+        plan: of its spec.
+        capture: the capture, as its source and the corrections of the spec give it.
+        source: the same, divided by the vignette that the run found, and in the light that it found.
+        vignette: by which it is divided.
+        motion: of every frame; where the run did not record `std_px`, it is 0.
+        has_std_px: whether the run recorded `std_px`.
+    """
+
+    folder: Path
+    record: RunRecord
+    plan: Plan
+    capture: Source
+    source: Source
+    vignette: Vignette | None
+    motion: FrameMotion
+    has_std_px: bool
+
+
+@contextmanager
+def opened_run(
+    folder: Path,
+    catalog: Catalog | None = None,
+    changes: Sequence[str] = (),
+    output: Path | None = None,
+) -> Iterator[OpenedRun]:
+    """Open a finished run and its capture.
+
+    Args:
+        folder: the run folder.
+        catalog: what can be chosen; by default what the installed plugins offer.
+        changes: values of the recorded spec to change, such as `render.scale=2`.
+        output: the run folder of the changed spec.
+
+    Raises:
+        InputError: the folder is no run folder, its files are of several runs, its capture cannot be opened, or it is another
+            capture now.
+        SpecError: a change is wrong.
+    """
+    require_one_run(folder, ["trajectory.npz", "light.npz", "vignette.npz"])
+    run = load_run_trajectory(folder, needs_std_px=False)
+    record = read_record(folder)
+    with _capture(folder, record, catalog, changes, output) as (plan, capture):
+        _require_same_capture(folder, run, capture.info)
+        require_same_frames(folder, record, capture)
+        vignette = read_vignette(folder, capture)
+        source = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
+        yield OpenedRun(folder, record, plan, capture, source, vignette, _motion(run), not np.isnan(run.std_px).any())
+
+
+@contextmanager
+def _capture(
+    folder: Path, record: RunRecord, catalog: Catalog | None, changes: Sequence[str], output: Path | None
+) -> Iterator[tuple[Plan, Source]]:
+    """Open the capture of a run by the spec that the run recorded."""
+    try:
+        plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog, overrides=changes, output=output)
+        opened = open_source(plan)
+        source = opened.__enter__()
+    except SpecError as error:
+        if any(problem.override for problem in error.problems):
+            raise
+        problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
+        raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
+    try:
+        yield plan, source
+    finally:
+        opened.__exit__(None, None, None)
+
+
+def _require_same_capture(folder: Path, run: RunTrajectory, stream: StreamInfo) -> None:
+    n_frames, (height, width) = len(run.homographies), run.frame_shape
+    if (stream.n_frames, *stream.frame_shape) != (n_frames, height, width):
+        raise InputError(
+            f"{folder} is a run of {n_frames:,} frames of {height}x{width}, but its capture now has {stream.n_frames:,} frames "
+            f"of {stream.height}x{stream.width}; it is another capture"
+        )
+    if not run.located.any():
+        raise InputError(f"{folder}: the run located no frame, so that it has no panorama")
+
+
+def _motion(run: RunTrajectory) -> FrameMotion:
+    """Return the motion of a run. An expected error that the run did not record is 0."""
+    known = np.flatnonzero(run.located)
+    span = FrameSpan(int(known[0]), int(known[-1]) + 1)
+    reference = int(np.abs(run.homographies - np.eye(3)).max(axis=(1, 2)).argmin())
+    trajectory = FrameTrajectory(run.homographies)
+    std_px = np.where(run.located, np.nan_to_num(run.std_px, posinf=np.inf), np.inf)
+    return FrameMotion(trajectory, span, run.homographies, run.located, std_px, reference, run.frame_shape)

@@ -1,0 +1,80 @@
+"""Render the panorama along a known motion, into a run folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from photonpano.context import Context
+from photonpano.corrections import Vignette
+from photonpano.merging.panorama import RenderedPanorama, render_panorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.pipeline.components import build_exporters, build_renderer
+from photonpano.pipeline.exports import export_all
+from photonpano.pipeline.run_folder import RunFolder
+from photonpano.protocols import Source, light_of
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision, Panorama
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendering:
+    """A panorama whose files are written.
+
+    Attributes:
+        panorama: what the files hold.
+        decisions: what renderer and exporters chose.
+    """
+
+    panorama: RenderedPanorama
+    decisions: tuple[Decision, ...]
+
+
+def render_into(
+    folder: RunFolder,
+    plan: Plan,
+    source: Source,
+    vignette: Vignette | None,
+    motion: FrameMotion,
+    context: Context,
+    ready: Panorama | None = None,
+) -> Rendering:
+    """Render the panorama, and write it, its motion, and what its capture was divided by.
+
+    Args:
+        folder: receives the files.
+        plan: renderer, exporters and settings.
+        source: the capture, divided by its vignette and in its light.
+        vignette: by which it is divided.
+        motion: of every frame.
+        context: threads, progress and checkpoints.
+        ready: the merge of all frames along this motion, where it is known.
+
+    Raises:
+        CanvasTooLargeError: the panorama would exceed the memory of the spec.
+        InputError: no frame shows the extent.
+        LocationError: frames reach the horizon of the reference plane.
+        OutputError: a file cannot be written.
+        PluginError: the renderer or an exporter failed, or broke its contract.
+    """
+    decisions: list[Decision] = []
+    renderer, exporters = build_renderer(plan, source, decisions), build_exporters(plan, source, decisions)
+    panorama = render_panorama(
+        renderer,
+        source,
+        motion.trajectory,
+        motion.span,
+        plan.render,
+        int(plan.run.memory),
+        folder.write_tile,
+        context,
+        renderer.bytes_per_pixel,
+        ready if renderer.merges else None,
+    )
+    renderer.require_seen(panorama.coverage_share)
+    folder.write_results(panorama, motion)
+    export_all(exporters, folder.staging, panorama)
+    if vignette is not None:
+        folder.write_vignette(vignette)
+    if (light := light_of(source)) is not None:
+        folder.write_light(light)
+    return Rendering(panorama, tuple(decisions))

@@ -1,0 +1,117 @@
+"""A finished run is rendered again: the bytes are those of a whole run, and wrong input is named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonpano import PhotonpanoError, parse_spec, render, run
+from photonpano.pipeline.run import RunResult
+
+
+def error_of(run_folder: Path, output: Path, *changes: str) -> str:
+    with pytest.raises(PhotonpanoError) as caught:
+        render(run_folder, output, changes)
+    assert not output.exists() or output == run_folder
+    return str(caught.value)
+
+
+def test_rendering_is_that_of_a_whole_run(small_run: RunResult, tmp_path: Path, without_report: None) -> None:
+    changes = ["render.scale=1.5", "render.extent=[10, 20, 90, 80]", "output.formats=[hdr]"]
+    whole = run(parse_spec(dict(small_run.record["spec"]), overrides=changes, output=tmp_path / "whole"))
+    again = render(small_run.directory, tmp_path / "again", changes)
+    names = {"panorama.tiff", "panorama.png", "panorama.hdr", "coverage.tiff", "trajectory.npz"}
+    assert set(again.record["files"]) == names
+    assert {name: again.record["files"][name] for name in names} == {name: whole.record["files"][name] for name in names}
+    differing = {key for key, value in whole.record.items() if again.record.get(key) != value}
+    assert differing <= {"created", "seconds", "peak_memory_bytes", "files", "panorama", "spec", "spec_file", "levels"}
+    assert again.record["rendered_from"] == str(small_run.directory)
+    assert json.loads((tmp_path / "again" / "run.json").read_text()) == again.record
+
+
+def test_rendering_of_a_rendering_is_the_same(small_run: RunResult, tmp_path: Path) -> None:
+    first = render(small_run.directory, tmp_path / "first", ["render.scale=0.5"])
+    second = render(first.directory, tmp_path / "second", ["render.scale=1"])
+    same = "panorama.tiff", "trajectory.npz"
+    assert [second.record["files"][name] for name in same] == [small_run.record["files"][name] for name in same]
+
+
+def test_decisions_of_the_renderer_are_replaced(small_run: RunResult, tmp_path: Path) -> None:
+    part = ["render.extent=[0, 0, 40, 32]", "run.threads=1"]
+    sharp = render(small_run.directory, tmp_path / "sharp", ["render.use=super-resolution", "render.scale=2", *part])
+    decided = set(sharp.record["panorama"]["decisions"])
+    assert decided
+    assert decided <= {each["what"] for each in sharp.record["decisions"]}
+    merged = render(sharp.directory, tmp_path / "merged", ["render.use=merge", *part])
+    assert merged.record["decisions"] == small_run.record["decisions"]
+
+
+def test_capture_that_was_moved_is_named_and_changed_one_refused(
+    small_run: RunResult, small_capture: Path, tmp_path: Path
+) -> None:
+    moved, folder = tmp_path / "moved.npy", tmp_path / "run"
+    shutil.copytree(small_run.directory, folder)
+    record = json.loads((folder / "run.json").read_text())
+    record["spec"]["source"]["with"]["path"] = str(tmp_path / "gone.npy")
+    (folder / "run.json").write_text(json.dumps(record))
+    shutil.copy(small_capture, moved)
+    output = tmp_path / "again"
+    assert error_of(folder, output) == (
+        f"{folder}: the capture of this run cannot be opened by its recorded spec (source: there is no file "
+        f"{tmp_path / 'gone.npy'}; check the path)"
+    )
+    again = render(folder, output, [f"source.with.path={moved}"])
+    assert again.record["files"]["panorama.tiff"] == small_run.record["files"]["panorama.tiff"]
+    assert [each["path"] for each in again.record["capture"]["files"]] == [str(moved)]
+    np.save(moved, np.load(moved)[::-1])
+    assert error_of(folder, tmp_path / "other", f"source.with.path={moved}") == (
+        f"{folder}: the capture has other frames than when it was run; it is another capture"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            "locate.use=opencv-sift",
+            "locate.use=opencv-sift: a rendering has only the sections render, output, run and source; run the spec again to "
+            "change others",
+        ),
+        (
+            "render.scale=-1",
+            "render.scale: expected a number from 0.05 to 16, got -1 (in the override render.scale=-1)",
+        ),
+        (
+            "render.reference=first",
+            "render.reference: the panorama of RUN lies in the plane of frame 'middle', and a rendering stays there; run the "
+            "spec again for 'first'",
+        ),
+        (
+            "render.extent=[5000, 0, 5001, 1]",
+            "render.extent: [5000, 0, 5001, 1] lies outside the panorama",
+        ),
+    ],
+)
+def test_change_that_a_rendering_cannot_make_is_named(small_run: RunResult, tmp_path: Path, change: str, message: str) -> None:
+    found = error_of(small_run.directory, tmp_path / "again", change).replace(str(small_run.directory), "RUN")
+    assert found.startswith(message)
+
+
+def test_run_is_not_replaced_by_its_own_rendering(small_run: RunResult) -> None:
+    folder = small_run.directory
+    assert error_of(folder, folder) == (f"{folder} would be replaced by its own rendering; choose another folder with --output")
+    assert (folder / "report.html").exists()
+
+
+def test_damaged_vignette_is_named(small_run: RunResult, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(small_run.directory, folder)
+    np.savez(folder / "vignette.npz", gain=np.ones((3, 4), np.float32), mean=np.ones((3, 4), np.float32))
+    assert error_of(folder, tmp_path / "again") == (
+        f"{folder / 'vignette.npz'}: gain must be float32 of shape (128, 160), as the frames, and is float32 of shape (3, 4); "
+        "run again"
+    )
