@@ -132,7 +132,7 @@ def table(found: Measured) -> bool:
     """Print the decades of flux; return whether the judged ones hold what is asked."""
     gathered = found.gathered
     print(f"\n{found.name}: {gathered.decibels:.0f} dB of {gathered.measurable_decibels:.0f} dB")
-    print("flux             pixels   error / bound   bias / bound   within 2 std")
+    print("flux             pixels   error / bound   bias / bound   error / std   within 2 std")
     error = found.flux - found.true
     edges = 10.0 ** np.arange(np.log10(LOWEST), np.log10(HIGHEST) + 0.1)
     parts = [(low, high, (found.true >= low) & (found.true < high)) for low, high in pairwise(edges)]
@@ -142,7 +142,9 @@ def table(found: Measured) -> bool:
             continue
         relative = error[part] / found.bound[part]
         rms, within = float(np.sqrt((relative**2).mean())), float((np.abs(error[part]) <= 2 * found.std[part]).mean())
-        print(f"{low:7.0e} to {high:5.0e} {part.sum():8d} {rms:15.3f} {relative.mean():+14.3f} {100 * within:13.1f} %")
+        claimed = float(np.sqrt(((error[part] / found.std[part]) ** 2).mean()))
+        figures = f"{rms:15.3f} {relative.mean():+14.3f} {claimed:13.3f} {100 * within:13.1f} %"
+        print(f"{low:7.0e} to {high:5.0e} {part.sum():8d} {figures}")
     finite = bool(np.isfinite(found.flux).all() and np.isfinite(found.std).all())
     are = "are finite" if finite else "are NOT finite"
     print(f"saturated: {100 * gathered.saturated_share:.3f} %; flux and standard deviation {are}")

@@ -1,13 +1,14 @@
-"""The noise of a panorama: its standard deviation and its saturated pixels, with the corrections of the sensor."""
+"""The noise of a merged panorama: its standard deviation and its saturated pixels, with the corrections of the sensor."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from photonpano.geometry import Canvas, rescaling
+from photonpano.merging.averaging import Averaging
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
 from photonpano.protocols import LinearlyCorrectedSource, Source, Trajectory
 from photonpano.values import BoolArray, FluxImage, FrameSpan, Response
@@ -33,16 +34,18 @@ class CanvasNoise:
         slope: one number, or a map (h, w) of the canvas, coarser by `reduction`.
         offset: as `slope`.
         reduction: pixels of the canvas per pixel of the maps, along each side.
+        averaging: how far interpolation lowers the noise; None without motion.
     """
 
     response: Response
     slope: Factor = 1.0
     offset: Factor = 0.0
     reduction: float = 1.0
+    averaging: Averaging | None = None
 
     @classmethod
     def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the corrections of a source on a canvas, as they are on average over the frames that see each place.
+        """Lay the noise of a source on a canvas, as it is on average over the frames that see each place.
 
         Args:
             source: the capture.
@@ -50,6 +53,12 @@ class CanvasNoise:
             span: the frames that are rendered.
             canvas: the pixel grid.
         """
+        averaging = Averaging.of(trajectory, span, source.info.frame_shape, canvas)
+        return replace(cls._corrected(source, trajectory, span, canvas), averaging=averaging)
+
+    @classmethod
+    def _corrected(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
+        """Lay the corrections of a source on a canvas."""
         if not isinstance(source, LinearlyCorrectedSource):
             return cls(source.response)
         none = np.zeros(source.info.frame_shape, np.uint32)
@@ -88,7 +97,11 @@ class CanvasNoise:
             left: first column.
         """
         slope, offset = (self._part(each, flux, top, left) for each in (self.slope, self.offset))
-        return flux_std(flux, weight, self.response, slope, offset)
+        std = flux_std(flux, weight, self.response, slope, offset)
+        if self.averaging is None:
+            return std
+        factor = self.averaging.std_factor((flux.shape[0], flux.shape[1]), top, left)
+        return np.asarray(std * (factor if flux.ndim == 2 else factor[..., None]), np.float32)
 
     def saturated(self, flux: FluxImage, weight: FluxImage) -> BoolArray:
         """Return the pixels that were lit in every frame."""
