@@ -83,6 +83,7 @@ class Gains:
         std: (S,) its standard deviation.
         brightness: (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen.
         change: root mean square of the change of the light between spans that see the same places, noise subtracted.
+        shifted: (N,) logarithm of what errors of the motion change in each observation.
     """
 
     seen: SeenCells
@@ -90,6 +91,7 @@ class Gains:
     std: FloatArray
     brightness: FloatArray
     change: float
+    shifted: FloatArray
 
     @property
     def gain(self) -> FloatArray:
@@ -149,21 +151,26 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
 def solve_gains(seen: SeenCells) -> Gains:
     """Solve for the gain of each span and the brightness of each square, from all that saw the same places.
 
-    A square c in a span t sends `exposure exp(s_c + l_t)` photons. Its weight is that of photon noise together with what the
-    structure of the square adds; both sets of unknowns are found by iterated least squares, the squares eliminated.
+    A square c in a span t sends `exposure exp(s_c + l_t + g_c d_t)` photons, where d_t is the error of the motion, and g_c the
+    gradient of s: a tremor makes squares beside an edge flicker. The weight of a square is that of photon noise together with
+    what its structure adds. Squares and light are found by iterated least squares, the squares eliminated, and the errors of
+    the motion between these steps.
     """
     n_times = len(seen.spans)
     brightness, light = _first_guess(seen)
+    shifted = np.zeros(len(seen.photons))
     robust = np.ones(len(seen.photons))
     for _ in range(_ROUNDS):
-        expected = seen.exposure * np.exp(brightness[seen.cells] + light[seen.times])
+        expected = seen.exposure * np.exp(brightness[seen.cells] + light[seen.times] + shifted)
         step = (seen.photons - expected) / np.maximum(expected, 1e-12)
         weight = robust / (1 / np.maximum(expected, 1e-12) + STRUCTURE**2)
         change, of_cells, covariance, shared = _step(seen, weight, np.clip(step, -2, 2))
         light = np.clip(light + change, _DARKEST, -_DARKEST)
         brightness = brightness + of_cells
         light -= light.mean()
-        left = (step - change[seen.times] - of_cells[seen.cells]) * np.sqrt(weight / np.maximum(robust, 1e-9))
+        left = step - change[seen.times] - of_cells[seen.cells]
+        shifted += _shifted(seen, brightness, weight, left)
+        left *= np.sqrt(weight / np.maximum(robust, 1e-9))
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
         # Smoothed squares share photons: their residuals are small, and correlated.
         noise = scale * np.sqrt(np.pi) * 2 * _BLUR
@@ -180,7 +187,24 @@ def solve_gains(seen: SeenCells) -> Gains:
         np.sqrt(np.diag(covariance)),
         np.where(unseen, np.nan, brightness),
         float(np.sqrt(max(squares, 0))),
+        shifted,
     )
+
+
+def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: FloatArray) -> FloatArray:
+    """Return the part of residuals that a shift of each span explains: (N,)."""
+    unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
+    image = np.where(unseen, np.nan, brightness).reshape(seen.shape)
+    gradient = np.stack([np.nan_to_num(each).ravel() for each in np.gradient(image)])[:, seen.cells]
+    columns = np.concatenate([gradient, np.ones((1, len(left)))])
+    normal = np.empty((len(seen.spans), 3, 3))
+    right = np.empty((len(seen.spans), 3))
+    for i in range(3):
+        right[:, i] = np.bincount(seen.times, weight * columns[i] * left, len(seen.spans))
+        for j in range(3):
+            normal[:, i, j] = np.bincount(seen.times, weight * columns[i] * columns[j], len(seen.spans))
+    shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
+    return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
 
 
 def _first_guess(seen: SeenCells) -> tuple[FloatArray, FloatArray]:

@@ -16,12 +16,16 @@ _FINER = 3
 """Frequencies are compared at this many steps for each that the time for which a place is seen tells apart."""
 _STANDS_OUT = 3.0
 """The power of a flicker is this many times the median of all frequencies."""
+_LINE = 10.0
+"""The power of a line in the spectrum of the light of all of the scene is this many times the median nearby."""
 _SMALLEST = 0.05
 """Root mean square, over places and time, of the flicker that is divided out."""
 _SPREAD = 0.5
 """Standard deviation of the amplitudes that is expected beforehand, where photons tell little."""
 _SMOOTH_CELLS = 1.0
 """Standard deviation of the Gaussian over which neighbouring squares share their photons: lamps have no sharp borders."""
+_ALIKE_CELLS = 3.0
+"""Standard deviation of the Gaussian over which a flicker has one phase: what a tremor does changes from edge to edge."""
 _ROUNDS = 2
 """Amplitudes and slow changes of the light are fitted in turn this many times."""
 _MOST = 1.5
@@ -65,9 +69,7 @@ def lamp_frequency(gains: Gains) -> float:
     if len(frequencies) < 8 or duration < 8 * length:
         return 0.0
     # A square whose mean is not subtracted would have power at all frequencies.
-    series, weights = np.zeros(known), np.zeros(known)
-    weights[seen.cells, seen.times] = weight
-    series[seen.cells, seen.times] = weight * ratio
+    series, weights = _of_neighbours(seen, weight * ratio), _of_neighbours(seen, weight)
     total = np.maximum(weights.sum(axis=1), 1e-12)
     series -= weights * (series.sum(axis=1) / total)[:, None]
 
@@ -83,7 +85,30 @@ def lamp_frequency(gains: Gains) -> float:
     # Of a wave of amplitude a, this power is a^2 / 4 for each unit of weight.
     if found[peak] < _STANDS_OUT * float(np.median(found)) or 2 * excess / weight.sum() < _SMALLEST**2:
         return 0.0
-    return best if _differs(gains, best) else 0.0
+    return best if _differs(gains, _of_all(gains, best, 1 / duration)) else 0.0
+
+
+def _of_all(gains: Gains, frequency: float, within: float) -> float:
+    """Return the frequency of the light of all of the scene near another one; that one, if no line stands out.
+
+    The whole capture tells more frequencies apart than the time for which a square is seen. At a wrong frequency, a light of
+    one phase seems to have another one at each place.
+    """
+    instants = gains.seen.instants
+    step = 1 / (8 * (instants[-1] - instants[0]))
+    frequencies = np.arange(max(frequency - within, step), frequency + within, step)
+    power = np.abs(np.exp(-2j * np.pi * np.outer(frequencies, instants)) @ (gains.gain - gains.gain.mean())) ** 2
+    peak = int(power.argmax())
+    return float(frequencies[peak]) if power[peak] > _LINE * np.median(power) else frequency
+
+
+def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
+    """Return the values of the observations, each shared among the neighbours that a lamp lights alike: (C, S)."""
+    found = np.zeros((len(seen.spans), seen.n_cells))
+    found[seen.times, seen.cells] = values
+    for row in found:
+        row[:] = cv2.GaussianBlur(row.reshape(seen.shape), (0, 0), _ALIKE_CELLS, borderType=cv2.BORDER_CONSTANT).ravel()
+    return found.T
 
 
 def _differs(gains: Gains, frequency: float) -> bool:
@@ -126,7 +151,7 @@ def measure_lamps(gains: Gains, frequency: float) -> Lamps:
 def _relative(gains: Gains) -> tuple[FloatArray, FloatArray]:
     """Return what each observation has beyond its square, as a fraction, and its weight: (N,) each."""
     seen = gains.seen
-    expected = seen.exposure * np.exp(np.nan_to_num(gains.brightness)[seen.cells])
+    expected = seen.exposure * np.exp(np.nan_to_num(gains.brightness)[seen.cells] + gains.shifted)
     ratio = np.clip(seen.photons / np.maximum(expected, 1e-12) - 1, -2, 2)
     return ratio, 1 / (1 / np.maximum(expected, 1e-12) + STRUCTURE**2)
 

@@ -100,29 +100,36 @@ def _lit(
 
     `light: steady` measures it, too, and warns if it changes. The first motion, of the results `steady`, was estimated in light
     that seemed steady, so that the light is measured once more along the second one. `light: auto` takes the light for steady
-    if the photons are explained worse in the light that was found.
+    if it does not change along that, or if the photons are explained worse in the light that was found.
 
     Returns:
         The capture in its light, its context, the first level in it, and the decision; None if the light is steady.
     """
     changing, known = plan.light.mode == "changing", steady[0].trajectory
-    light = measure_light(source, known, context) if changing else find_light(source, known, context)
-    if light is None:
+    measured = measure_light if changing else find_light
+    if (light := measured(source, known, context)) is None:
         return None
     if plan.light.mode == "steady":
         logger.warning(f"light: steady, but {decision_of(light, source.info.frame_rate_hz).reason}; write light: auto")
         return None
-    for final in (False, True):
-        in_this, within = in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
-        results = estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
-        known = results[0].trajectory
-        if not final:
-            light = measure_light(source, known, context)
-    if not changing:
-        before = _look(plan, source, steady, reference, context)
-        if worse := _look(plan, in_this, results, reference, within).worse_than(before):
-            logger.debug("the light is taken for steady: in the light that was found, %s", worse)
-            return None
+    worse = ""
+    try:
+        for final in (False, True):
+            in_this, within = in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
+            results = estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
+            known = results[0].trajectory
+            if not final and (light := measured(source, known, context)) is None:
+                return None
+        if not changing:
+            before = _look(plan, source, steady, reference, context)
+            worse = _look(plan, in_this, results, reference, within).worse_than(before)
+    except (LocationError, CanvasTooLargeError) as error:
+        if changing:
+            raise
+        worse = str(error)
+    if worse:
+        logger.debug("the light is taken for steady: in the light that was found, %s", worse)
+        return None
     return in_this, within, results, decision_of(light, source.info.frame_rate_hz)
 
 

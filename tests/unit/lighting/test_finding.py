@@ -20,12 +20,16 @@ DRIFT = 0.5 ** np.linspace(0, 1, N)
 FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
 
 
-def panned(light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int = 0) -> MemorySource:
-    """A pan over a scene that gets brighter along the way."""
+def panned(
+    light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int = 0, tremor_px: np.ndarray | None = None
+) -> MemorySource:
+    """A pan over a scene that gets brighter along the way, with a tremor along x."""
     scene, rng = Scene(seed, flux), np.random.default_rng(seed)
     frames = np.empty((N, *SHAPE), np.uint8)
     for first in range(0, N, 8):
         at = MOTION.at([first + 3.5])[0]
+        if tremor_px is not None:
+            at = at @ translation(tremor_px[first + 4], 0)
         view = scene.view(at, SHAPE) * (1 + (at[0, 2] + np.arange(SHAPE[1])) / 60)
         frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view * light[first : first + 8, None, None])
     return MemorySource(frames)
@@ -34,6 +38,11 @@ def panned(light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int
 @pytest.mark.parametrize("seed", range(2))
 def test_pan_over_bright_scene_is_no_change_of_light(seed: int) -> None:
     assert find_light(panned(STEADY, seed=seed), MOTION, Context(1)) is None
+
+
+def test_tremor_that_the_motion_lacks_is_no_flicker() -> None:
+    tremor = 1.5 * np.sin(2 * np.pi * np.arange(N) / 90.5)
+    assert find_light(panned(STEADY, tremor_px=tremor), MOTION, Context(1)) is None
 
 
 @pytest.mark.parametrize(("light", "period"), [(DRIFT, None), (FLICKER, 90.5)], ids=["drift", "flicker"])
