@@ -21,7 +21,7 @@ from photonpano.protocols import Source, Trajectory
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision
+from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
@@ -112,14 +112,18 @@ def _lit(
     if plan.light.mode == "steady":
         logger.warning(f"light: steady, but {decision_of(light, source.info.frame_rate_hz).reason}; write light: auto")
         return None
+
+    def first_level(light: Light, known: Trajectory) -> tuple[Source, Context, list[LevelResult]]:
+        in_this, within = in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
+        results = estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
+        return in_this, within, results
+
     worse = ""
     try:
-        for final in (False, True):
-            in_this, within = in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
-            results = estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
-            known = results[0].trajectory
-            if not final and (light := measured(source, known, context)) is None:
-                return None
+        known = first_level(light, known)[2][0].trajectory
+        if (light := measured(source, known, context)) is None:
+            return None
+        in_this, within, results = first_level(light, known)
         if not changing:
             before = _look(plan, source, steady, reference, context)
             worse = _look(plan, in_this, results, reference, within).worse_than(before)
