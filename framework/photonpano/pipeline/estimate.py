@@ -121,9 +121,10 @@ def _lit(
     worse = ""
     try:
         known = first_level(light, known)[2][0].trajectory
-        if (light := measured(source, known, context)) is None:
+        if (again := measured(source, known, context)) is None:
             return None
-        in_this, within, results = first_level(light, known)
+        in_this, within, results = first_level(again, known)
+        decision = decision_of(again, source.info.frame_rate_hz)
         if not changing:
             before = _look(plan, source, steady, reference, context)
             worse = _look(plan, in_this, results, reference, within).worse_than(before)
@@ -134,7 +135,7 @@ def _lit(
     if worse:
         logger.debug("the light is taken for steady: in the light that was found, %s", worse)
         return None
-    return in_this, within, results, decision_of(light, source.info.frame_rate_hz)
+    return in_this, within, results, decision
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
