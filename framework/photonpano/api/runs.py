@@ -8,7 +8,6 @@ from pathlib import Path
 
 from photonpano.api.captures import simulate
 from photonpano.api.opened_run import opened_run
-from photonpano.api.rendering import render as render_again
 from photonpano.context import Context, Progress, Quiet
 from photonpano.evaluation import Evaluation
 from photonpano.evaluation import evaluate as evaluate_folder
@@ -75,8 +74,7 @@ def warm_up() -> float:
             "version": 1,
             "source": {"use": "packed-npy", "with": {"path": str(capture)}},
             "resample": {"with": {"group_size": 40}},
-            "levels": [{"scale": 0.5}, {"merge": {"use": "splat"}}],
+            "levels": [{"scale": 0.5}, {}],
         }
-        merged = run(parse_spec(spec, output=Path(folder) / "run"))
-        render_again(merged.directory, Path(folder) / "fine", ["render.use=super-resolution", "render.scale=2"])
+        run(parse_spec(spec, output=Path(folder) / "run"))
     return time.perf_counter() - start
