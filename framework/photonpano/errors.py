@@ -18,6 +18,10 @@ class InputError(PhotonpanoError):
     """A capture, mask, truth or other input file cannot be used as it is."""
 
 
+class ExtentError(InputError):
+    """No frame shows the part of the panorama that is to be rendered."""
+
+
 class LocationError(PhotonpanoError):
     """Too few exposures could be located against each other to go on."""
 

@@ -44,8 +44,8 @@ class SplatMerger:
         """
         if isinstance(source, LinearlyCorrectedSource):
             raise InputError(
-                "splat warps photons one by one, so that dark counts cannot be subtracted, nor pixels interpolated; merge with "
-                "photon-mle, or use only corrections that move or mask pixels"
+                "merge.use: splat warps photons one by one, so that it cannot subtract dark counts, interpolate pixels or "
+                "compare colours; use photon-mle, or only corrections that move or mask pixels"
             )
         if trajectory is None:
             photons = unwarped_sum(source, group, scale)

@@ -1,6 +1,6 @@
 """Compare colour with demosaicking, and with a camera of three sensors: the table of docs/how-to/colour.md.
 
-    python tests/benchmarks/colour.py FOLDER PHOTOGRAPH... [--pattern PATTERN.png] [--seeds N]
+    python tests/benchmarks/colour.py FOLDER PHOTOGRAPH... [--pattern PATTERN.png] [--seeds N] [--flux F] [--frames N] [--large]
 
 For each photograph, filter array and seed, a capture is simulated, and its panorama rendered from the estimated motion. Its
 PSNR is compared, over the same pixels, with that of
@@ -10,7 +10,8 @@ PSNR is compared, over the same pixels, with that of
 - three sensors before which nothing stands, each of one colour and with as many photons as its coloured pixels get, along the
   true motion.
 
-PATTERN.png is a picture of a filter array with clear pixels, such as that of SwissSPAD2. Writes colour.json and pictures.
+A large capture has frames of 254x496 px, and a scene and a path that are as much larger. PATTERN.png is a picture of a filter
+array with clear pixels, such as that of SwissSPAD2. Writes colour.json and pictures.
 """
 
 from __future__ import annotations
@@ -34,10 +35,31 @@ from photonpano.merging.panorama import render
 from photonpano.photometry import BinaryResponse, linear_to_srgb
 from photonpano.reading import COLOURS, bayer_array, read_filter_array
 
-SHAPE, N_FRAMES, WIDTH = (128, 192), 3000, 700
-FLUX = 0.5
-PATH = {"kind": "pan", "length_px": 260, "angle_deg": 15, "shake": {"rms_px": 1.0}}
 GROUP_SIZE, GROUP_PX = 120, 1.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """What is simulated.
+
+    Attributes:
+        shape: (height, width) of a frame.
+        width: of the scene.
+        length_px: of the path.
+        n_frames: number of frames.
+        flux: mean flux of a clear pixel.
+    """
+
+    shape: tuple[int, int] = (128, 192)
+    width: int = 700
+    length_px: float = 260
+    n_frames: int = 3000
+    flux: float = 0.5
+
+    def settings(self, seed: int) -> dict[str, Any]:
+        """Return keys of the simulator."""
+        path = {"kind": "pan", "length_px": self.length_px, "angle_deg": 15, "shake": {"rms_px": 1.0}}
+        return {"path": path, "n_frames": self.n_frames, "frame_shape": list(self.shape), "seed": seed}
 
 
 @dataclass
@@ -56,17 +78,14 @@ class Row:
     three_sensors: float
 
 
-def measured(photograph: Path, filters: str, seed: int, folder: Path) -> Row:
-    sensor = {"filters": filters}
-    camera = {"path": PATH, "n_frames": N_FRAMES, "frame_shape": list(SHAPE), "seed": seed}
-    scene = {"kind": "photo", "file": str(photograph), "width": WIDTH}
-    spec: dict[str, Any] = {
-        "version": 1,
-        "source": {"use": "simulator", "with": {"scene": scene, "flux": FLUX, "sensor": sensor, **camera}},
-    }
-    places = read_filter_array(Path(filters)) if Path(filters).suffix else bayer_array(filters, SHAPE)
+def measured(photograph: Path, filters: str, seed: int, camera: Camera, folder: Path) -> Row:
+    """Simulate one capture, make its panorama and compare it with the others."""
+    scene = {"kind": "photo", "file": str(photograph), "width": camera.width}
+    simulator = {"scene": scene, "flux": camera.flux, "sensor": {"filters": filters}, **camera.settings(seed)}
+    spec: dict[str, Any] = {"version": 1, "source": {"use": "simulator", "with": simulator}}
+    places = read_filter_array(Path(filters)) if Path(filters).suffix else bayer_array(filters, camera.shape)
     with open_source(parse_spec(spec)) as source:
-        truth, frames = source.truth(), source.frames(FrameSpan(0, N_FRAMES))
+        truth, frames = source.truth(), source.frames(FrameSpan(0, camera.n_frames))
     np.save(folder / "cube.npy", np.packbits(frames, axis=-1))
     np.savez(folder / "truth.npz", **truth)
     corrections = [{"colour-filter": {"pattern": filters, "keep": "all"}}]
@@ -79,13 +98,13 @@ def measured(photograph: Path, filters: str, seed: int, folder: Path) -> Row:
         homographies, to_canvas, located = kept["homographies"], kept["canvas"], kept["located"]
     flux, weight = (tifffile.imread(done.directory / f"{name}.tiff") for name in ("panorama", "coverage"))
     canvas = Canvas(*flux.shape[:2], to_canvas)
-    alignment = corner_errors(homographies, truth["homographies"], SHAPE, located).alignment
+    alignment = corner_errors(homographies, truth["homographies"], camera.shape, located).alignment
     true_image = true_panorama(truth["scene"], canvas, alignment)
     images = {
         "colour": flux,
         "demosaicked": demosaicked(frames, places, FrameTrajectory(homographies), canvas),
         "three_sensors": three_sensors(
-            truth, camera, places, normalised(inverse(alignment) @ truth["homographies"]), canvas, folder
+            truth, camera.settings(seed), places, normalised(inverse(alignment) @ truth["homographies"]), canvas, folder
         ),
     }
     compared = covered(weight) & np.all([np.isfinite(each).all(axis=-1) for each in images.values()], axis=0)
@@ -109,16 +128,16 @@ def measured(photograph: Path, filters: str, seed: int, folder: Path) -> Row:
 
 def demosaicked(frames: np.ndarray, places: np.ndarray, motion: FrameTrajectory, canvas: Canvas) -> np.ndarray:
     """Demosaick groups whose image moves by less than a pixel, and average them along a motion: (H, W, 3) flux."""
-    total, seen = np.zeros((*canvas.shape, 3)), np.zeros(canvas.shape)
-    for group in chunks_of(FrameSpan(0, len(frames)), motion, SHAPE, GROUP_PX):
+    total, seen, shape = np.zeros((*canvas.shape, 3)), np.zeros(canvas.shape), places.shape
+    for group in chunks_of(FrameSpan(0, len(frames)), motion, shape, GROUP_PX):
         mean = frames[group.span.start : group.span.stop].mean(axis=0, dtype=np.float32)
         colours = edge_aware(mean) if places.max() < 3 else interpolated(mean, places)
         onto = canvas.transform @ group.homography
         size = canvas.width, canvas.height
         total += len(group.span) * cv2.warpPerspective(colours, onto, size, flags=cv2.INTER_LINEAR)
-        seen += len(group.span) * cv2.warpPerspective(np.ones(SHAPE, np.float32), onto, size, flags=cv2.INTER_LINEAR)
+        seen += len(group.span) * cv2.warpPerspective(np.ones(shape, np.float32), onto, size, flags=cv2.INTER_LINEAR)
     mean = np.divide(total, seen[..., None], out=np.full(total.shape, np.nan), where=seen[..., None] > 1)
-    return BinaryResponse().flux(mean.astype(np.float32), N_FRAMES)
+    return BinaryResponse().flux(mean.astype(np.float32), len(frames))
 
 
 def edge_aware(mean: np.ndarray) -> np.ndarray:
@@ -162,11 +181,16 @@ def main() -> None:
     parser.add_argument("photographs", type=Path, nargs="+")
     parser.add_argument("--pattern", type=Path)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--flux", type=float, default=Camera.flux, help="mean flux of a clear pixel")
+    parser.add_argument("--frames", type=int, default=Camera.n_frames)
+    parser.add_argument("--large", action="store_true", help="frames of 254x496 px")
     given = parser.parse_args()
+    size = {"shape": (254, 496), "width": 1808, "length_px": 672} if given.large else {}
+    camera = Camera(n_frames=given.frames, flux=given.flux, **size)
     given.folder.mkdir(parents=True, exist_ok=True)
     arrays = ["rggb"]
     if given.pattern is not None:
-        pattern = cv2.imread(str(given.pattern))[2 : 2 + SHAPE[0], : SHAPE[1], ::-1]
+        pattern = cv2.imread(str(given.pattern))[2 : 2 + camera.shape[0], : camera.shape[1], ::-1]
         np.save(given.folder / "rgbw.npy", pattern)
         arrays.append(str((given.folder / "rgbw.npy").resolve()))
     rows = []
@@ -174,7 +198,7 @@ def main() -> None:
     for photograph in given.photographs:
         for filters in arrays:
             for seed in range(given.seeds):
-                row = measured(photograph.resolve(), filters, seed, given.folder.resolve())
+                row = measured(photograph.resolve(), filters, seed, camera, given.folder.resolve())
                 rows.append(asdict(row))
                 values = [f"{each:.2f}" if isinstance(each, float) else str(each) for each in asdict(row).values()]
                 print("| " + " | ".join(values) + " |", flush=True)

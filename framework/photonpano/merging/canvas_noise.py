@@ -10,7 +10,7 @@ import numpy as np
 from photonpano.geometry import Canvas, rescaling
 from photonpano.merging.averaging import Averaging
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
-from photonpano.protocols import LinearlyCorrectedSource, Source, Trajectory
+from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory
 from photonpano.values import BoolArray, FluxImage, FrameSpan, Response
 
 _INSTANTS = 64
@@ -21,6 +21,8 @@ _BLOCK = 2**18
 """Values of a tile that are looked at at once."""
 _EVEN = 1e-4
 """Corrections that differ by less than this are one number."""
+_RGB = 3
+"""Colours of a panorama; clear pixels, which come last, are none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +33,7 @@ class CanvasNoise:
 
     Attributes:
         response: the response of the camera.
-        slope: one number, or a map (h, w) of the canvas, coarser by `reduction`.
+        slope: one number, or a map of the canvas, coarser by `reduction`: (h, w), or (h, w, 3) in colour.
         offset: as `slope`.
         reduction: pixels of the canvas per pixel of the maps, along each side.
         averaging: how far interpolation lowers the noise; None without motion.
@@ -54,7 +56,12 @@ class CanvasNoise:
             canvas: the pixel grid.
         """
         averaging = Averaging.of(trajectory, span, source.info.frame_shape, canvas)
-        return replace(cls._corrected(source, trajectory, span, canvas), averaging=averaging)
+        if not isinstance(source, ColouredSource):
+            return replace(cls._corrected(source, trajectory, span, canvas), averaging=averaging)
+        # The grey source equalises the colours, which are rendered without it.
+        colours = [cls._corrected(each, trajectory, span, canvas) for each in list(source.colours().values())[:_RGB]]
+        slope, offset = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset"))
+        return cls(source.response, slope, offset, max(each.reduction for each in colours), averaging)
 
     @classmethod
     def _corrected(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
@@ -119,7 +126,16 @@ class CanvasNoise:
             for first, length, side in zip((top, left), flux.shape, factor.shape, strict=False)
         )
         part = factor[np.ix_(rows, columns)]
-        return part if flux.ndim == 2 else part[..., None]
+        return part if part.ndim == flux.ndim else part[..., None]
+
+
+def _stacked(factors: list[Factor]) -> Factor:
+    """Return one number if the factors of all colours are the same, otherwise a map in three colours."""
+    numbers = [each for each in factors if not isinstance(each, np.ndarray)]
+    if len(numbers) == len(factors) and np.ptp(numbers) < _EVEN:
+        return numbers[0]
+    shape = max(np.shape(each) for each in factors) or (1, 1)
+    return np.stack([np.broadcast_to(np.asarray(each, np.float32), shape) for each in factors], axis=-1)
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.errors import CanvasTooLargeError, InputError, LocationError
+from photonpano.errors import CanvasTooLargeError, ExtentError, LocationError
 from photonpano.geometry import Canvas, Extent, apply, canvas_of, canvas_of_box, inverse, rescaling, translation
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
@@ -103,7 +103,7 @@ def plan_canvas(
         extent: the part, by default everything.
 
     Raises:
-        InputError: no frame shows the extent.
+        ExtentError: no frame shows the extent.
         CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
             a scale that fits.
         LocationError: frames reach the horizon of the reference plane.
@@ -117,7 +117,7 @@ def plan_canvas(
             "choose a render.reference in the middle of the motion, or fewer frames"
         ) from error
     if extent != "panorama":
-        canvas = _part_of(canvas, (0, 0, *frame_shape[::-1]) if extent == "reference" else extent, scale)
+        canvas = _part_of(canvas, box_of(extent, frame_shape), scale)
     excess = canvas.height * canvas.width * bytes_per_pixel / memory
     if excess > MAX_EXCESS:
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
@@ -131,19 +131,29 @@ def plan_canvas(
     return canvas
 
 
+def box_of(extent: Extent, frame_shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the box of a part of the panorama, in pixels of the reference frame.
+
+    Args:
+        extent: the part; not the whole panorama.
+        frame_shape: (height, width) of a frame.
+    """
+    return (0, 0, *frame_shape[::-1]) if isinstance(extent, str) else extent
+
+
 def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Canvas:
     """Return the canvas of a box in pixels of the reference frame.
 
     Raises:
-        InputError: it lies outside the whole canvas.
+        ExtentError: it lies outside the whole canvas.
     """
     part = canvas_of_box(box, scale)
     ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
     (left, top), (right, bottom) = np.rint(apply(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
     x0, y0, x1, y1 = box
     if x1 <= left or x0 > right or y1 <= top or y0 > bottom:
-        raise InputError(
-            f"render.extent: [{x0}, {y0}, {x1}, {y1}] lies outside the panorama, which holds x from {left} to {right} and "
+        raise ExtentError(
+            f"[{x0}, {y0}, {x1}, {y1}] lies outside the panorama, which holds x from {left} to {right} and "
             f"y from {top} to {bottom}, in pixels of the reference frame"
         )
     return part
@@ -325,7 +335,7 @@ def render_panorama(
         ready: what `render` would render of the same frames along the same motion; used if it lies on the same canvas.
 
     Raises:
-        InputError: no frame shows the extent.
+        ExtentError: no frame shows the extent.
         CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
         LocationError: frames reach the horizon of the reference plane.
     """
@@ -345,7 +355,7 @@ def render_panorama(
         gathered.add(tile, part)
         dynamic_range.add(part.flux, part.weight, tile.top, tile.left)
     if options.extent != "panorama" and not gathered.coverage_share:
-        raise InputError("render.extent: no frame that was located shows it; choose a part of the panorama")
+        raise ExtentError("no frame that was located shows it; choose a part of the panorama")
     thumbnail = gathered.panorama
     shown = balanced(thumbnail.flux, options.white_balance)
     lit = shown[np.isfinite(shown)]

@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photonpano.context import Context
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano.geometry import canvas_of_box
+from photonpano.merging.colour import channels_of
+from photonpano.merging.panorama import box_of, plan_canvas, render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels, build_renderer
 from photonpano.protocols import Source
@@ -36,7 +38,8 @@ class Forecast:
         threads: the number of threads of the trial.
         seconds: expected time of each level, and of the panorama.
         memory_bytes: expected peak memory of the process.
-        canvas: (height, width) of the panorama if the camera keeps moving as in the trial and never returns.
+        canvas: (height, width) of the panorama if the camera keeps moving as in the trial and never returns; of a part of it
+            (`render.extent`), that of the part.
     """
 
     tried: FrameSpan
@@ -95,19 +98,26 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     seconds = {f"level {result.level.number}": sum(result.seconds.values()) * more for result in results}
     start = time.perf_counter()
     renderer, trajectory, scale = build_renderer(plan, part, []), results[-1].trajectory, plan.render.scale
-    canvas = plan_canvas(
-        trajectory, part.info.span, part.info.frame_shape, scale, int(plan.run.memory), renderer.bytes_per_pixel
-    )
+    bytes_per_pixel = renderer.bytes_per_pixel * channels_of(part)
+    canvas = plan_canvas(trajectory, part.info.span, part.info.frame_shape, scale, int(plan.run.memory), bytes_per_pixel)
     with one_thread_inside():
         render(part, trajectory, part.info.span, canvas, plan.render.tolerance_px, Context(threads), renderer)
     seconds["panorama"] = (time.perf_counter() - start) * more
-    sides = [
-        round(side * plan.render.scale + (whole - side * plan.render.scale) * more)
-        for side, whole in zip(part.info.frame_shape, canvas.shape, strict=True)
-    ]
-    rendering = min(renderer.bytes_per_pixel * sides[0] * sides[1], int(plan.run.memory))
+    height, width = _expected_shape(plan, part.info.frame_shape, canvas.shape, more)
+    rendering = min(bytes_per_pixel * height * width, int(plan.run.memory))
     memory = (peak_memory_bytes() or 0) + n_frames * BYTES_PER_FRAME + rendering
-    return Forecast(span, threads, seconds, memory, (sides[0], sides[1]))
+    return Forecast(span, threads, seconds, memory, (height, width))
+
+
+def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: tuple[int, int], more: float) -> tuple[int, int]:
+    """Return the (height, width) of the panorama, from that of the trial, which has `1 / more` of the frames."""
+    scale, extent = plan.render.scale, plan.render.extent
+    if extent != "panorama":
+        return canvas_of_box(box_of(extent, frame_shape), scale).shape
+    height, width = (
+        round(side * scale + (whole - side * scale) * more) for side, whole in zip(frame_shape, tried, strict=True)
+    )
+    return height, width
 
 
 def _tried(plan: Plan, part: PartOfSource, threads: int) -> list[LevelResult]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from photonpano.context import Context
 from photonpano.corrections import Vignette
+from photonpano.errors import ExtentError, InputError
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.components import build_exporters, build_renderer
@@ -58,18 +59,21 @@ def render_into(
     """
     decisions: list[Decision] = []
     renderer, exporters = build_renderer(plan, source, decisions), build_exporters(plan, source, decisions)
-    panorama = render_panorama(
-        renderer,
-        source,
-        motion.trajectory,
-        motion.span,
-        plan.render,
-        int(plan.run.memory),
-        folder.write_tile,
-        context,
-        renderer.bytes_per_pixel,
-        ready if renderer.merges else None,
-    )
+    try:
+        panorama = render_panorama(
+            renderer,
+            source,
+            motion.trajectory,
+            motion.span,
+            plan.render,
+            int(plan.run.memory),
+            folder.write_tile,
+            context,
+            renderer.bytes_per_pixel,
+            ready if renderer.merges else None,
+        )
+    except ExtentError as error:
+        raise InputError(str(plan.place("render.extent").problem(str(error)))) from error
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
     export_all(exporters, folder.staging, panorama)

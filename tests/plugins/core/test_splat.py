@@ -188,8 +188,8 @@ def test_splat_refuses_source_with_corrected_sums() -> None:
         with pytest.raises(InputError) as caught:
             SplatMerger().merge(source, Group(FrameSpan(0, 10), 5), trajectory, 1.0)
         assert str(caught.value) == (
-            "splat warps photons one by one, so that dark counts cannot be subtracted, nor pixels interpolated; merge with "
-            "photon-mle, or use only corrections that move or mask pixels"
+            "merge.use: splat warps photons one by one, so that it cannot subtract dark counts, interpolate pixels or "
+            "compare colours; use photon-mle, or only corrections that move or mask pixels"
         )
 
 

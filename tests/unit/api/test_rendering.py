@@ -90,15 +90,17 @@ def test_capture_that_was_moved_is_named_and_changed_one_refused(
             "render.reference: the panorama of RUN lies in the plane of frame 'middle', and a rendering stays there; run the "
             "spec again for 'first'",
         ),
-        (
-            "render.extent=[5000, 0, 5001, 1]",
-            "render.extent: [5000, 0, 5001, 1] lies outside the panorama",
-        ),
     ],
 )
 def test_change_that_a_rendering_cannot_make_is_named(small_run: RunResult, tmp_path: Path, change: str, message: str) -> None:
     found = error_of(small_run.directory, tmp_path / "again", change).replace(str(small_run.directory), "RUN")
     assert found.startswith(message)
+
+
+def test_extent_outside_the_panorama_is_named_where_it_was_given(small_run: RunResult, tmp_path: Path) -> None:
+    found = error_of(small_run.directory, tmp_path / "again", "render.extent=[5000, 0, 5001, 1]")
+    assert found.startswith("render.extent: [5000, 0, 5001, 1] lies outside the panorama, which holds x from ")
+    assert found.endswith("in pixels of the reference frame (in the override render.extent=[5000, 0, 5001, 1])")
 
 
 def test_run_is_not_replaced_by_its_own_rendering(small_run: RunResult) -> None:

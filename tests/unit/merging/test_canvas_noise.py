@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
+from photonpano.corrections.colours import filtered
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.photometry import BinaryResponse, flux_std
@@ -48,6 +49,17 @@ def test_noise_of_moving_camera_follows_mean_dark_counts(pan: Callable) -> None:
     noise = CanvasNoise.of(DarkCounts(rates), pan(1), SPAN, Canvas(8, 12 + N, translation(0, 0)))
     std = noise.std(image(0.1, (8, 4)), image(1e6, (8, 4)), left=24)
     np.testing.assert_allclose(std, np.sqrt(np.expm1(0.13) / 1e6), rtol=0.01)
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_noise_of_colours_is_that_of_their_pixels(pan: Callable, even: bool) -> None:
+    """The grey source that all colours make multiplies counts by the gains of the colours, which must not count."""
+    rates = np.full((8, 12), 0.2) if even else np.linspace(0.01, 0.5, 96).reshape(8, 12)
+    colour = np.tile(np.int8([[0, 1], [1, 2]]), (4, 6))
+    noise = CanvasNoise.of(filtered(DarkCounts(rates), lambda: colour, []), pan(0), SPAN, CANVAS)
+    std = noise.std(image(0.1, (8, 12, 3)), image(1e6, (8, 12, 3)))
+    own = np.take_along_axis(std, colour[..., None].astype(int), axis=-1)[..., 0]
+    np.testing.assert_allclose(own, np.sqrt(np.expm1(0.1 + rates) / 1e6), rtol=0.01)
 
 
 @pytest.mark.parametrize("colours", [0, 3])

@@ -78,7 +78,7 @@ def test_plan_canvas_refuses_box_outside_panorama(pan: Callable, box: tuple[int,
     with pytest.raises(InputError) as caught:
         plan_canvas(pan(2), ALL, SHAPE, 2.0, GIB, extent=box)
     assert str(caught.value) == (
-        f"render.extent: {list(box)} lies outside the panorama, which holds x from 0 to 157 and y from 0 to 29, "
+        f"{list(box)} lies outside the panorama, which holds x from 0 to 157 and y from 0 to 29, "
         "in pixels of the reference frame"
     )
 

@@ -47,3 +47,11 @@ def test_forecast_predicts_time_memory_and_canvas(small_spec: dict[str, Any]) ->
     # The camera pans by 60 px over the capture, and trembles.
     assert 190 < found.canvas[1] < 290
     assert 128 <= found.canvas[0] < 220
+
+
+@pytest.mark.parametrize(("extent", "shape"), [("reference", (256, 320)), ([-10, 5, 20, 25], (40, 60))])
+def test_forecast_of_a_part_has_the_size_of_the_part(small_spec: dict[str, Any], extent: Any, shape: tuple[int, int]) -> None:
+    render = {"extent": extent, "scale": 2}
+    plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 10}}, "levels": 1, "render": render})
+    with build_source(plan) as source:
+        assert forecast(plan, source).canvas == shape
