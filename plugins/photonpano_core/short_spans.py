@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
 from photonpano.geometry import corners, inverse, normalised, step_motions
 from photonpano_core.configs import ShortSpansConfig
+from photonpano_core.uneven_noise import separated
 
 _WINDOW_SPANS = 128
 """Longest window of the spectra, in spans: the tremor may change from one window to the next."""
@@ -23,6 +24,8 @@ _SYSTEMATIC_PX = 0.015
 _SLOW_BINS, _SLOW_PX = 2, 0.04
 """The two lowest frequencies of a window must exceed an error of this size, too: the panorama follows a slow motion, and is
 no better itself."""
+_DARK, _DARK_SHARE = 10.0, 0.05
+"""The light goes out, as between two flickers, if the variance of this share of the steps is this many times the usual one."""
 _NAMED_LINES = 3
 """Frequencies that a summary names at most."""
 _NAMED_SHARE = 0.003
@@ -125,8 +128,11 @@ def _filtered(steps: FloatArray, variances: FloatArray) -> _Filtered:
     known = np.isfinite(variances)
     if known.sum() < size // 2:
         return _Filtered(np.zeros(len(steps)), np.zeros(len(steps)))
-    # A step of large noise, over a dark place, would drown its window: it counts for less.
     typical = float(np.median(variances[known]))
+    if np.mean(variances > _DARK * typical) > _DARK_SHARE:
+        found = separated(steps, variances + _SYSTEMATIC_PX**2, size, _SIGNIFICANT, (_SLOW_BINS, _SLOW_PX))
+        return _Filtered(found.signal, found.std)
+    # A step of large noise, over a dark place, would drown its window: it counts for less.
     trust = np.where(known, typical / (typical + np.maximum(variances - typical, 0)), 0.0)
     noise = (
         np.where(known, np.minimum(variances, typical / np.maximum(trust, 1e-9)), 0.0) * trust**2 + _SYSTEMATIC_PX**2 * trust**2

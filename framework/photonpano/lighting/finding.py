@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,7 @@ from photonpano.lighting.gains import Gains, seen_cells, solve_gains
 from photonpano.lighting.lamps import Lamps, lamp_frequency, measure_lamps
 from photonpano.lighting.series import gain_of_frames
 from photonpano.protocols import Source, Trajectory
-from photonpano.values import Decision, FrameSpan, Light
+from photonpano.values import Decision, FloatArray, FrameSpan, Light
 
 LIGHT_DECISION = "light"
 """What a record names the decision to divide by the gain of the light."""
@@ -66,6 +67,30 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
     gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
     mean = float(gain.mean())
     return Light.of_frames(gain / mean, frequency, std / mean)
+
+
+def corrected(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
+    """Correct light by what the panorama in it does not explain.
+
+    Squares of the scene are brighter and darker inside, so that a sensor that saturates sees too little of their changes; a
+    panorama has every pixel. Lamps over parts of the scene stay as they are.
+
+    Args:
+        light: in which the panorama was rendered.
+        spans: S spans of frames.
+        change: (S,) their brightness relative to that of the panorama in this light, minus 1.
+        std: (S,) its standard deviation.
+    """
+    if light.has_lamps:
+        return light
+    instants = np.array([span.centre for span in spans])
+    lengths = np.array([len(span) for span in spans], float)
+    gain = np.array([light.mean(span) for span in spans]) * np.maximum(1 + change, 0)
+    found, noise, frequency = gain_of_frames(instants, gain, std, lengths, len(light.gain))
+    if bool(frequency) != bool(light.frequency):
+        return light
+    mean = float(found.mean())
+    return Light.of_frames(found / mean, frequency, noise / mean)
 
 
 def _light_of(lamps: Lamps, gains: Gains, n_frames: int) -> Light:

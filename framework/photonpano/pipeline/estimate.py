@@ -11,7 +11,7 @@ from photonpano.context import Context
 from photonpano.contributions import MergerContribution
 from photonpano.corrections import Vignette, divided_by, estimate_vignette
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.lighting import decision_of, find_light, in_light, measure_light
+from photonpano.lighting import corrected, decision_of, find_light, in_light, measure_light
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion
@@ -113,21 +113,24 @@ def _lit(
         logger.warning(f"light: steady, but {decision_of(light, source.info.frame_rate_hz).reason}; write light: auto")
         return None
 
-    def first_level(light: Light, known: Trajectory) -> tuple[Source, Context, list[LevelResult]]:
-        in_this, within = in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
-        results = estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
-        return in_this, within, results
+    def lit(light: Light) -> tuple[Source, Context]:
+        return in_light(source, light), replace(context, checkpoints=context.checkpoints.within(light))
+
+    def first_level(light: Light, known: Trajectory) -> list[LevelResult]:
+        in_this, within = lit(light)
+        return estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
 
     worse = ""
     try:
-        known = first_level(light, known)[2][0].trajectory
+        known = first_level(light, known)[0].trajectory
         if (again := measured(source, known, context)) is None:
             return None
-        in_this, within, results = first_level(again, known)
-        decision = decision_of(again, source.info.frame_rate_hz)
+        results = first_level(again, known)
+        in_this, within = lit(again)
+        look = _look(plan, in_this, results, reference, within)
+        light = corrected(again, look.residuals.spans, *look.residuals.gains())
         if not changing:
-            before = _look(plan, source, steady, reference, context)
-            worse = _look(plan, in_this, results, reference, within).worse_than(before)
+            worse = look.worse_than(_look(plan, source, steady, reference, context))
     except (LocationError, CanvasTooLargeError) as error:
         if changing:
             raise
@@ -135,7 +138,7 @@ def _lit(
     if worse:
         logger.debug("the light is taken for steady: in the light that was found, %s", worse)
         return None
-    return in_this, within, results, decision
+    return *lit(light), results, decision_of(light, source.info.frame_rate_hz)
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:

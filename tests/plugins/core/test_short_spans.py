@@ -53,6 +53,21 @@ def test_refine_follows_tremor_to_a_fraction_of_noise(tremor_px: float) -> None:
     assert error < 1.5 * np.sqrt(np.mean(refined.std_px[inside] ** 2)) < 3 * NOISE_PX
 
 
+def test_refine_follows_tremor_through_gaps_without_light() -> None:
+    random, instants = np.random.default_rng(0), np.array([span.centre for span in spans()])
+    noise_px = NOISE_PX / np.clip(0.5 + 0.5 * np.cos(2 * np.pi * instants / 200), 0.01, 1) ** 0.5
+    std = noise_px[:, None] * [1, 1, 1 / 80, 1 / 80]
+    steps = random.normal(size=std.shape) * std
+    steps[:, 0] += 0.5 * np.sqrt(2) * np.sin(2 * np.pi * instants / 95)
+    information = np.stack([np.diag(each) for each in 1 / std**2])
+    refined = refine(SpanResiduals(spans(), steps, information))
+    found = refined.homographies[:, 0, 2] - refined.homographies[:, 0, 2].mean()
+    error = (found - 0.5 * np.sqrt(2) * np.sin(2 * np.pi * np.arange(N_FRAMES) / 95))[100:-100]
+    # A filter that leaves out steps of large noise misses half of the tremor there.
+    assert np.sqrt(np.mean(error**2)) < NOISE_PX
+    assert np.mean(np.abs(error) < 2 * refined.std_px[100:-100]) > 0.9
+
+
 def test_refine_names_frequencies() -> None:
     assert refine(residuals(0, 0.5), 96_800).summary == "motion of 0.5 px within groups was corrected, mostly at 1,276 Hz"
     assert refine(residuals(0, 0.5)).summary == "motion of 0.5 px within groups was corrected, mostly with periods of 76 frames"
