@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 
 from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
-from photonpano.geometry import corners, inverse, normalised, step_motions
+from photonpano.geometry import apply, corners, inverse, normalised, step_motions
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.uneven_noise import separated
 
@@ -26,6 +27,8 @@ _SLOW_BINS, _SLOW_PX = 2, 0.04
 no better itself."""
 _DARK, _DARK_SHARE = 10.0, 0.05
 """The light goes out, as between two flickers, if the variance of this share of the steps is this many times the usual one."""
+_SMOOTH_SPANS = 16.0
+"""Standard deviation of the Gaussian that makes a trajectory smooth, in spans."""
 _NAMED_LINES = 3
 """Frequencies that a summary names at most."""
 _NAMED_SHARE = 0.003
@@ -70,12 +73,16 @@ class ShortSpansRefiner:
         to_px = np.array([1, 1, self._radius_px, self._radius_px])
         variances = _variances(residuals.information) * to_px**2
         steps = residuals.steps * to_px
-        modes = [_filtered(steps[:, mode], variances[:, mode]) for mode in range(steps.shape[1])]
+        instants = np.array([span.centre for span in residuals.spans])
+        if _goes_dark(variances):
+            wiggles = _wiggles(trajectory, instants, self._shape) * to_px
+            modes = [_through_the_dark(*columns) for columns in zip(steps.T, wiggles.T, variances.T, strict=True)]
+        else:
+            modes = [_filtered(*columns) for columns in zip(steps.T, variances.T, strict=True)]
         shift_px = float(np.sqrt(sum(np.mean(mode.signal**2) for mode in modes)))
         if shift_px < self._config.smallest_px:
             return None
         frames = np.arange(len(std_px))
-        instants = np.array([span.centre for span in residuals.spans])
         at = np.clip(frames, instants[0], instants[-1])
         corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1))(at) / to_px
         motions = trajectory.at(frames)
@@ -128,11 +135,8 @@ def _filtered(steps: FloatArray, variances: FloatArray) -> _Filtered:
     known = np.isfinite(variances)
     if known.sum() < size // 2:
         return _Filtered(np.zeros(len(steps)), np.zeros(len(steps)))
-    typical = float(np.median(variances[known]))
-    if np.mean(variances > _DARK * typical) > _DARK_SHARE:
-        found = separated(steps, variances + _SYSTEMATIC_PX**2, size, _SIGNIFICANT, (_SLOW_BINS, _SLOW_PX))
-        return _Filtered(found.signal, found.std)
     # A step of large noise, over a dark place, would drown its window: it counts for less.
+    typical = float(np.median(variances[known]))
     trust = np.where(known, typical / (typical + np.maximum(variances - typical, 0)), 0.0)
     noise = (
         np.where(known, np.minimum(variances, typical / np.maximum(trust, 1e-9)), 0.0) * trust**2 + _SYSTEMATIC_PX**2 * trust**2
@@ -160,6 +164,47 @@ def _filtered(steps: FloatArray, variances: FloatArray) -> _Filtered:
         spread[place] += let_through[window] * taper**2
     inner = slice(half, half + len(steps))
     return _Filtered(signal[inner], np.sqrt(spread[inner]))
+
+
+def _goes_dark(variances: FloatArray) -> bool:
+    """Return whether many steps are far less certain than the others, as between two flickers: variances are (S, 4)."""
+    noise = variances[:, 0]
+    return bool(np.mean(noise > _DARK * np.median(noise)) > _DARK_SHARE)
+
+
+def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> _Filtered:
+    """Filter one mode where the light goes out.
+
+    What the motion does in the dark follows from what it does before and after, and not from the steps, which vanish there once
+    the trajectory is right: so the wiggles of the trajectory are part of what is filtered.
+
+    Args:
+        steps: (S,) in px.
+        wiggles: (S,) what the trajectory does faster than a smooth one.
+        variances: (S,) of the photon noise of the steps.
+    """
+    size = min(_WINDOW_SPANS, len(steps))
+    noise = variances + _SYSTEMATIC_PX**2
+    found = separated(wiggles + steps, noise, size, _SIGNIFICANT, (_SLOW_BINS, _SLOW_PX))
+    return _Filtered(found.signal - wiggles, found.std)
+
+
+def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return by which steps a trajectory differs from a smooth one: (S, 4), shift in px, roll in radians, and zoom."""
+    homographies = trajectory.at(instants)
+    middle = corners(frame_shape).mean(axis=0)
+    points = apply(homographies, middle + np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0]]))
+    place, along = points[:, 0], points[:, 2] - points[:, 1]
+    angle, size = np.unwrap(np.arctan2(along[:, 1], along[:, 0])), np.hypot(*along.T)
+    parameters = np.column_stack([place, angle, np.log(size)])
+    # Beyond its ends, the trajectory goes on as a mirror image through them.
+    beyond = min(int(4 * _SMOOTH_SPANS), len(instants) - 1)
+    longer = np.pad(parameters, ((beyond, beyond), (0, 0)), mode="reflect", reflect_type="odd")
+    wiggles = parameters - gaussian_filter1d(longer, _SMOOTH_SPANS, axis=0, mode="nearest")[beyond : beyond + len(instants)]
+    cosine, sine = np.cos(angle) / size, np.sin(angle) / size
+    x, y = wiggles[:, 0].copy(), wiggles[:, 1].copy()
+    wiggles[:, 0], wiggles[:, 1] = cosine * x + sine * y, cosine * y - sine * x
+    return wiggles
 
 
 def _mean_of_neighbours(image: FloatArray) -> FloatArray:
