@@ -3,12 +3,14 @@
 from photonpano.merging.accumulate import PhotonSum, accumulate, divided
 from photonpano.merging.binning import binned_mean, binning_of
 from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
-from photonpano.merging.light import gain_image
+from photonpano.merging.light import LightTerms, LitFrames, gain_image
 from photonpano.merging.merge_renderer import MergeRenderer
 
 __all__ = [
     "Chunk",
     "CountsCache",
+    "LightTerms",
+    "LitFrames",
     "MergeRenderer",
     "PhotonSum",
     "accumulate",

@@ -76,6 +76,10 @@ class LitFrames:
                 break
         return flux
 
+    def part(self, box: tuple[slice, slice]) -> LitFrames:
+        """Return copies of some rows and columns."""
+        return LitFrames(self.frames[:, *box].copy(), self.gains[:, *box].copy())
+
     def weighted(self, by: FluxImage) -> LitFrames:
         """Return these frames with a weight for each pixel, (H, W)."""
         return LitFrames(self.frames * by, self.gains * by)

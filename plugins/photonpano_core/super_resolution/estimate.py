@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 
 from photonpano import FloatArray, FluxImage
+from photonpano.merging import LitFrames
 from photonpano_core.super_resolution.collaborative import GROUP, PATCH, filter_groups, find_similar, places_of
-from photonpano_core.super_resolution.observing import expected, log_likelihood, photon_ratio
+from photonpano_core.super_resolution.observing import counts_in_light, expected, log_likelihood, photon_ratio
 
 STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
 """Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round."""
@@ -31,15 +32,22 @@ class Observations:
 
     Attributes:
         lit: (H, W) float32, sums of counts.
-        seen: (H, W) float32, frames in these sums.
+        seen: (H, W) float32, frames in these sums; in changing light the sum of their gains, in frames of mean light.
         kernel: (2 r + 1,) float32, the area of a pixel along x and along y: see `pixel_area`.
         binary: whether a count is 1 for one photon or more; otherwise counts are photons.
+        light: frames and gains by the class of their light; None in steady light.
     """
 
     lit: FluxImage
     seen: FluxImage
     kernel: FluxImage
     binary: bool
+    light: LitFrames | None = None
+
+    @property
+    def frames(self) -> FluxImage:
+        """Frames in the sums: (H, W)."""
+        return self.seen if self.light is None else np.asarray(self.light.frames.sum(axis=0), np.float32)
 
     def weight(self) -> FluxImage:
         """Return the frames of a cell, on average over the area of a pixel: (H, W)."""
@@ -49,8 +57,33 @@ class Observations:
         """Return the log-likelihood of the counts of each cell, but for a constant: (H, W)."""
         mean, found = np.empty_like(flux), np.empty_like(flux)
         expected(flux, self.kernel, found, mean)
-        log_likelihood(self.lit, self.seen, mean, self.binary, found)
-        return found
+        if self.light is None or not self.binary:
+            log_likelihood(self.lit, self.seen, mean, self.binary, found)
+            return found
+        lit, dark = self._counts(mean)
+        n = np.maximum(self.frames, 1)
+        return np.asarray(self.lit * np.log(lit / n) + (n - self.lit) * np.log(dark / n), np.float32) * (self.seen > 0)
+
+    def photon_ratio(self, mean: FluxImage, into: FluxImage) -> None:
+        """Return the photons that each cell detected, given its counts, for each photon of the flux: (H, W).
+
+        In changing light it is `k sum_c n_c g_c / sum_c n_c (1 - exp(-g_c mean))` of counts k in n_c frames of gain g_c.
+
+        Args:
+            mean: (H, W) expected photons of a pixel in a frame.
+            into: (H, W) output.
+        """
+        if self.light is None or not self.binary:
+            photon_ratio(self.lit, self.seen, mean, self.binary, into)
+        else:
+            np.divide(self.lit * self.seen, self._counts(mean)[0], out=into)
+
+    def _counts(self, mean: FluxImage) -> tuple[FluxImage, FluxImage]:
+        """Return the expected lit and dark frames of each cell, at least a tiny number."""
+        assert self.light is not None
+        lit, dark = np.empty_like(mean), np.empty_like(mean)
+        counts_in_light(np.maximum(mean, np.float32(1e-9)), self.light.frames, self.light.gains, lit, dark)
+        return np.maximum(lit, np.float32(1e-12)), np.maximum(dark, np.float32(1e-12))
 
 
 def pixel_area(width: float) -> FluxImage:
@@ -115,7 +148,7 @@ def _likelier(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Obs
     per_frame = np.divide(1, seen, out=np.zeros_like(seen), where=known)
     for _ in range(_STEPS):
         expected(flux, observed.kernel, room, mean)
-        photon_ratio(observed.lit, observed.seen, mean, observed.binary, ratio)
+        observed.photon_ratio(mean, ratio)
         expected(ratio, observed.kernel, room, mean)
         flux = np.maximum(np.where(known, flux * mean * per_frame, flux), floor)
     return flux
@@ -130,7 +163,9 @@ def _started(observed: Observations) -> FluxImage:
     mean = (lit + 1e-6 * share) / (seen + 1e-6)
     if not observed.binary:
         return np.asarray(np.maximum(mean, 1e-9), np.float32)
-    return np.asarray(-np.log1p(-np.clip(mean, 1e-9, 1 - 0.5 / np.maximum(seen, 1))), np.float32)
+    gain = float(observed.seen.sum()) / max(float(observed.frames.sum()), 1.0)
+    share = np.clip(mean * gain, 1e-9, 1 - 0.5 / np.maximum(seen, 1))
+    return np.asarray(-np.log1p(-share) / gain, np.float32)
 
 
 def _stabilised(flux: FluxImage, binary: bool) -> FluxImage:

@@ -19,7 +19,7 @@ _UP = 0.5 + 1e-6
 def add_observations(
     counts: NDArray[np.float32],
     usable: NDArray[np.bool_],
-    n_frames: float,
+    amounts: NDArray[np.float32],
     to_grid: NDArray[np.float64],
     first: int,
     lit: NDArray[np.float32],
@@ -33,15 +33,15 @@ def add_observations(
     Args:
         counts: (h, w) sum of frames.
         usable: (h, w), False for masked pixels.
-        n_frames: frames in the sum.
+        amounts: (P,) what each usable pixel adds to each image of `seen`, such as the frames in the sum.
         to_grid: (3, 3), pixels of the frame to cells of the whole grid.
         first: row of the whole grid at which `lit` and `seen` begin.
         lit: (H, W) rows of the grid: counts, added to.
-        seen: (H, W): frames, added to.
+        seen: (P, H, W): amounts, added to.
     """
     height, width = counts.shape
     rows, columns = lit.shape
-    n = np.float32(n_frames)
+    present = np.flatnonzero(amounts)
     for y in range(height):
         # Along a row of the frame, the grid's coordinates are quotients of linear functions.
         u0, du = to_grid[0, 1] * y + to_grid[0, 2], to_grid[0, 0]
@@ -57,7 +57,8 @@ def add_observations(
             row = int(np.floor((v0 + dv * x) * per_depth + _UP)) - first
             if 0 <= row < rows and 0 <= column < columns and usable[y, x]:
                 lit[row, column] += counts[y, x]
-                seen[row, column] += n
+                for p in present:
+                    seen[p, row, column] += amounts[p]
 
 
 @compiled
@@ -149,3 +150,31 @@ def log_likelihood(
                 out[x] = k[x] * np.log(_lit_share(light)) - (n[x] - k[x]) * light
             else:
                 out[x] = k[x] * np.log(light) - n[x] * light
+
+
+@compiled
+def counts_in_light(
+    mean: NDArray[np.float32],
+    frames: NDArray[np.float32],
+    gains: NDArray[np.float32],
+    lit: NDArray[np.float32],
+    dark: NDArray[np.float32],
+) -> None:
+    """Return the expected lit and dark frames of each cell in changing light, summed over the classes of its frames.
+
+    Args:
+        mean: (H, W) expected photons of a pixel in a frame of mean light.
+        frames: (C, H, W) frames of each class.
+        gains: (C, H, W) sums of their gains.
+        lit: (H, W) output: frames with one photon or more.
+        dark: (H, W) output: frames without.
+    """
+    for y in range(mean.shape[0]):
+        for x in range(mean.shape[1]):
+            lit[y, x] = dark[y, x] = np.float32(0)
+            for c in range(len(frames)):
+                n = frames[c, y, x]
+                if n > 0:
+                    share = _lit_share(gains[c, y, x] / n * mean[y, x])
+                    lit[y, x] += n * share
+                    dark[y, x] += n * (np.float32(1) - share)

@@ -18,7 +18,7 @@ from photonpano.merging import Chunk
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.configs import SuperResolutionConfig
 from photonpano_core.super_resolution.estimate import STRENGTHS, Observations, coarser, gain_of, pixel_area, rounds_of
-from photonpano_core.super_resolution.sums import pieces_of, sums_on, visible
+from photonpano_core.super_resolution.sums import PhotonSums, pieces_of, sums_on, visible
 
 Decide = Callable[[str, int | bool, str], None]
 
@@ -116,22 +116,21 @@ class SuperResolutionRenderer:
     def _fill(
         self,
         panorama: Panorama,
-        sums: tuple[FluxImage, FluxImage],
+        sums: PhotonSums,
         chunks: Sequence[Chunk],
         source: Source,
         n_rounds: int,
         block: Box,
     ) -> None:
         """Estimate what frames show of a block of a panorama, if they show anything."""
-        part = _seen_part(sums[1], block)
+        part = _seen_part(sums.seen, block)
         if part is None:
             return
         block, inner, around = part
         rows, columns = block
-        lit, seen = (np.ascontiguousarray(each[around]) for each in sums)
         middle = np.array([(columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2])
         zoom = _zoom_at(middle, panorama.canvas, chunks, source.info.frame_shape)
-        observed = self._observations(source, lit, seen, zoom)
+        observed = self._observations(source, sums.part(around), zoom)
         weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(source))
         known = weight >= _FEWEST_FRAMES
         if not known.any():
@@ -140,9 +139,10 @@ class SuperResolutionRenderer:
         panorama.flux[block] = np.where(known, flux, np.float32(np.nan))
         panorama.weight[block] = np.where(known, weight, 0)
 
-    def _observations(self, source: Source, lit: FluxImage, seen: FluxImage, zoom: float) -> Observations:
+    def _observations(self, source: Source, sums: PhotonSums, zoom: float) -> Observations:
         binary = isinstance(source.response, BinaryResponse | BinarySumResponse)
-        return Observations(lit, seen, pixel_area(zoom * float(np.sqrt(self._config.fill_factor))), binary)
+        area = pixel_area(zoom * float(np.sqrt(self._config.fill_factor)))
+        return Observations(sums.lit, sums.seen, area, binary, sums.light)
 
     def _rounds(
         self,
@@ -166,7 +166,7 @@ class SuperResolutionRenderer:
             middle = np.array([(probe.width - 1) / 2, (probe.height - 1) / 2])
             zoom = _zoom_at(middle, probe.transform, near, source.info.frame_shape)
             fitted, tested = (
-                self._observations(source, *sums_on(source, part, probe, lambda _: None, pool), zoom) for part in (kept, held)
+                self._observations(source, sums_on(source, part, probe, lambda _: None, pool), zoom) for part in (kept, held)
             )
             inner = slice(_HALO_PX, -_HALO_PX), slice(_HALO_PX, -_HALO_PX)
             results = rounds_of(fitted, len(STRENGTHS))

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import BoolArray, FluxImage, FrameSpan, Homography, LinearlyCorrectedSource, Source, Trajectory
+from photonpano import BoolArray, FluxImage, FrameSpan, Homography, LinearlyCorrectedSource, LitSource, Source, Trajectory
 from photonpano.geometry import Canvas, apply, corners
-from photonpano.merging import Chunk, chunks_of, divided
+from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.super_resolution.observing import add_observations
 
@@ -22,6 +23,26 @@ _PART_ROWS = 64
 """Rows of the grid, about, that a thread adds to at a time."""
 _MANY_PIECES = 64
 """A span is divided into at least this many chunks, if it has the frames: some of them are held out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotonSums:
+    """Sums over the frames whose pixels fall into each cell of a grid.
+
+    Attributes:
+        lit: (H, W) float32, counts. For a camera that does not count single photons, they are photons.
+        seen: (H, W) float32, frames, or binary frames where a frame is a sum of these; in changing light, their gains.
+        light: frames and gains by the class of their light; None in steady light.
+    """
+
+    lit: FluxImage
+    seen: FluxImage
+    light: LitFrames | None
+
+    def part(self, box: tuple[slice, slice]) -> PhotonSums:
+        """Return some rows and columns."""
+        lit, seen = (np.ascontiguousarray(each[box]) for each in (self.lit, self.seen))
+        return PhotonSums(lit, seen, None if self.light is None else self.light.part(box))
 
 
 def pieces_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float) -> list[Chunk]:
@@ -48,39 +69,39 @@ def visible(chunks: Sequence[Chunk], canvas: Canvas, frame_shape: tuple[int, int
 
 def sums_on(
     source: Source, chunks: Sequence[Chunk], canvas: Canvas, advance: Callable[[int], None], pool: Executor
-) -> tuple[FluxImage, FluxImage]:
-    """Sum the counts and the frames of the pixels whose centres fall into each cell of a canvas.
-
-    Returns:
-        Counts and frames, (H, W) float32 each. For a camera that does not count single photons, the counts are photons; for
-        sums of binary frames, the frames are binary ones.
-    """
-    lit, seen = np.zeros(canvas.shape, np.float32), np.zeros(canvas.shape, np.float32)
+) -> PhotonSums:
+    """Sum the counts and the frames of the pixels whose centres fall into each cell of a canvas."""
+    light = source.light if isinstance(source, LitSource) else None
+    terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
+    lit = np.zeros(canvas.shape, np.float32)
+    seen = np.zeros((1 if terms is None else terms.number, *canvas.shape), np.float32)
     usable = np.ascontiguousarray(source.valid)
     parts = divided(canvas.height, max(1, canvas.height // _PART_ROWS))
     adding: Iterable[None] = ()
     for first in range(0, len(chunks), _BATCH):
         batch = chunks[first : first + _BATCH]
-        summed = list(pool.map(partial(_summed, source), batch))
+        summed = list(pool.map(partial(_summed, source, terms), batch))
         deque(adding, maxlen=0)
         to_grid = [np.ascontiguousarray(canvas.transform @ chunk.homography) for chunk in batch]
-        adding = pool.map(partial(_add, batch, summed, to_grid, usable, lit, seen), parts)
+        adding = pool.map(partial(_add, summed, to_grid, usable, lit, seen), parts)
         for chunk in batch:
             advance(len(chunk.span))
     deque(adding, maxlen=0)
-    return _photons(source, lit, seen)
+    lit_frames = None if terms is None or light is None else terms.lit_frames(seen, light, canvas.transform)
+    return _photons(source, lit, seen[0], lit_frames)
 
 
-def _summed(source: Source, chunk: Chunk) -> NDArray[np.float32]:
-    counts = source.counts(chunk.span)
+def _summed(source: Source, terms: LightTerms | None, chunk: Chunk) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the counts of a chunk, (h, w), and what a pixel adds to each image of frames and gains, (P,)."""
+    counts, n_frames = source.counts(chunk.span), len(chunk.span)
+    amounts = np.array([n_frames], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
     if isinstance(source, LinearlyCorrectedSource):
-        return np.ascontiguousarray(source.corrected(counts, len(chunk.span)), np.float32)
-    return np.ascontiguousarray(counts, np.float32)
+        return np.ascontiguousarray(source.corrected(counts, n_frames), np.float32), amounts
+    return np.ascontiguousarray(counts, np.float32), amounts
 
 
 def _add(
-    chunks: Sequence[Chunk],
-    summed: Sequence[NDArray[np.float32]],
+    summed: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]],
     to_grid: Sequence[Homography],
     usable: BoolArray,
     lit: FluxImage,
@@ -88,19 +109,22 @@ def _add(
     rows: range,
 ) -> None:
     part = slice(rows.start, rows.stop)
-    for chunk, counts, homography in zip(chunks, summed, to_grid, strict=True):
-        add_observations(counts, usable, float(len(chunk.span)), homography, rows.start, lit[part], seen[part])
+    for (counts, amounts), homography in zip(summed, to_grid, strict=True):
+        add_observations(counts, usable, amounts, homography, rows.start, lit[part], seen[:, part])
 
 
-def _photons(source: Source, lit: FluxImage, seen: FluxImage) -> tuple[FluxImage, FluxImage]:
+def _photons(source: Source, lit: FluxImage, seen: FluxImage, light: LitFrames | None) -> PhotonSums:
     # Subtraction of dark counts can leave a negative sum by chance.
     lit = np.maximum(lit, 0, out=lit)
+    frames = seen if light is None else np.asarray(light.frames.sum(axis=0), np.float32)
+    if light is not None:
+        seen = light.weight
     match source.response:
         case BinaryResponse():
-            return np.minimum(lit, seen, out=lit), seen
+            return PhotonSums(np.minimum(lit, frames, out=lit), seen, light)
         case BinarySumResponse(n):
-            seen *= np.float32(n)
-            return np.minimum(lit, seen, out=lit), seen
-    frames = np.maximum(seen, 1)
-    photons = source.response.flux(np.asarray(lit / frames, np.float32), frames) * seen
-    return np.asarray(np.where(seen > 0, np.maximum(photons, 0), 0), np.float32), seen
+            light = None if light is None else light.weighted(np.full_like(seen, n))
+            return PhotonSums(np.minimum(lit, frames * np.float32(n), out=lit), seen * np.float32(n), light)
+    some = np.maximum(frames, 1)
+    photons = source.response.flux(np.asarray(lit / some, np.float32), some) * frames
+    return PhotonSums(np.asarray(np.where(frames > 0, np.maximum(photons, 0), 0), np.float32), seen, light)

@@ -8,15 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Panorama
+from photonpano import FrameSpan, Light, Panorama
 from photonpano.geometry import Canvas, translation
+from photonpano.lighting import in_light
 from photonpano.merging import MergeRenderer
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
 from photonpano_core.super_resolution.collaborative import GROUP, filter_groups, find_similar, places_of
 from photonpano_core.super_resolution.estimate import Observations, pixel_area, rounds_of
-from photonpano_core.super_resolution.observing import add_observations, expected
+from photonpano_core.super_resolution.observing import add_observations, counts_in_light, expected
 from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
 
 SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
@@ -48,10 +49,19 @@ def seen_from(stop: np.ndarray, scene: np.ndarray, area: int = FINE) -> np.ndarr
     return view[:, margin : margin + area, :, margin : margin + area].mean(axis=(1, 3))
 
 
-def capture(scene: np.ndarray, area: int = FINE, seed: int = 0) -> tuple[MemorySource, KnownMotion]:
-    """Simulate a camera that jumps from stop to stop; the reference plane has the pixels of a frame."""
+def capture(
+    scene: np.ndarray, area: int = FINE, seed: int = 0, gains: np.ndarray | None = None
+) -> tuple[MemorySource, KnownMotion]:
+    """Simulate a camera that jumps from stop to stop, in steady light or of given gains, (CHUNKS, FRAMES).
+
+    The reference plane has the pixels of a frame.
+    """
     rng, places = np.random.default_rng(seed), stops()
-    lit = [rng.random((FRAMES, SIDE, SIDE)) < -np.expm1(-seen_from(stop, scene, area)) for stop in places]
+    gains = np.ones((CHUNKS, FRAMES)) if gains is None else gains
+    lit = [
+        rng.random((FRAMES, SIDE, SIDE)) < -np.expm1(-gain[:, None, None] * seen_from(stop, scene, area))
+        for stop, gain in zip(places, gains, strict=True)
+    ]
     motion = KnownMotion(lambda frame: translation(*places[min(int(frame) // FRAMES, CHUNKS - 1)] / FINE))
     return MemorySource(np.concatenate(lit)), motion
 
@@ -78,7 +88,7 @@ def psnr_db(flux: np.ndarray, truth: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean(difference**2)))
 
 
-def test_super_resolution_exceeds_interpolated_panorama_by_3_db() -> None:
+def test_super_resolution_exceeds_interpolated_panorama_by_3_db_with_the_weight_of_a_merge() -> None:
     scene = fine_scene()
     source, motion = capture(scene)
     truth, decisions = true_panorama(scene), []
@@ -88,12 +98,36 @@ def test_super_resolution_exceeds_interpolated_panorama_by_3_db() -> None:
     bicubic = cv2.resize(np.nan_to_num(merged.flux), CANVAS.shape, interpolation=cv2.INTER_CUBIC)
     assert psnr_db(panorama.flux, truth) > psnr_db(bicubic, truth) + 3
     assert float(panorama.flux[INNER].mean()) == pytest.approx(truth[INNER].mean(), rel=0.01)
+    merged = MergeRenderer(1).render(source, motion, source.info.span, CANVAS, 0.125, lambda _: None)
+    assert panorama.weight[INNER].mean() == pytest.approx(merged.weight[INNER].mean(), rel=0.02)
     (what, value, reason), (supported, yes, _) = decisions
     assert (what, supported, yes) == ("super_resolution.rounds", "super_resolution.supported", True)
     assert 1 <= value <= 6
     assert reason.startswith(
         "of 6, each with a weaker prior: the first that predicts frames held out nearly as well as the best; "
     )
+
+
+def test_flux_in_light_that_flickers_and_drifts_is_that_of_mean_light() -> None:
+    time = np.arange(CHUNKS * FRAMES) / (CHUNKS * FRAMES)
+    gain = (1 + np.cos(2 * np.pi * 37 * time)) * (1.4 - 0.8 * time)
+    gain /= gain.mean()
+    scene = fine_scene(0.6)
+    source, motion = capture(scene, gains=gain.reshape(CHUNKS, FRAMES))
+    truth, decisions = true_panorama(scene), []
+    panorama, ignoring = rendered(in_light(source, Light.of_frames(gain)), motion, decisions), rendered(source, motion)
+    assert float(panorama.flux[INNER].mean()) == pytest.approx(truth[INNER].mean(), rel=0.01)
+    assert psnr_db(panorama.flux, truth) > psnr_db(ignoring.flux, truth) + 3
+    assert panorama.weight[INNER].mean() == pytest.approx(ignoring.weight[INNER].mean(), rel=0.05)
+    assert "nan" not in "".join(reason for _, _, reason in decisions)
+
+
+def test_expected_counts_in_changing_light_are_sums_over_classes() -> None:
+    frames, sums = np.float32([[[60]], [[40]], [[0]]]), np.float32([[[30]], [[80]], [[0]]])
+    lit, dark = np.empty((2, 1, 1), np.float32)
+    counts_in_light(np.float32([[0.7]]), frames, sums, lit, dark)
+    wanted = 60 * -np.expm1(-0.35) + 40 * -np.expm1(-1.4)
+    np.testing.assert_allclose([lit[0, 0], dark[0, 0]], [wanted, 100 - wanted], rtol=1e-5)
 
 
 def test_scale_beyond_the_photons_is_said_with_the_figure_and_done(caplog: pytest.LogCaptureFixture) -> None:
@@ -107,14 +141,6 @@ def test_scale_beyond_the_photons_is_said_with_the_figure_and_done(caplog: pytes
         "the photons do not support scale 2: with its detail beyond that of scale 1, the log-likelihood of"
     )
     assert caplog.messages == [reason]
-
-
-def test_weight_is_the_number_of_frames_that_saw_a_pixel() -> None:
-    source, motion = capture(fine_scene())
-    small = Canvas(*CANVAS.shape, CANVAS.transform)
-    merged = MergeRenderer(1).render(source, motion, source.info.span, small, 0.125, lambda _: None)
-    weight = rendered(source, motion).weight
-    assert weight[INNER].mean() == pytest.approx(merged.weight[INNER].mean(), rel=0.02)
 
 
 def test_panorama_keeps_fine_detail_of_pixels_with_a_small_area() -> None:
@@ -157,14 +183,14 @@ def test_expected_equals_a_filter_and_is_its_own_adjoint_inside() -> None:
 def test_add_observations_sorts_pixels_into_the_nearest_cells_and_leaves_masked_ones_out() -> None:
     counts, usable = np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 3), bool)
     usable[1, 2] = False
-    lit, seen = np.zeros((2, 4, 8), np.float32)
+    lit, seen = np.zeros((4, 8), np.float32), np.zeros((2, 4, 8), np.float32)
     to_grid = np.array([[2.0, 0, 0.4], [0, 2.0, 0.7], [0, 0, 1]])
-    add_observations(counts, usable, 5.0, to_grid, 0, lit, seen)
+    add_observations(counts, usable, np.float32([5, 2]), to_grid, 0, lit, seen)
     wanted = np.zeros((4, 8))
     wanted[1, [0, 2, 4]], wanted[3, [0, 2]] = [0, 1, 2], [3, 4]
     np.testing.assert_array_equal(lit, wanted)
-    assert (seen > 0).sum() == 5
-    assert seen.sum() == 25
+    assert (seen > 0).sum(axis=(1, 2)).tolist() == [5, 5]
+    assert seen.sum(axis=(1, 2)).tolist() == [25, 10]
 
 
 def test_likelihood_rises_from_round_to_round_until_the_prior_is_weak() -> None:
