@@ -164,8 +164,8 @@ def _started(observed: Observations) -> FluxImage:
     if not observed.binary:
         return np.asarray(np.maximum(mean, 1e-9), np.float32)
     gain = float(observed.seen.sum()) / max(float(observed.frames.sum()), 1.0)
-    share = np.clip(mean * gain, 1e-9, 1 - 0.5 / np.maximum(seen, 1))
-    return np.asarray(-np.log1p(-share) / gain, np.float32)
+    lit_share = np.clip(mean * gain, 1e-9, 1 - 0.5 / np.maximum(seen, 1))
+    return np.asarray(-np.log1p(-lit_share) / gain, np.float32)
 
 
 def _stabilised(flux: FluxImage, binary: bool) -> FluxImage:
