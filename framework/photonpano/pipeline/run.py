@@ -26,7 +26,7 @@ from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import RunFolder, run_folder
-from photonpano.protocols import Source
+from photonpano.protocols import Source, light_of
 from photonpano.record.run_json import peak_memory_bytes, record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
@@ -34,6 +34,7 @@ from photonpano.residuals.refinement import Explained, refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
+from photonpano.values import Light
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +127,7 @@ def run(
             )
         )
         work.finish()
-        record = _with_report(folder, record, explained, panorama)
+        record = _with_report(folder, record, explained, panorama, light_of(source))
         finished(record)
     return RunResult(plan.output.directory, record, verdict)
 
@@ -135,12 +136,14 @@ def _read_files(plan: Plan) -> list[Path]:
     return [*capture_files(plan), *([] if plan.file is None else [plan.file])]
 
 
-def _with_report(folder: RunFolder, record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> RunRecord:
+def _with_report(
+    folder: RunFolder, record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None
+) -> RunRecord:
     """Add the report to the run folder. The results are there already: what fails now is a warning."""
     try:
         folder.reopen()
         try:
-            folder.write_report(render_report(record, explained, panorama))
+            folder.write_report(render_report(record, explained, panorama, light))
         except Exception as error:
             logger.debug("the report failed", exc_info=True)
             warning = f"the report could not be drawn ({type(error).__name__}: {error}); all other files of the run are written"

@@ -19,7 +19,7 @@ from photonpano.report import figures, residual_figures
 from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.failures import failure_groups
 from photonpano.residuals.refinement import Explained
-from photonpano.values import true_spans
+from photonpano.values import Light, true_spans
 
 PICTURE_PIXELS = 1600
 """Longer side of the panorama on the page; the files of the run folder have all pixels."""
@@ -28,7 +28,9 @@ MAX_SPANS = 12
 """Number of spans of frames that are listed."""
 
 
-def render_report(record: RunRecord, explained: Explained | None, panorama: RenderedPanorama | None) -> str:
+def render_report(
+    record: RunRecord, explained: Explained | None, panorama: RenderedPanorama | None, light: Light | None = None
+) -> str:
     """Return the report of a run as one HTML page that needs no other file, no network and no script.
 
     Args:
@@ -36,6 +38,7 @@ def render_report(record: RunRecord, explained: Explained | None, panorama: Rend
         explained: the motion of every frame, and what the panorama does not explain; None for a run that failed, whose page
             has no figures of it.
         panorama: the panorama; None for a run that failed.
+        light: that the run found; None if it is steady.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -57,13 +60,16 @@ def render_report(record: RunRecord, explained: Explained | None, panorama: Rend
         failures=failure_groups(record["levels"]),
         spec_yaml=_yaml(record["spec"]),
         stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
-        **({"picture": None} if explained is None or panorama is None else _results(record, explained, panorama)),
+        **({"picture": None} if explained is None or panorama is None else _results(record, explained, panorama, light)),
     )
     return page
 
 
-def _results(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:
-    return _motion(record, explained.motion, panorama) | _unexplained(record, explained, panorama)
+def _results(record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None) -> dict[str, Any]:
+    canvas = panorama.canvas
+    flicker = residual_figures.flicker_over_panorama(light, inverse(canvas.transform), canvas.shape)
+    motion = _motion(record, explained.motion, panorama)
+    return motion | _unexplained(record, explained, panorama) | {"flicker_over_panorama": flicker}
 
 
 def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.geometry import apply
+from photonpano.merging.light import amplitudes
 from photonpano.report.drawing import (
     INK,
     LINE,
@@ -22,7 +23,7 @@ from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.unexplained import SYSTEMATIC_PX
 from photonpano.residuals.verdict import block_shifts
-from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Homography, Light
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
@@ -41,6 +42,10 @@ _WINDOW_SPANS = 512
 _MISFIT_RANGE = (0.5, 2.0)
 """The smallest range of colours of the misfit; the largest misfit that is drawn may widen it."""
 _MISFIT_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_FLICKER_PIXELS = 200
+"""Longer side of the maps of the flicker, about."""
+_FLICKERS = 0.2
+"""Places flicker if they do so by this share of the deepest flicker."""
 _GAIN_RANGE_PERCENT = 5.0
 """The smallest range of colours of the brightness, to both sides."""
 
@@ -136,6 +141,39 @@ def light_over_time(residuals: Residuals) -> str | None:
         axes.set_xlabel("frame")
         axes.xaxis.set_major_formatter("{x:,.0f}")
         return svg_of(figure, "light")
+
+
+def flicker_over_panorama(light: Light | None, to_plane: Homography, shape: tuple[int, int]) -> str | None:
+    """Draw how deep each place flickers, and at which phase; None if all of the scene has the same light.
+
+    Args:
+        light: of the capture; None if it is steady.
+        to_plane: (3, 3), pixels of the panorama to pixels of the reference plane.
+        shape: (height, width) of the panorama.
+    """
+    if light is None or not light.has_lamps:
+        return None
+    step = max(1, max(shape) // _FLICKER_PIXELS)
+    small = -(-shape[0] // step), -(-shape[1] // step)
+    cosine, sine = amplitudes(light, to_plane @ np.diag([step, step, 1.0]), small)
+    extent = -0.5, small[1] * step - 0.5, small[0] * step - 0.5, -0.5
+    depth = np.hypot(cosine, sine)
+    with plain_figure(WIDTH_IN, float(np.clip((WIDTH_IN / 2 - 0.8) * shape[0] / shape[1], 1.0, 4.0)) + 0.9) as figure:
+        left, right = figure.subplots(1, 2)
+        image = left.imshow(depth, cmap="viridis", vmin=0, extent=extent)
+        _add_colour_bar(figure, left, image, "flicker / mean light", 0.05)
+        # Places that hardly flicker have no phase.
+        phase = np.ma.masked_where(depth < _FLICKERS * depth.max(), np.degrees(np.arctan2(-sine, cosine)))
+        image = right.imshow(phase, cmap="twilight", vmin=-180, vmax=180, extent=extent)
+        _add_colour_bar(figure, right, image, "phase (degrees)", 0.05)
+        for axes in (left, right):
+            axes.grid(visible=False)
+            axes.set_facecolor(LINE)
+            axes.locator_params(nbins=4)
+            axes.xaxis.set_major_formatter("{x:,.0f}")
+            axes.set_xlim(-0.5, shape[1] - 0.5)
+            axes.set_ylim(shape[0] - 0.5, -0.5)
+        return svg_of(figure, "flicker")
 
 
 def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:

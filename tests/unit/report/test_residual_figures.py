@@ -11,6 +11,7 @@ import pytest
 
 from photonpano.report import residual_figures
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX
+from photonpano.values import Light
 
 
 def test_figures_use_colour_variables_of_page(residuals):
@@ -31,6 +32,17 @@ def test_light_is_drawn_only_if_it_changes(residuals):
     svg = residual_figures.light_over_time(replace(residuals, light=np.linspace(0.5, 1.5, len(residuals.spans))))
     ElementTree.fromstring(svg)
     assert "light / mean" in svg
+
+
+def test_flicker_is_drawn_only_where_places_have_their_own():
+    gain = np.ones(100)
+    assert residual_figures.flicker_over_panorama(None, np.eye(3), (60, 90)) is None
+    assert residual_figures.flicker_over_panorama(Light.of_frames(gain), np.eye(3), (60, 90)) is None
+    waves, maps = np.zeros((2, 100)), np.stack([np.linspace(0, 0.8, 90 * 60).reshape(60, 90)] * 2).astype(np.float32)
+    svg = residual_figures.flicker_over_panorama(Light(gain, waves, maps, np.eye(3), 0.1, gain), np.eye(3), (60, 90))
+    ElementTree.fromstring(svg)
+    assert "flicker / mean light" in svg
+    assert "phase (degrees)" in svg
 
 
 def test_spectrum_of_noise_is_one(residuals):
