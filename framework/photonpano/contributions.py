@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from photonpano.errors import CaptureUnreadError
 from photonpano.paths import given_path, refusal
@@ -177,6 +177,21 @@ class Recognised:
     because: str
 
 
+class PartOfCapture(Config):
+    """The key of every source that the framework applies: which part of the capture to read."""
+
+    frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = Field(
+        None, description="the part of the capture to read, [start, stop]: frames start to stop - 1; all by default"
+    )
+
+    @field_validator("frames", mode="after")
+    @classmethod
+    def _in_order(cls, frames: tuple[int, int] | None) -> tuple[int, int] | None:
+        if frames is not None and frames[0] >= frames[1]:
+            raise ValueError(f"expected [start, stop] with start < stop, got {list(frames)}")
+        return frames
+
+
 def _not_ours(_: Path) -> None:
     """Recognise nothing: the default `recognise` of a source."""
 
@@ -184,6 +199,8 @@ def _not_ours(_: Path) -> None:
 @dataclass(frozen=True, kw_only=True)
 class SourceContribution(Contribution):
     """Offers a source.
+
+    The config gets one more key, `frames`: see `PartOfCapture`. The framework reads that part of what `build` returns.
 
     Attributes:
         check: finds problems of a config without reading the capture, such as a missing file.
@@ -198,6 +215,15 @@ class SourceContribution(Contribution):
     check: Callable[[Any], Sequence[str]] = no_problems
     recognise: Callable[[Path], Recognised | None] = _not_ours
     suffixes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        Contribution.__post_init__(self)
+        if issubclass(self.config, PartOfCapture):
+            return
+        if "frames" in self.config.model_fields:
+            raise ValueError(f"{self.name}: the key 'frames' of a source is the framework's; give yours another name")
+        own = {"__module__": self.config.__module__, "__doc__": self.config.__doc__}
+        object.__setattr__(self, "config", type(self.config.__name__, (PartOfCapture, self.config), own))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,7 +54,7 @@ class NpyConfig(Config):
     frames_per_sum: int | None = Field(
         None, ge=1, le=65535, description="number of binary frames in each sum; required for sums"
     )
-    frames: Literal["first", "last"] | None = Field(
+    frame_axis: Literal["first", "last"] | None = Field(
         None,
         description="axis of the frames: first for (frames, height, width), last for (height, width, frames); by default "
         "first, and arrays that show that it is the last are refused",
@@ -206,13 +206,13 @@ def _header(config: NpyConfig) -> NpyHeader:
         )
     if len(header.shape) != 3:
         raise InputError(f"{path} has the shape {header.shape}; a capture has 3 dimensions, frames, height and width")
-    require_frames(path, header, "height, width, frames" if config.frames == "last" else "frames, height, width")
+    require_frames(path, header, "height, width, frames" if config.frame_axis == "last" else "frames, height, width")
     if not is_gzip(path):
         require_whole(path, header)
-    if config.frames is None and _frames_are_last(path, header):
+    if config.frame_axis is None and _frames_are_last(path, header):
         raise InputError(
-            f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write frames: last, or "
-            "frames: first if it is right"
+            f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write "
+            "frame_axis: last, or frame_axis: first if it is right"
         )
     return header
 
@@ -228,7 +228,7 @@ def _frames_are_last(path: Path, header: NpyHeader) -> bool:
 def _open(config: NpyConfig) -> NpyBits | NpySums:
     header = _header(config)
     path = unpacked(config.path) if is_gzip(config.path) else config.path
-    values = _Values(path, header, config.frames == "last")
+    values = _Values(path, header, config.frame_axis == "last")
     if config.frames_per_sum is None:
         return NpyBits(values, config.frame_rate_hz)
     return NpySums(values, config.frames_per_sum, config.frame_rate_hz)
@@ -263,7 +263,7 @@ def _recognise(path: Path) -> Recognised | None:
     because = f"{header.dtype} of shape {header.shape} in a .npy file, with the values 0 and {content.highest} only"
     if not _frames_are_last(path, header):
         return Recognised(keys, because)
-    return Recognised(keys | {"frames": "last"}, f"{because}, and values are most alike along the last axis")
+    return Recognised(keys | {"frame_axis": "last"}, f"{because}, and values are most alike along the last axis")
 
 
 NPY = SourceContribution(

@@ -10,7 +10,15 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from photonpano.contributions import ExporterContribution, RendererContribution, SourceContext, StageContext, install_command
+from photonpano.captures.part import part_of
+from photonpano.contributions import (
+    ExporterContribution,
+    PartOfCapture,
+    RendererContribution,
+    SourceContext,
+    StageContext,
+    install_command,
+)
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
@@ -24,7 +32,7 @@ from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
 from photonpano.threads import thread_count
-from photonpano.values import CaptureSummary, Decision, DecisionValue, Group
+from photonpano.values import CaptureSummary, Decision, DecisionValue, FrameSpan, Group
 
 if TYPE_CHECKING:
     from photonpano.pipeline.exports import AttributedExporter
@@ -68,7 +76,7 @@ def build_source(plan: Plan) -> Source:
     """
     try:
         built = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
-        source = attributed(built, plan.source.label)
+        source = _part(plan, attributed(built, plan.source.label))
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
@@ -87,6 +95,19 @@ def build_source(plan: Plan) -> Source:
     except BaseException:
         source.close()
         raise
+
+
+def _part(plan: Plan, source: Source) -> Source:
+    """Return the frames that `source.with.frames` names; all if it names none."""
+    config = plan.source.config
+    if not isinstance(config, PartOfCapture) or config.frames is None:
+        return source
+    (start, stop), n_frames = config.frames, source.info.n_frames
+    if stop > n_frames:
+        source.close()
+        message = f"the capture has {n_frames} frames: expected [start, stop] with stop up to {n_frames}, got [{start}, {stop}]"
+        raise SpecError([plan.place("source.with.frames").problem(message)])
+    return part_of(source, FrameSpan(start, stop))
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:

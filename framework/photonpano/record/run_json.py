@@ -100,6 +100,7 @@ def record_of(
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
         "capture": capture,
+        "rendered_from": None,
     }
 
 

@@ -165,7 +165,7 @@ class RunRecord(TypedDict):
 
     `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none; `peak_memory_bytes` is None where the
     system does not report it. `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
-    `rendered_from` is the run folder whose motion was rendered again.
+    `rendered_from` is the run folder whose motion was rendered again, None where the motion was estimated.
     """
 
     photonpano: str
@@ -188,4 +188,4 @@ class RunRecord(TypedDict):
     peak_memory_bytes: int | None
     capture: CaptureRecord
     files: NotRequired[Mapping[str, FileContent]]
-    rendered_from: NotRequired[str]
+    rendered_from: str | None

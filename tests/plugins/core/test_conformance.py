@@ -41,7 +41,7 @@ class TestNpyBits(SourceConformance):
 
 
 class TestNpyBitsFramesLast(TestNpyBits):
-    config = {"holds": "bits", "frames": "last"}
+    config = {"holds": "bits", "frame_axis": "last"}
 
     def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
         np.save(folder / "capture.npy", np.ascontiguousarray(np.moveaxis(frames * np.uint8(255), 0, -1)))
@@ -60,7 +60,7 @@ class TestNpySums(SourceConformance):
 
 
 class TestNpySumsFramesLast(TestNpySums):
-    config = {"holds": "sums", "frames_per_sum": 1023, "frames": "last"}
+    config = {"holds": "sums", "frames_per_sum": 1023, "frame_axis": "last"}
 
     def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
         np.save(folder / "capture.npy", np.ascontiguousarray(np.moveaxis(frames, 0, -1)))

@@ -38,7 +38,7 @@ def frames_last(frames: np.ndarray) -> np.ndarray:
 def test_bits_of_any_integer_type_are_a_packed_source(tmp_path: Path, dtype: Any, last: bool) -> None:
     stored = frames_last(BITS) if last else BITS
     path = saved(tmp_path / "cube.npy", stored.astype(dtype))
-    with opened(path, holds="bits", frames="last" if last else "first", frame_rate_hz=96800) as source:
+    with opened(path, holds="bits", frame_axis="last" if last else "first", frame_rate_hz=96800) as source:
         assert str(source.info) == "40 binary frames of 6x19 at 96,800 Hz"
         assert isinstance(source, PackedSource)
         span = FrameSpan(3, 30)
@@ -57,7 +57,7 @@ def test_0_and_255_are_bits(tmp_path: Path) -> None:
 def test_sums_have_the_response_of_their_number(tmp_path: Path, dtype: Any, last: bool) -> None:
     stored = frames_last(SUMS) if last else SUMS
     path = saved(tmp_path / "cube.npy", stored.astype(dtype))
-    with opened(path, holds="sums", frames_per_sum=300, frames="last" if last else "first") as source:
+    with opened(path, holds="sums", frames_per_sum=300, frame_axis="last" if last else "first") as source:
         assert str(source.info) == "40 9-bit frames of 6x19"
         assert source.response == BinarySumResponse(300)
         frames = source.frames(FrameSpan(3, 30))
@@ -135,7 +135,7 @@ def test_truncated_file_is_refused_with_both_sizes(tmp_path: Path) -> None:
             "copy or record it again",
             path,
             holds="bits",
-            frames=frames,
+            frame_axis=frames,
         )
 
 
@@ -171,7 +171,7 @@ def test_value_out_of_range_is_named_with_its_place(
     array = BITS.astype(dtype)
     array[21, 4, 17] = value
     path = saved(tmp_path / "cube.npy", frames_last(array) if last else array)
-    with opened(path, **keys, frames="last" if last else "first") as source:
+    with opened(path, **keys, frame_axis="last" if last else "first") as source:
         source.counts(FrameSpan(0, 21))
         for read in (source.counts, source.frames):
             with pytest.raises(InputError) as caught:
@@ -208,10 +208,10 @@ def test_frames_per_sum_belongs_to_sums(keys: dict[str, Any], message: str) -> N
 def test_frames_that_seem_to_be_last_are_refused_unless_the_spec_states_their_axis(tmp_path: Path, clouds: Callable) -> None:
     path = saved(tmp_path / "cube.npy", frames_last(clouds()))
     assert_refused(
-        f"{path} has its frames along the last axis of (64, 96, 384), where values are most alike; write frames: last, or "
-        "frames: first if it is right",
+        f"{path} has its frames along the last axis of (64, 96, 384), where values are most alike; write frame_axis: last, or "
+        "frame_axis: first if it is right",
         path,
         holds="bits",
     )
     for frames in ("first", "last"):
-        assert list(NPY.check(NpyConfig(path=path, holds="bits", frames=frames))) == []
+        assert list(NPY.check(NpyConfig(path=path, holds="bits", frame_axis=frames))) == []

@@ -116,7 +116,7 @@ def test_unpacked_bits_with_frames_last_are_recognised(tmp_path: Path, clouds: C
     np.save(tmp_path / "cube.npy", np.ascontiguousarray(np.moveaxis(clouds() * np.uint8(255), 0, -1)))
     found = recognised(tmp_path / "cube.npy")
     assert set(found) == {"npy"}
-    assert found["npy"].keys == {"path": str(tmp_path / "cube.npy"), "holds": "bits", "frames": "last"}
+    assert found["npy"].keys == {"path": str(tmp_path / "cube.npy"), "holds": "bits", "frame_axis": "last"}
     assert found["npy"].because == (
         "uint8 of shape (64, 96, 384) in a .npy file, with the values 0 and 255 only, and values are most alike along the last "
         "axis"

@@ -410,6 +410,7 @@ def test_plugins_show_prints_keys_and_valid_snippet(finished: Path, invoke: Call
         "bit_order",
         "packed_along",
         "height",
+        "frames",
     ]
     assert "required" in table
     plan = parse_spec("version: 1\n" + snippet.replace('"<path>"', "cube.npy"), directory=finished)

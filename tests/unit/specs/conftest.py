@@ -44,7 +44,7 @@ class Orbit(Config):
 
 
 class SimulatorConfig(Config):
-    frames: int = Field(1000, ge=1, le=10_000_000, description="number of frames")
+    n_frames: int = Field(1000, ge=1, le=10_000_000, description="number of frames")
     flux: float = Field(0.5, gt=0, le=100, description="photons per pixel per frame")
     camera: Literal["pan", "loop"] = Field("pan", description="the path of the camera")
     size: tuple[int, int] = Field((254, 496), description="height and width in px")

@@ -215,9 +215,9 @@ def test_default_run_folder_follows_a_capture_that_is_chosen_by_override(catalog
 
 
 def test_parse_spec_accepts_numpy_numbers_tuples_and_paths(catalog, tmp_path):
-    source = {"use": "simulator", "with": {"flux": np.float32(0.5), "frames": np.int64(7), "size": (3, 4)}}
+    source = {"use": "simulator", "with": {"flux": np.float32(0.5), "n_frames": np.int64(7), "size": (3, 4)}}
     plan = parse_spec({"version": 1, "source": source, "output": {"directory": tmp_path}}, catalog=catalog)
-    assert (plan.source.config.flux, plan.source.config.frames, plan.source.config.size) == (0.5, 7, (3, 4))
+    assert (plan.source.config.flux, plan.source.config.n_frames, plan.source.config.size) == (0.5, 7, (3, 4))
     assert plan.output.directory == tmp_path
 
 

@@ -12,7 +12,7 @@ from photonpano.specs import json_schema, parse_spec
 
 SPEC = {
     "version": 1,
-    "source": {"use": "simulator", "with": {"frames": 10, "size": [3, 4], "flip": {"rows": True}}},
+    "source": {"use": "simulator", "with": {"n_frames": 10, "size": [3, 4], "flip": {"rows": True}}},
     "resample": {"use": "midpoint", "with": {"group_size": 5, "stride": 2}},
     "locate": {"with": {"max_steps": 7}, "fallback": ["opencv-sift", {"use": "opencv-sift", "with": {"ratio": 0.9}}]},
     "refine": ["drift", {"use": "short-spans", "with": {"span_frames": 4}}],

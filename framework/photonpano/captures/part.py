@@ -1,0 +1,57 @@
+"""A part of a capture: the frames that `source.with.frames` names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.protocols import Source
+from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
+from photonpano.values import FrameSpan, StreamInfo
+
+
+def part_of(source: Source, span: FrameSpan) -> Source:
+    """Return the frames of a span as a capture of its own, whose first frame has the index 0.
+
+    Args:
+        source: the whole capture.
+        span: frames that it has.
+    """
+    capabilities = [_PartOfTruth if each is TruthWrapper else each for each in capabilities_of(source)]
+    return with_capabilities(Part, capabilities)(source, span)
+
+
+class Part(SourceWrapper):
+    """A part of a capture: made by `part_of`."""
+
+    def __init__(self, source: Source, span: FrameSpan) -> None:
+        super().__init__(source)
+        self._span = span
+
+    def around(self, source: Source) -> Source:
+        """See `SourceWrapper`."""
+        return part_of(source, self._span)
+
+    @property
+    def info(self) -> StreamInfo:
+        """Frames of the part, size, rate."""
+        return replace(self.wrapped.info, n_frames=len(self._span))
+
+    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
+        """Read the frames of the whole capture."""
+        start = self._span.start
+        return super().read(method, FrameSpan(start + span.start, start + span.stop), shape)
+
+
+class _PartOfTruth(TruthWrapper):
+    """A part of a source that `KnowsTruth`."""
+
+    _span: FrameSpan
+
+    def truth(self) -> Mapping[str, NDArray[np.generic]]:
+        """Return what the frames of the part show."""
+        truth = super().truth()
+        return {**truth, "homographies": truth["homographies"][self._span.start : self._span.stop]}
