@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ SMALL_NIGHT = {
     "source.with.scene": "{kind: night, width: 512, height: 341, range_db: 60}",
     "source.with.flux": 0.5,
     "resample.with.group_size": 150,
+    "output.formats": "[hdr, exr]" if find_spec("OpenEXR") else "[hdr]",
 }
 CAPTURES = {
     "capture": SMALL_STREET | GROUPS,
@@ -146,6 +148,8 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
             video = write_video(camera.frames(camera.info.span), "a.mp4", "libx264", "yuvj420p")
         shutil.copy(video, examples / "high-speed.mp4")
     photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **RUNS[name])
+    formats = {file.suffix for file in (tmp_path / "run").glob("panorama.*")} - {".tiff", ".png"}
+    assert formats == ({".hdr", *([".exr"] if find_spec("OpenEXR") else [])} if name == "high-dynamic-range" else set())
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     groups = [level["groups"] for level in record["levels"]]
     assert all(level["located"] == level["groups"] for level in record["levels"])

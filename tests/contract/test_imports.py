@@ -36,6 +36,7 @@ def test_script_outside_the_suite_can_be_imported(script: Path, monkeypatch: pyt
     """Benchmarks and the scripts of the docs take too long to run here, and are not to fall behind."""
     spec = importlib.util.spec_from_file_location(f"script_{script.stem}", script)
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.syspath_prepend(str(script.parent))  # as Python does for a script
     monkeypatch.setitem(sys.modules, spec.name, module)  # as dataclasses look it up
     spec.loader.exec_module(module)
 
