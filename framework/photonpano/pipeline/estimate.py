@@ -25,6 +25,9 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
+_EXPLAINED = 0.9
+"""Light that lowers the misfit of the photons by this factor, or more, is there."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
@@ -130,7 +133,7 @@ def _lit(
         look = _look(plan, in_this, results, reference, within)
         light = corrected(again, look.residuals.spans, *look.residuals.gains())
         if not changing:
-            worse = look.worse_than(_look(plan, source, steady, reference, context))
+            worse = _worse_in_light(look, _look(plan, source, steady, reference, context))
     except (LocationError, CanvasTooLargeError) as error:
         if changing:
             raise
@@ -139,6 +142,17 @@ def _lit(
         logger.debug("the light is taken for steady: in the light that was found, %s", worse)
         return None
     return *lit(light), results, decision_of(light, source.info.frame_rate_hz)
+
+
+def _worse_in_light(look: Look, before: Look) -> str:
+    """Return how the photons are explained worse than in steady light, as a clause; empty if they are not.
+
+    Where the light explains the brightness, the scatter of the shifts does not count: groups blur the panorama of level 1 by a
+    tremor, and the steps against it are then wrong by much more than their noise.
+    """
+    if float(look.residuals.misfit.mean()) < _EXPLAINED * float(before.residuals.misfit.mean()):
+        return ""
+    return look.worse_than(before)
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
