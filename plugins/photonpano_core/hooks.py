@@ -164,6 +164,7 @@ def photonpano_renderers() -> Iterator[RendererContribution]:
         summary="The most probable flux on a fine grid, with the area of pixels and a denoiser as prior",
         config=SuperResolutionConfig,
         build=_build_super_resolution,
+        bytes_per_pixel=90,  # as measured by tests/benchmarks/super_resolution.py --large
     )
 
 

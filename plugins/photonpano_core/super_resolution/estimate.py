@@ -20,6 +20,8 @@ _MATCHED_ROUNDS = 3
 """Rounds for which similar patches are looked for once."""
 _FEWEST_FRAMES = 0.25
 """Frames of a cell, smoothed, below which its noise grows no more."""
+_KEPT_PX = 8.0
+"""Denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian."""
 _DARKEST = 1e-5
 """The flux stays above this share of its mean: expectation-maximisation cannot leave 0."""
 _BRIGHTEST = 1.55
@@ -131,7 +133,7 @@ def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
             find_similar(stabilised, rows, columns, found)
         total, weights = np.zeros_like(flux), np.zeros_like(flux)
         filter_groups(stabilised, np.asarray(strength * noise, np.float32), rows, columns, found, total, weights)
-        flux = np.maximum(_flux_of(total / weights, observed.binary), floor)
+        flux = _as_bright(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
         results.append(flux)
     return results
 
@@ -166,6 +168,15 @@ def _started(observed: Observations) -> FluxImage:
     gain = float(observed.seen.sum()) / max(float(observed.frames.sum()), 1.0)
     lit_share = np.clip(mean * gain, 1e-9, 1 - 0.5 / np.maximum(seen, 1))
     return np.asarray(-np.log1p(-lit_share) / gain, np.float32)
+
+
+def _as_bright(flux: FluxImage, before: FluxImage) -> FluxImage:
+    """Return flux that is as bright as before, on average over the surroundings of each pixel.
+
+    The mean on the stabilised scale is below that of the flux by what the noise spreads: by 10 % in a cell of few photons.
+    """
+    wanted, found = (cv2.GaussianBlur(each, (0, 0), _KEPT_PX) for each in (before, flux))
+    return np.asarray(flux * (wanted / found), np.float32)
 
 
 def _stabilised(flux: FluxImage, binary: bool) -> FluxImage:

@@ -41,7 +41,7 @@ _FEWEST_FRAMES = 1.0
 """Pixels that fewer frames saw are unknown."""
 _GATHERING = 5
 """One part in 5 of the time is spent on sorting photons, about."""
-_ENOUGH = 0.9
+_ENOUGH = 0.93
 """The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
 from frames held out, so that the most likely round is a noisy one."""
 _SIGNIFICANT = 2.0

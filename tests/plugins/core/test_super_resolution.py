@@ -208,6 +208,14 @@ def test_likelihood_rises_from_round_to_round_until_the_prior_is_weak() -> None:
     assert likely[2] < float(tested.log_likelihood(truth).sum(dtype=float))
 
 
+def test_cells_of_few_photons_keep_their_mean_flux() -> None:
+    """The denoiser averages a stabilised scale, whose mean is lower by what the noise spreads."""
+    rng, seen = np.random.default_rng(3), np.full((96, 96), 40, np.float32)
+    lit = rng.binomial(40, -np.expm1(-0.05), seen.shape).astype(np.float32)
+    flux = rounds_of(Observations(lit, seen, pixel_area(2.0), True), 4)[-1]
+    assert float(flux[8:-8, 8:-8].mean()) == pytest.approx(0.05, rel=0.03)
+
+
 def test_denoiser_keeps_edges_and_removes_noise() -> None:
     clean = np.zeros((64, 64), np.float32)
     clean[:, 32:] = 1
