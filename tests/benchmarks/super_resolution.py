@@ -1,13 +1,13 @@
-"""Measure super-resolution at twice the resolution of the sensor, along the estimated motion.
+"""Measure super-resolution along the estimated motion, by default at twice the resolution of the sensor.
 
     python tests/benchmarks/super_resolution.py --scene facade.jpg --scene stream.jpg --output table.md
 
 For each scene and flux, 10,000 frames of 128x160 px are simulated, whose pixels average the scene over their areas. A run
-estimates the motion and renders at scale 2. Scores are PSNR in dB, in sRGB, against the true scene, over the same
+estimates the motion and renders at `--scale`. Scores are PSNR in dB, in sRGB, against the true scene, over the same
 pixels. Compared are:
 
 - bicubic: the panorama of scale 1 along the same motion, interpolated;
-- Richardson-Lucy: the merge of scale 2, deconvolved with the area of a pixel; the number of its steps is chosen with the truth;
+- Richardson-Lucy: the merge of the same scale, deconvolved with the area of a pixel, with as many steps as fit the truth best;
 - true motion: super-resolution along the true motion;
 - thin: super-resolution and bicubic where at most a fifth as many frames as usual saw a pixel.
 
@@ -54,6 +54,8 @@ def main() -> None:
     parser.add_argument("--flux", action="append", type=float, help="photons per pixel per frame; by default 0.5, 0.1 and 0.02")
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scale", type=int, default=2, help="pixels of the panorama along the side of a pixel")
+    parser.add_argument("--fill-factor", type=float, default=1.0, help="sensitive share of the area of a pixel")
     parser.add_argument("--large", action="store_true", help="measure time and memory of a large canvas")
     parser.add_argument("--output", type=Path, help="write the table to this file")
     options = parser.parse_args()
@@ -63,7 +65,7 @@ def main() -> None:
             print(large(scene, options.frames, options.seed), flush=True)
             continue
         for flux in options.flux or FLUXES:
-            lines.append(row(scene, flux, options.frames, options.seed))
+            lines.append(row(scene, flux, options.frames, options.seed, options.scale, options.fill_factor))
             print(lines[-1], flush=True)
     if options.output:
         options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -90,12 +92,14 @@ def spec_of(capture: Path, **sections: Any) -> dict[str, Any]:
     return {"version": 1, "source": source, "render": {"use": "super-resolution", "scale": 2.0}} | sections
 
 
-def row(scene: Path, flux: float, frames: int, seed: int) -> str:
+def row(scene: Path, flux: float, frames: int, seed: int, scale: int = 2, fill_factor: float = 1.0) -> str:
     """Measure a scene at a flux."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        capture = simulated(folder, scene, flux, frames, seed)
-        plan = parse_spec(spec_of(capture), output=folder / "run")
+        keys = {"scene_scale": scale, "fill_factor": fill_factor}
+        capture = simulated(folder, scene, flux, frames, seed, 600 * scale, **keys)
+        rendering = {"use": "super-resolution", "with": {"fill_factor": fill_factor}, "scale": float(scale)}
+        plan = parse_spec(spec_of(capture, render=rendering), output=folder / "run")
         record = run(plan).record
         scores = evaluate(folder / "run", capture.with_name("capture.truth.npz"))
         truth, found = load_truth(capture.with_name("capture.truth.npz")), load_run_trajectory(folder / "run")
@@ -120,7 +124,7 @@ def row(scene: Path, flux: float, frames: int, seed: int) -> str:
         def psnr(image: np.ndarray, where: np.ndarray = usual) -> float:
             return image_score(image, true_image, where, white).psnr_db if where.any() else float("nan")
 
-        deconvolved = richardson_lucy(np.nan_to_num(fine.flux), lambda image: psnr(image))
+        deconvolved = richardson_lucy(np.nan_to_num(fine.flux), scale * fill_factor**0.5, psnr)
         decided = {each["what"]: each["value"] for each in record["decisions"]}
         assert scores.oracle is not None
         assert scores.panorama is not None
@@ -140,9 +144,11 @@ def row(scene: Path, flux: float, frames: int, seed: int) -> str:
         return f"| {' | '.join(cells)} |"
 
 
-def richardson_lucy(image: np.ndarray, score: Any) -> float:
-    """Deconvolve a merge of scale 2 with the area of a pixel, and return the best score of all steps."""
-    kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25]).astype(np.float32)  # a box of 2 px, at any place in a cell
+def richardson_lucy(image: np.ndarray, width: float, score: Any) -> float:
+    """Deconvolve a merge with the area of a pixel, of a width in px of the merge, and return the best score of all steps."""
+    offsets = np.arange(-2, 3)
+    shares = np.maximum(np.minimum(offsets + 0.5, width / 2) - np.maximum(offsets - 0.5, -width / 2), 0) / width
+    kernel = np.outer(shares, shares).astype(np.float32)
     best, estimate = -np.inf, image.astype(np.float32) + 1e-6
     for _ in range(STEPS):
         seen = cv2.filter2D(estimate, cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE)
