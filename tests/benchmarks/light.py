@@ -1,6 +1,6 @@
 """Measure what light that changes costs, and how often steady light is taken for changing.
 
-    python tests/benchmarks/light.py [--rows drift] [--seeds 3] [--false-alarms 200] [--large]
+    python tests/benchmarks/light.py [--rows drift] [--seeds 3] [--false-alarms 200] [--large] [--picture light.png]
 
 Each row is a kind of light over a pan across the built-in street, with another scene and noise for each seed. The error of
 the motion is compared with that of the same capture in steady light with as many photons; the panorama with a merge along the
@@ -25,9 +25,10 @@ from photonpano.corrections import divided_by
 from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.trajectory import corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory
-from photonpano.lighting import LIGHT_DECISION, find_light, in_light
+from photonpano.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
 from photonpano.merging.panorama import render
 from photonpano.motion.loop import estimate_motion
+from photonpano.photometry import linear_to_srgb
 from photonpano.pipeline.components import build_levels, open_source
 from photonpano.pipeline.estimate import estimate, vignette_of
 from photonpano.values import Decision, FloatArray, Light
@@ -146,6 +147,39 @@ def _below_known_gains(directory: Path, cube: Path, settings: Settings, truth: d
     return scores[0] - scores[1]
 
 
+def save_picture(file: Path) -> None:
+    """Draw a part of two panoramas along the same motion: frames counted alike, and in the light that was found."""
+    with tempfile.TemporaryDirectory() as place:
+        settings = SMALL | ROWS["100 Hz, 100 % deep"]
+        cube, directory = captured(Path(place), "changing", settings, 0), Path(place) / "run"
+        run(parse_spec({"version": 1, "source": source_of(cube, settings)}, output=directory))
+        cv2.imwrite(str(file), alike_and_lit(cube, directory, settings))
+
+
+def alike_and_lit(cube: Path, directory: Path, settings: Settings) -> np.ndarray:
+    """Return a part of the panorama of a run below one that counts all frames alike: uint8."""
+    with np.load(directory / "trajectory.npz") as file:
+        motion = dict(file)
+    plan, trajectory = parse_spec({"version": 1, "source": source_of(cube, settings)}), FrameTrajectory(motion["homographies"])
+    with open_source(plan) as source:
+        shape = image_shape(directory)
+        canvas, tolerance_px = Canvas(*shape, motion["canvas"]), plan.render.tolerance_px
+        parts = [
+            render(each, trajectory, source.info.span, canvas, tolerance_px, Context(2)).flux
+            for each in (source, in_light_of(source, directory))
+        ]
+    width = SMALL["frame_shape"][1]
+    white = float(np.nanquantile(parts[1], 0.99))
+    rows = [255 * linear_to_srgb(np.clip(np.nan_to_num(part[:, : 2 * width]) / white, 0, 1)) for part in parts]
+    return np.uint8(np.concatenate([rows[0], np.full((6, rows[0].shape[1]), 255.0), rows[1]]))
+
+
+def image_shape(directory: Path) -> tuple[int, int]:
+    """Return the height and width of the panorama of a run."""
+    image = cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_GRAYSCALE)
+    return image.shape[0], image.shape[1]
+
+
 def steady_capture(folder: Path, seed: int) -> tuple[str, Settings]:
     """Simulate a small steady capture of a kind that the seed chooses.
 
@@ -243,8 +277,12 @@ def main() -> None:
     parser.add_argument("--rows", nargs="*", default=[""], metavar="WORD", help="words in the names of the rows to measure")
     parser.add_argument("--seeds", type=int, default=1, help="number of seeds of each row")
     parser.add_argument("--false-alarms", type=int, default=0, metavar="N", help="number of steady captures to look at")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw a panorama with and without its light")
     parser.add_argument("--large", action="store_true", help="captures of 254x496 px and 10,000 frames")
     arguments = parser.parse_args()
+    if arguments.picture:
+        save_picture(arguments.picture)
+        return
     if arguments.false_alarms:
         print_false_alarms(arguments.false_alarms)
         return
