@@ -128,6 +128,10 @@ def measured(
             errors = corner_errors(to_reference, motion, SHAPE, np.ones(n_frames, np.bool_))
             true_motion = normalised(inverse(errors.alignment) @ motion)
             print(f"\nerror of the estimated motion: {errors.errors_px.mean():.3f} px, at most {errors.errors_px.max():.3f} px")
+            expected = (done.record["motion"] or {}).get("std_px", np.nan)
+            print(f"expected by the run: {expected:.3f} px; verdict: {done.verdict.status}")
+            for reason in done.verdict.reasons:
+                print(f"  {reason}")
         trajectory, span = FrameTrajectory(to_reference), source.info.span
         canvas: Canvas = canvas_of_box((12, 12, SHAPE[1] - 12, SHAPE[0] - 12), 1.0)
         noise = CanvasNoise.of(source, trajectory, span, canvas)
