@@ -165,6 +165,7 @@ def photonpano_renderers() -> Iterator[RendererContribution]:
         config=SuperResolutionConfig,
         build=_build_super_resolution,
         bytes_per_pixel=90,  # as measured by tests/benchmarks/super_resolution.py --large
+        divides_by_light=True,
     )
 
 

@@ -132,6 +132,7 @@ def measurable_range(
     many = np.full(n_levels, _MANY_FRAMES, np.float32)  # of which the noise is that of the bound
     highest = float(response.flux(response.mean_count(np.array([np.inf], np.float32)), frames)[0])
     flux = np.geomspace(highest * 1e-12, highest, n_levels, dtype=np.float32)
-    std = flux_std(flux, many, response, slope, offset) * np.sqrt(_MANY_FRAMES / frames)
+    # Above 0, it is that of a line around the mean count of a curve through 0, as of a vignette: at low flux it does not hold.
+    std = flux_std(flux, many, response, slope, min(offset, 0.0)) * np.sqrt(_MANY_FRAMES / frames)
     measured = flux[flux >= std]
     return FluxRange(float(measured[0]), float(measured[-1])) if len(measured) else None
