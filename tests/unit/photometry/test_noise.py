@@ -132,4 +132,4 @@ def test_measurable_range_through_a_vignette_is_as_without() -> None:
     found, plain = measurable_range(N, BinaryResponse(), 1.2, 0.04), measurable_range(N, BinaryResponse())
     assert found is not None
     assert plain is not None
-    assert found.decibels == pytest.approx(plain.decibels, abs=3)
+    assert found.decibels == pytest.approx(plain.decibels, abs=5)
