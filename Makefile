@@ -34,7 +34,7 @@ test: $(INSTALLED)
 	$(STEP) 'import-linter'
 	@$(BIN)/lint-imports --no-logo
 	$(STEP) 'pytest'
-	@$(BIN)/pytest -n auto
+	@$(BIN)/pytest -n auto --dist worksteal
 
 demo: $(INSTALLED)
 	@mkdir -p demo

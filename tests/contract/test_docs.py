@@ -191,9 +191,14 @@ class Reader:
         return None
 
     def run_pytest(self, block: Block, arguments: list[str], shown: str) -> None:
-        command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(self.workplace), *arguments]
+        more = block.argument("test: with")
+        added = ["-p", "no:cacheprovider", "--rootdir", str(self.workplace), *shlex.split(more or "")]
+        command = [sys.executable, "-m", "pytest", *added, *arguments]
         done = subprocess.run(command, cwd=self.workplace, capture_output=True, text=True, check=False)
-        self.compare(block, arguments, done.stdout, shown)
+        if more is None:
+            self.compare(block, arguments, done.stdout, shown)
+        else:
+            assert done.returncode == 0, f"{block}: {arguments}\n{done.stdout}"
 
     def compare(self, block: Block, words: list[str], printed: str, shown: str) -> None:
         flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

@@ -61,7 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(content=st.binary(max_size=64) | st.lists(st.integers(0, 262145)).map(lambda words: np.array(words, "<u4").tobytes()))
 @pytest.mark.parametrize("name", ["swissspad-half", "swissspad-full", "spad512", "spad512-sparse"])
 def test_bin_source_raises_input_error_on_random_bytes(folder: Path, name: str, content: bytes) -> None:
@@ -70,14 +70,14 @@ def test_bin_source_raises_input_error_on_random_bytes(folder: Path, name: str, 
     try_to_read(name, path)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(values=st.dictionaries(st.sampled_from([*TRANSFORMS, "frames"]), JSON, max_size=4))
 def test_visionsim_raises_input_error_on_random_values(folder: Path, values: dict[str, Any]) -> None:
     (folder / "transforms.json").write_text(json.dumps(TRANSFORMS | {"frames": [{}] * 3} | values))
     try_to_read("visionsim", folder)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(changes=CHANGES)
 def test_visionsim_raises_input_error_on_random_bytes(folder: Path, changes: dict[int, int]) -> None:
     content = json.dumps(TRANSFORMS | {"frames": [{}] * 3}).encode()
@@ -85,7 +85,7 @@ def test_visionsim_raises_input_error_on_random_bytes(folder: Path, changes: dic
     try_to_read("visionsim", folder)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(changes=CHANGES, info=st.none() | JSON, compressed=st.booleans())
 def test_mat_parts_raises_input_error_on_random_bytes(
     folder: Path, changes: dict[int, int], info: Any, compressed: bool
@@ -116,7 +116,7 @@ def hdf5(folder: Path) -> bytes:
     return bytes((folder / "capture.ubi.h5").read_bytes())
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(kept=st.integers(0, 20_000), start=st.binary(max_size=12))
 @pytest.mark.usefixtures("no_look")
 def test_ubicept_raises_input_error_on_truncated_file(folder: Path, hdf5: bytes, kept: int, start: bytes) -> None:
@@ -126,7 +126,7 @@ def test_ubicept_raises_input_error_on_truncated_file(folder: Path, hdf5: bytes,
     try_to_read("ubicept-h5", path)
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(metadata=JSON | st.fixed_dictionaries({"num_integrated_binary_frames": JSON, "node_history": JSON}))
 @pytest.mark.usefixtures("no_look")
 def test_ubicept_raises_input_error_on_random_metadata(folder: Path, metadata: Any) -> None:
