@@ -126,24 +126,32 @@ def _lent(place: Path, start: str, end: str, *, folder: bool = False) -> Iterato
         with claim(path) as mine:
             if mine:
                 remove(path)
-    while True:
+    descriptor = None
+    while descriptor is None:
         temporary = place.with_name(f"{start}{secrets.token_hex(4)}{end}")
-        if folder:
-            temporary.mkdir()
-        flags = os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-        descriptor = os.open(temporary, flags, 0o666)
-        # Another process may have taken it for abandoned before it was locked.
-        if claimed(descriptor) is not False and temporary.exists():
-            break
-        os.close(descriptor)
-    _unfinished.add(temporary)
-    try:
-        yield temporary
-    finally:
-        os.close(descriptor)
-        with suppress(OSError):
-            remove(temporary)
-        _unfinished.discard(temporary)
+        try:
+            _unfinished.add(temporary)  # before it is there: a signal may come at any moment
+            descriptor = _created(temporary, folder)
+            if descriptor is not None:
+                yield temporary
+        finally:
+            if descriptor is not None:
+                os.close(descriptor)
+            with suppress(OSError):
+                remove(temporary)
+            _unfinished.discard(temporary)
+
+
+def _created(temporary: Path, folder: bool) -> int | None:
+    """Make and lock a file or folder; None if another process took it for abandoned before it was locked."""
+    if folder:
+        temporary.mkdir()
+    flags = os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+    descriptor = os.open(temporary, flags, 0o666)
+    if claimed(descriptor) is not False and temporary.exists():
+        return descriptor
+    os.close(descriptor)
+    return None
 
 
 def partial_paths(folder: Path, start: str, end: str) -> list[Path]:

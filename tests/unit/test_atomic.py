@@ -4,12 +4,14 @@ import errno
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from photonpano import OutputError
-from photonpano.atomic import atomic_path
+from photonpano.atomic import atomic_folder, atomic_path
 
 
 def test_atomic_path_creates_the_file_when_the_block_ends(tmp_path: Path) -> None:
@@ -98,4 +100,17 @@ def test_atomic_path_reports_a_full_disk(tmp_path: Path) -> None:
     with pytest.raises(OutputError) as caught, atomic_path(final), Path("/dev/full").open("wb", buffering=0) as full:
         full.write(b"x")
     assert str(caught.value) == (f"cannot write {final}: No space left on device; free some space or choose another folder")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("lend", [atomic_path, atomic_folder])
+def test_interrupt_while_the_temporary_file_is_made_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lend: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    def interrupted(_: int) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("photonpano.atomic.claimed", interrupted)
+    with pytest.raises(KeyboardInterrupt), lend(tmp_path / "cube.npy"):
+        pass
     assert list(tmp_path.iterdir()) == []
