@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from photonpano import CaptureSummary, Group, Resampler, StageContext
@@ -23,6 +24,10 @@ _BRIGHT_BLUR = 0.04
 """Blur below which groups do not get shorter, as a share of the shorter side of a frame."""
 _MIN_GROUPS = 8
 """Groups at the first level, at least, if the capture is long enough."""
+_NEARLY_WHOLE = 0.1
+"""A group that is longer than whole periods by this share of one is shortened to them."""
+_MOST_LENGTHENED = 4
+"""A group is not lengthened to a period of the light that is longer than it by more than this factor."""
 _EPSILON = 1e-9
 """Floor on flux and speed, which are divided by."""
 _DEFAULT_SIZE = 500
@@ -57,6 +62,9 @@ class AutoResampler:
             stream = self._context.stream
             capture = self._context.capture()
             size, reason = choose_group_size(capture, n_frames, min(stream.frame_shape), shortest_of(stream))
+            if (lengthened := whole_periods(size, capture.period_frames, n_frames)) != size:
+                reason += f"; {lengthened} are whole periods of the light, which each group then sees alike"
+                size = lengthened
             self._doubled = self._densifies and capture.flux * size < _DIM_PHOTONS and n_frames // (2 * size) >= _MIN_GROUPS
             if self._doubled:
                 reason += f"; from level {_DOUBLED_FROM} on, where the motion is known, groups are twice as long for more light"
@@ -92,6 +100,17 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
         f"{blur_px:.3g} px, {blur_px / shorter_side_px:.2g} of the shorter side of a frame, and at a flux of "
         f"{capture.flux:.2g} hold {size * capture.flux:.3g} photons per pixel{light if size != shortest else ''}{bound}"
     )
+
+
+def whole_periods(size: int, period_frames: float | None, n_frames: int) -> int:
+    """Return a group size that is lengthened to whole periods of flickering light (paper, section 6), in frames.
+
+    It stays as it is in steady light, where a period is longer than 4 groups, and where there would be fewer than 8 groups.
+    """
+    if period_frames is None or period_frames > _MOST_LENGTHENED * size:
+        return size
+    lengthened = round(max(1, math.ceil(size / period_frames - _NEARLY_WHOLE)) * period_frames)
+    return lengthened if lengthened <= n_frames // _MIN_GROUPS else size
 
 
 def _bounded(wanted: float, n_frames: int, shortest: int) -> tuple[int, str]:

@@ -7,6 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -121,7 +122,9 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     threads = thread_count(plan.run.threads)
-    capture = cache(lambda: summarise(source, threads))
+    light = light_of(source)
+    period = 1 / light.frequency if light is not None and light.frequency else None
+    capture = cache(lambda: replace(summarise(source, threads), period_frames=period))
     context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
     made: list[tuple[Choice, Any]] = []
 

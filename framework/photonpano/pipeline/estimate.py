@@ -17,7 +17,7 @@ from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.components import build_levels
-from photonpano.protocols import Source, Trajectory
+from photonpano.protocols import Source, Trajectory, light_of
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
 from photonpano.specs.plan import Plan
@@ -80,6 +80,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     if lit is not None:
         source, context, first, decision = lit
         decisions.append(decision)
+        levels = _in_whole_periods(plan, source, levels, decisions)
         known = first[0].trajectory
         results, later = first, levels[1:]
     results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
@@ -88,6 +89,15 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         found = _cut_at(cuts, plan, found)
     decisions += found.timeline.decisions
     return found
+
+
+def _in_whole_periods(plan: Plan, source: Source, levels: tuple[Level, ...], decisions: list[Decision]) -> tuple[Level, ...]:
+    """Return the levels with groups that suit flickering light, where their size is chosen from the capture."""
+    light = light_of(source)
+    if light is None or not light.frequency:
+        return levels
+    decisions[:] = [each for each in decisions if each.what != "group_size"]
+    return build_levels(plan, source, decisions)
 
 
 def _lit(

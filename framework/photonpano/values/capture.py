@@ -80,11 +80,13 @@ class CaptureSummary:
         flux: mean of the sampled frames, photons per pixel per frame.
         speed_px: upper quantile of the speed of the image, in px per frame; None if it could not be measured.
         how: a clause that says how the speed was measured, for the reasons of decisions.
+        period_frames: period of light that flickers, in frames; None in steady light, or before the light is known.
     """
 
     flux: float
     speed_px: float | None
     how: str
+    period_frames: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from photonpano import CaptureSummary, CaptureUnreadError, StageContext, StreamInfo
 from photonpano_core.configs import MidpointConfig
-from photonpano_core.group_size import choose_group_size
+from photonpano_core.group_size import choose_group_size, whole_periods
 from photonpano_core.hooks import photonpano_resamplers
 from photonpano_core.midpoint import MidpointResampler
 
@@ -150,3 +150,20 @@ def test_check_refuses_capture_shorter_than_shortest_group() -> None:
             "the capture has 15 frames, fewer than one group of 16; set group_size to 3 or less, so that at least four groups "
             "fit"
         ]
+
+
+@pytest.mark.parametrize(
+    ("size", "period", "n_frames", "expected"),
+    [
+        (150, None, 3000, 150),
+        (150, 200.0, 3000, 200),
+        (210, 200.0, 3000, 200),
+        (250, 200.0, 4000, 400),
+        (50, 33.4, 3000, 67),
+        (150, 200.0, 1500, 150),
+        (3, 50.0, 3000, 3),
+        (30, 50.0, 3000, 50),
+    ],
+)
+def test_groups_are_lengthened_to_whole_periods(size: int, period: float | None, n_frames: int, expected: int) -> None:
+    assert whole_periods(size, period, n_frames) == expected
