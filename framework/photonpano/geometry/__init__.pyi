@@ -1,4 +1,6 @@
 from .alignment import align_planes as align_planes
+from .camera import Camera as Camera
+from .camera import camera_matrix as camera_matrix
 from .canvas import Canvas as Canvas
 from .canvas import Extent as Extent
 from .canvas import canvas_of as canvas_of
@@ -17,6 +19,9 @@ from .homographies import rescaling as rescaling
 from .homographies import step_motions as step_motions
 from .homographies import translation as translation
 from .plausibility import why_implausible as why_implausible
+from .rotations import nearest_rotations as nearest_rotations
+from .rotations import rotation_matrices as rotation_matrices
+from .rotations import rotation_vectors as rotation_vectors
 from .sampling import Run as Run
 from .sampling import run_from as run_from
 from .sampling import sample_run as sample_run

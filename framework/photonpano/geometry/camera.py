@@ -1,0 +1,125 @@
+"""A camera: the map between the pixels of its frames and the directions in which they look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from photonpano.geometry.homographies import rescaling
+from photonpano.values import FloatArray, Homography
+
+_ITERATIONS = 30
+_EXACT = 1e-13
+"""The inverse of the distortion has converged when its last step was below this, in focal lengths."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A pinhole camera with square pixels, and a lens that distorts.
+
+    Convention:
+        Points are (x, y), integers are pixel centres. Ideal pixels are those that the camera would have without distortion:
+        `matrix` maps directions (x right, y down, z ahead) to them, and `distorted` maps them to the pixels of a frame.
+
+    Attributes:
+        matrix: (3, 3), [[focal, 0, x], [0, focal, y], [0, 0, 1]], in px.
+        distortion: (4,) k1, k2, p1, p2 as OpenCV defines them: radial of second and fourth order, and tangential.
+    """
+
+    matrix: FloatArray
+    distortion: FloatArray = field(default_factory=lambda: np.zeros(4))
+
+    @classmethod
+    def of(cls, focal_px: float, frame_shape: tuple[int, int], distortion: ArrayLike = (0, 0, 0, 0)) -> Camera:
+        """Return a camera that looks through the middle of its frames, of (height, width)."""
+        middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
+        return cls(camera_matrix(focal_px, middle), np.asarray(distortion, dtype=np.float64))
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in px."""
+        return float(self.matrix[0, 0])
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """The principal point (x, y)."""
+        return float(self.matrix[0, 2]), float(self.matrix[1, 2])
+
+    @property
+    def distorts(self) -> bool:
+        """Whether the lens distorts."""
+        return bool(self.distortion.any())
+
+    def distorted(self, points: ArrayLike) -> FloatArray:
+        """Map (..., 2) ideal pixels to pixels of a frame."""
+        return self._in_px(self._distorted(self._in_focal_lengths(points)))
+
+    def ideal(self, points: ArrayLike) -> FloatArray:
+        """Map (..., 2) pixels of a frame to ideal pixels; NaN where no ideal pixel is imaged."""
+        seen = self._in_focal_lengths(points)
+        if not self.distorts:
+            return self._in_px(seen)
+        found = seen.copy()
+        for _ in range(_ITERATIONS):
+            step = np.linalg.solve(self._slopes(found), (seen - self._distorted(found))[..., None])[..., 0]
+            found = found + step
+            if np.abs(step).max(initial=0) < _EXACT:
+                break
+        # Beyond the radius at which the image folds over, the iteration ends anywhere.
+        wrong = np.abs(self._distorted(found) - seen).max(axis=-1) > 1e-6
+        return self._in_px(np.where(wrong[..., None], np.nan, found))
+
+    def directions(self, points: ArrayLike) -> FloatArray:
+        """Return the unit vectors in which (..., 2) pixels of a frame look: (..., 3)."""
+        ideal = self._in_focal_lengths(self.ideal(points))
+        rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+    def scaled(self, scale: float) -> Camera:
+        """Return the camera of frames that are rescaled."""
+        return Camera(rescaling(scale) @ self.matrix, self.distortion)
+
+    def homographies(self, rotations: FloatArray) -> Homography:
+        """Return K R K^-1, of determinant 1, for (..., 3, 3) rotations R; h33 may be zero or negative."""
+        return np.asarray(self.matrix @ rotations @ np.linalg.inv(self.matrix))
+
+    def rotations(self, homographies: Homography) -> FloatArray:
+        """Return K^-1 H K, scaled to determinant 1, for (..., 3, 3) homographies H: rotations where this camera only turned."""
+        matrices = np.linalg.inv(self.matrix) @ homographies @ self.matrix
+        return np.asarray(matrices / np.cbrt(np.linalg.det(matrices))[..., None, None])
+
+    def _in_focal_lengths(self, points: ArrayLike) -> FloatArray:
+        return (np.asarray(points, dtype=np.float64) - self.matrix[:2, 2]) / np.diag(self.matrix)[:2]
+
+    def _in_px(self, points: FloatArray) -> FloatArray:
+        return np.asarray(points * np.diag(self.matrix)[:2] + self.matrix[:2, 2])
+
+    def _distorted(self, points: FloatArray) -> FloatArray:
+        k1, k2, p1, p2 = self.distortion
+        x, y = np.moveaxis(points, -1, 0)
+        square = x**2 + y**2
+        radial = 1 + square * (k1 + k2 * square)
+        return np.stack(
+            [x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2), y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y],
+            axis=-1,
+        )
+
+    def _slopes(self, points: FloatArray) -> FloatArray:
+        """Return the derivatives of the distorted points by (..., 2) ideal ones: (..., 2, 2)."""
+        k1, k2, p1, p2 = self.distortion
+        x, y = np.moveaxis(points, -1, 0)
+        square = x**2 + y**2
+        radial, growth = 1 + square * (k1 + k2 * square), 2 * (k1 + 2 * k2 * square)
+        mixed = x * y * growth + 2 * p1 * x + 2 * p2 * y
+        rows = [
+            [radial + x**2 * growth + 2 * p1 * y + 6 * p2 * x, mixed],
+            [mixed, radial + y**2 * growth + 6 * p1 * y + 2 * p2 * x],
+        ]
+        return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def camera_matrix(focal_px: float, centre_px: tuple[float, float]) -> FloatArray:
+    """Return the (3, 3) matrix of a camera with square pixels."""
+    return np.array([[focal_px, 0, centre_px[0]], [0, focal_px, centre_px[1]], [0, 0, 1]], dtype=np.float64)

@@ -1,0 +1,37 @@
+"""Rotations and rotation vectors.
+
+Convention:
+    A rotation is (3, 3) with determinant 1 and maps column vectors; its rotation vector points along the axis, and its length
+    is the angle in radians. All functions take stacks as well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from photonpano.values import FloatArray
+
+
+def rotation_matrices(vectors: ArrayLike) -> FloatArray:
+    """Return the rotations of rotation vectors: (..., 3) to (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    vectors = np.asarray(vectors, dtype=np.float64)
+    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()).reshape(*vectors.shape, 3)
+
+
+def rotation_vectors(rotations: ArrayLike) -> FloatArray:
+    """Return the rotation vectors of rotations, of angles up to pi: (..., 3, 3) to (..., 3)."""
+    from scipy.spatial.transform import Rotation
+
+    rotations = np.asarray(rotations, dtype=np.float64)
+    return np.asarray(Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()).reshape(rotations.shape[:-1])
+
+
+def nearest_rotations(matrices: ArrayLike) -> FloatArray:
+    """Return the rotations nearest to (..., 3, 3) matrices of positive determinant, whatever their scale (Kabsch 1976)."""
+    left, _, right = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
+    signs = np.ones(left.shape[:-1])
+    signs[..., 2] = np.linalg.det(left @ right)
+    return np.asarray((left * signs[..., None, :]) @ right)
