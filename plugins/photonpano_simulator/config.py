@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from photonpano import Bayer, Config, SpecPath
 
@@ -119,6 +119,22 @@ class HandShakePath(_Aimed):
     shake: Shake = Field(Shake(rms_px=5.0), description="the tremor")
 
 
+class TurnPath(_Path):
+    """A turn about the vertical axis at constant speed, by any angle; the scene surrounds the camera.
+
+    The scene is an equirectangular panorama: its width is 360 degrees, its ends meet, and the horizon is its middle row. The
+    turn starts at its middle.
+    """
+
+    kind: Literal["turn"] = Field("turn", description="a turn before a scene all around the camera")
+    degrees: float = Field(
+        360.0, ge=-3600, le=3600, description="angle of the turn in degrees: to the right, or below 0 to the left"
+    )
+    pitch_wobble_deg: float = Field(0.0, ge=0, le=45, description="amplitude with which the camera nods, as a sine, in degrees")
+    roll_wobble_deg: float = Field(0.0, ge=0, le=45, description="amplitude with which it rolls, as a cosine, in degrees")
+    wobbles: float = Field(5.0, ge=0, le=1e4, description="periods of these wobbles during the turn")
+
+
 class FilePath(_Path):
     """Homographies from a file."""
 
@@ -148,6 +164,24 @@ class Lens(Config):
     vignette: float = Field(
         0.0, ge=0, le=1, description="fraction of the light that is lost at the corner; it grows with the square of r"
     )
+
+
+class Distortion(Config):
+    """Distortion of the lens by the model of OpenCV, in focal lengths from the middle of the frame.
+
+    What an ideal lens images at (x, y), this lens images at x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2), and y
+    likewise.
+    """
+
+    k1: float = Field(0.0, ge=-2, le=2, description="radial distortion of second order: below 0 it is a barrel")
+    k2: float = Field(0.0, ge=-2, le=2, description="radial distortion of fourth order")
+    p1: float = Field(0.0, ge=-0.5, le=0.5, description="tangential distortion along y")
+    p2: float = Field(0.0, ge=-0.5, le=0.5, description="tangential distortion along x")
+
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """k1, k2, p1, p2."""
+        return self.k1, self.k2, self.p1, self.p2
 
 
 class Dirt(Config):
@@ -265,9 +299,9 @@ class SimulationConfig(Config):
     scene: Annotated[StreetScene | NightScene | PhotoScene, Field(discriminator="kind")] = Field(
         StreetScene(), description="the scene"
     )
-    path: Annotated[PanPath | ScanPath | LoopPath | SplinePath | HandShakePath | FilePath, Field(discriminator="kind")] = Field(
-        PanPath(), description="the path of the camera"
-    )
+    path: Annotated[
+        PanPath | ScanPath | LoopPath | SplinePath | HandShakePath | TurnPath | FilePath, Field(discriminator="kind")
+    ] = Field(PanPath(), description="the path of the camera")
     scene_scale: int = Field(
         1,
         ge=1,
@@ -303,14 +337,23 @@ class SimulationConfig(Config):
     n_frames: int = Field(2000, ge=1, le=10_000_000, description="number of frames that the camera takes")
     frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")
     frame_rate_hz: float = Field(96_800.0, gt=0, le=1e9, description="frames a second, in Hz")
-    focal_length_px: float = Field(4464.0, ge=100, le=1e6, description="focal length of the camera, in px")
+    focal_length_px: float = Field(4464.0, ge=50, le=1e6, description="focal length of the camera, in px")
     lens: Lens = Field(Lens(), description="the lens of the camera")
+    distortion: Distortion = Field(
+        Distortion(), description="distortion of the lens by OpenCV's model, in place of k1 and k2 of `lens`"
+    )
     objects: tuple[FrameObject, ...] = Field((), max_length=100, description="rectangles in front of the scene")
     drops: tuple[FrameRange, ...] = Field((), description="frames that are missing in the capture")
     repeats: tuple[FrameRange, ...] = Field(
         (), description="frames that the capture holds twice: all of the range, and then all of it again"
     )
     seed: int | None = Field(None, ge=0, description="seed of photons, pixels and shake; by default the seed of the run")
+
+    @model_validator(mode="after")
+    def _one_distortion(self) -> Self:
+        if any(self.distortion.coefficients) and (self.lens.k1 or self.lens.k2):
+            raise ValueError("lens and distortion both distort the image; leave out one of the two models")
+        return self
 
 
 class SimulatorConfig(SimulationConfig):

@@ -1,4 +1,4 @@
-"""The lens of the simulated camera: radial distortion and vignetting.
+"""The lens of the simulated camera: distortion and vignetting.
 
 Convention:
     Points are (x, y) in px of the frame, integers are pixel centres, sizes are (height, width). r is the distance from the
@@ -10,33 +10,48 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photonpano import FloatArray
-from photonpano.geometry import corners
-from photonpano_simulator.config import Lens
+from photonpano import FloatArray, InputError
+from photonpano.geometry import Camera, corners
+from photonpano_simulator.config import Lens, SimulationConfig
 
 _POINTS_OF_A_SIDE = 16
 
 
-def undistorted(lens: Lens, points: ArrayLike, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens`."""
-    middle = _middle(frame_shape)
-    offsets = np.asarray(points, dtype=np.float64) - middle
-    squared = _squared_distance(offsets, middle)[..., None]
-    return np.asarray(middle + offsets / (1 + squared * (lens.k1 + squared * lens.k2)))
+def undistorted(config: SimulationConfig, points: ArrayLike) -> FloatArray:
+    """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens` and `Distortion`.
+
+    Raises:
+        InputError: the lens images nothing at one of the points.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if not any(config.distortion.coefficients):
+        return _undivided(config.lens, points, config.frame_shape)
+    ideal = camera(config).ideal(points)
+    if np.isnan(ideal).any():
+        raise InputError(
+            f"distortion folds the image of {config.frame_shape[1]}x{config.frame_shape[0]} px at the focal length of "
+            f"{config.focal_length_px:g} px, so that nothing is imaged at its border; take smaller coefficients"
+        )
+    return ideal
 
 
-def distorts(lens: Lens) -> bool:
+def camera(config: SimulationConfig) -> Camera:
+    """Return the camera with OpenCV's distortion, which looks through the middle of its frames."""
+    return Camera.of(config.focal_length_px, config.frame_shape, config.distortion.coefficients)
+
+
+def distorts(config: SimulationConfig) -> bool:
     """Return whether straight lines become curves."""
-    return bool(lens.k1 or lens.k2)
+    return bool(config.lens.k1 or config.lens.k2 or any(config.distortion.coefficients))
 
 
-def outline(lens: Lens, frame_shape: tuple[int, int]) -> FloatArray:
+def outline(config: SimulationConfig) -> FloatArray:
     """Return points around the frame, (N, 2), as a lens without distortion images them."""
-    around = corners(frame_shape)
-    if not distorts(lens):
+    around = corners(config.frame_shape)
+    if not distorts(config):
         return around
     shares = np.arange(_POINTS_OF_A_SIDE)[:, None, None] / _POINTS_OF_A_SIDE
-    return undistorted(lens, ((1 - shares) * around + shares * np.roll(around, -1, axis=0)).reshape(-1, 2), frame_shape)
+    return undistorted(config, ((1 - shares) * around + shares * np.roll(around, -1, axis=0)).reshape(-1, 2))
 
 
 def pixel_grid(frame_shape: tuple[int, int]) -> FloatArray:
@@ -50,6 +65,14 @@ def transmission(lens: Lens, frame_shape: tuple[int, int]) -> NDArray[np.float32
     middle = _middle(frame_shape)
     squared = _squared_distance(pixel_grid(frame_shape) - middle, middle)
     return (1 - lens.vignette * squared).astype(np.float32)
+
+
+def _undivided(lens: Lens, points: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Undo the division model."""
+    middle = _middle(frame_shape)
+    offsets = points - middle
+    squared = _squared_distance(offsets, middle)[..., None]
+    return np.asarray(middle + offsets / (1 + squared * (lens.k1 + squared * lens.k2)))
 
 
 def _middle(frame_shape: tuple[int, int]) -> FloatArray:

@@ -3,7 +3,8 @@
 Convention:
     Points are (x, y), x right, y down; integers are pixel centres; sizes are (height, width). Homographies map pixels of a
     frame to pixels of the scene, h33 = 1. The camera only turns: a homography is K' R K^-1, where the scene is the image that
-    the same lens makes when it looks straight at the middle of the scene.
+    the same lens makes when it looks straight at the middle of the scene. Before a panorama all around, a homography is
+    K R K^-1 with determinant 1, where h33 may be 0 or negative.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import apply, inverse, normalised, rescaling
+from photonpano.geometry import Camera, apply, inverse, normalised, rescaling, rotation_matrices
 from photonpano.reading import read_array
 from photonpano_simulator.config import (
     FilePath,
@@ -24,12 +25,17 @@ from photonpano_simulator.config import (
     Shake,
     SimulationConfig,
     SplinePath,
+    TurnPath,
 )
-from photonpano_simulator.lens import outline
+from photonpano_simulator.lens import camera, outline
 from photonpano_simulator.sensor import Draw, generator
 
 _DENSE = 100_000
 """Points of a curve before it is resampled at constant speed; the error is far below 0.001 px."""
+_POINTS_OF_A_SIDE = 17
+"""Points along each side of a frame that must lie in the panorama."""
+_BLOCK = 8192
+"""Frames that are checked at a time, which bounds the memory."""
 
 
 def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
@@ -40,6 +46,8 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
     """
     path, focal = config.path, config.focal_length_px
     frame = _intrinsics(config.frame_shape, focal)
+    if isinstance(path, TurnPath):
+        return _turn(config, path, scene_shape, seed)
     if isinstance(path, FilePath):
         homographies = _read_homographies(path.file, config.n_frames)
     else:
@@ -53,14 +61,76 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
         shaking = _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
         homographies = homographies @ frame @ shaking @ np.linalg.inv(frame)
     homographies = normalised(homographies)
-    _require_inside(homographies, outline(config.lens, config.frame_shape), scene_shape)
+    _require_inside(homographies, outline(config), scene_shape)
     return homographies
 
 
-def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+def camera_rotations(config: SimulationConfig, homographies: FloatArray, scene_shape: tuple[int, int]) -> FloatArray | None:
+    """Return the rotations of a path: (T, 3, 3), directions of a frame to those of a camera before the middle of the scene.
+
+    Returns:
+        None for homographies from a file, which need not be rotations.
+    """
+    if isinstance(config.path, FilePath):
+        return None
+    ours = camera(config)
+    if isinstance(config.path, TurnPath):
+        return ours.rotations(homographies)
+    in_frame_px = scene_shape[0] / config.scene_scale, scene_shape[1] / config.scene_scale
+    scene = rescaling(config.scene_scale) @ _intrinsics(in_frame_px, config.focal_length_px)
+    return ours.rotations(ours.matrix @ np.linalg.inv(scene) @ homographies)
+
+
+def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int], path: object) -> FloatArray:
     """Return how far the scene has moved through the middle of the frame since the first frame: (T, 2) px."""
     middle = _middle(frame_shape)
+    if isinstance(path, TurnPath):
+        steps = apply(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
+        return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     return np.asarray(apply(inverse(homographies), apply(homographies[0], middle[None]))[:, 0] - middle)
+
+
+def _turn(config: SimulationConfig, path: TurnPath, scene_shape: tuple[int, int], seed: int) -> FloatArray:
+    """Return K R K^-1 of a camera that turns before a panorama of (height, width), 360 degrees wide: (T, 3, 3).
+
+    Raises:
+        InputError: a frame reaches above or below the panorama, or the panorama is too coarse for the camera.
+    """
+    focal, per_radian = config.focal_length_px, scene_shape[1] / (2 * np.pi)
+    if per_radian < focal * config.scene_scale / 2:
+        raise InputError(
+            f"a scene of {scene_shape[1]} px all around is too coarse for a focal length of {focal:g} px, which sees "
+            f"{2 * np.pi * focal * config.scene_scale:,.0f} px; take a wider scene, or lower focal_length_px"
+        )
+    progress = np.linspace(0, 1, config.n_frames)
+    phase, zero = 2 * np.pi * path.wobbles * progress, np.zeros(config.n_frames)
+    pitch = -np.deg2rad(path.pitch_wobble_deg) * np.sin(phase)
+    roll = np.deg2rad(path.roll_wobble_deg) * np.cos(phase)
+    rotations = rotation_matrices(np.stack([zero, np.deg2rad(path.degrees) * progress, zero], axis=1))
+    rotations = rotations @ rotation_matrices(np.stack([pitch, zero, zero], axis=1))
+    rotations = rotations @ rotation_matrices(np.stack([zero, zero, roll], axis=1))
+    if path.shake is not None:
+        random = generator(seed, Draw.SHAKE)
+        rotations = rotations @ _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, random)
+    _require_seen(rotations, camera(config), outline(config), scene_shape)
+    return camera(config).homographies(rotations)
+
+
+def _require_seen(rotations: FloatArray, ours: Camera, frame: FloatArray, scene_shape: tuple[int, int]) -> None:
+    """Require that the panorama reaches as high and as low as the frames, whose outline is (N, 2) ideal pixels."""
+    low, high = frame.min(axis=0), frame.max(axis=0)
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, _POINTS_OF_A_SIDE).T), axis=-1).reshape(-1, 2)
+    rays = np.concatenate([grid, np.ones((len(grid), 1))], axis=1) @ np.linalg.inv(ours.matrix).T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    steepest = 0.0
+    for start in range(0, len(rotations), _BLOCK):
+        steepest = max(steepest, float(np.abs(rotations[start : start + _BLOCK, 1] @ rays.T).max()))
+    needed, reach = np.rad2deg(np.arcsin(min(1.0, steepest))), 180 * scene_shape[0] / scene_shape[1]
+    if needed > reach + 1e-9:
+        raise InputError(
+            f"the frames reach {needed:.1f} degrees above or below the horizon, but the scene of {scene_shape[1]}x"
+            f"{scene_shape[0]} px, which is 360 degrees wide, only {reach:.1f}; take a higher scene, or a smaller wobble"
+        )
 
 
 def _centres(path: PanPath | ScanPath | LoopPath | SplinePath | HandShakePath, n_frames: int) -> FloatArray:

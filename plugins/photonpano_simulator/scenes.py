@@ -17,34 +17,55 @@ from photonpano_simulator.street.night import night
 
 _LUMINANCE = (0.0722, 0.7152, 0.2126)
 """Luminance of blue, green and red, in the order of OpenCV (IEC 61966-2-1)."""
+_OVERLAP = 40
+"""The ends of a drawing all around fade into each other over this part of its width."""
 _LARGEST = 16384
 """Largest side of a scene, px. Warps of OpenCV refuse a side of 32768 px."""
 
 
-def scene_flux(scene: StreetScene | NightScene | PhotoScene, flux: float, in_colour: bool = False) -> NDArray[np.float32]:
+def scene_flux(
+    scene: StreetScene | NightScene | PhotoScene, flux: float, in_colour: bool = False, is_round: bool = False
+) -> NDArray[np.float32]:
     """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame, with the mean `flux`.
 
     Args:
         scene: a photograph, or a drawing, which is painted in colour.
         flux: the mean; in colour, that of the sum of red, green and blue.
         in_colour: whether to return red, green and blue: (Hs, Ws, 3).
+        is_round: whether the ends of a drawing meet; those of a photograph are taken as they are.
 
     Raises:
         InputError: the photograph cannot be used.
     """
-    if isinstance(scene, StreetScene):
-        linear = srgb_to_linear(street((scene.height, scene.width), scene.seed))
-    elif isinstance(scene, NightScene):
-        linear = night((scene.height, scene.width), scene.seed, scene.range_db)
-    else:
+    if isinstance(scene, PhotoScene):
         linear = _photo(scene.file, scene.width, in_colour)
-    if in_colour and not isinstance(scene, PhotoScene):
-        linear = linear[..., None] * paint((scene.height, scene.width), scene.seed)
+    else:
+        overlap = max(2, scene.width // _OVERLAP) if is_round else 0
+        linear = _drawing(scene, (scene.height, scene.width + overlap), in_colour)
+        if is_round:
+            linear = _joined(linear, overlap)
     mean = float(linear.mean(dtype=np.float64)) * (3 if in_colour else 1)
     if mean == 0 and isinstance(scene, PhotoScene):
         raise InputError(f"{scene.file} is black: no flux can be made of it; take another photograph")
     linear *= np.float32(flux / mean)
     return linear
+
+
+def _drawing(scene: StreetScene | NightScene, shape: tuple[int, int], in_colour: bool) -> NDArray[np.float32]:
+    """Return a linear drawing of (height, width)."""
+    if isinstance(scene, StreetScene):
+        linear = srgb_to_linear(street(shape, scene.seed))
+    else:
+        linear = night(shape, scene.seed, scene.range_db)
+    return linear[..., None] * paint(shape, scene.seed) if in_colour else linear
+
+
+def _joined(linear: NDArray[np.float32], overlap: int) -> NDArray[np.float32]:
+    """Fade the last columns of a drawing into the first ones, so that its ends meet; it loses `overlap` columns."""
+    share = ((np.arange(overlap, dtype=np.float32) + 0.5) / overlap).reshape(-1, *[1] * (linear.ndim - 2))
+    joined = linear[:, :-overlap].copy()
+    joined[:, :overlap] = share * linear[:, :overlap] + (1 - share) * linear[:, -overlap:]
+    return joined
 
 
 def _photo(path: Path, width: int | None, in_colour: bool) -> NDArray[np.float32]:

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, SourceContext, StreamInfo
-from photonpano.geometry import apply, corner_displacements, corners, inverse, translation
+from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.reading import Closing
-from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
+from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig, TurnPath
 from photonpano_simulator.delivery import delivered
 from photonpano_simulator.intensity import IntensityCamera
 from photonpano_simulator.lamps import brightness, shares
-from photonpano_simulator.lens import distorts, pixel_grid, transmission, undistorted
+from photonpano_simulator.lens import camera, distorts, transmission, undistorted
 from photonpano_simulator.objects import DrawnObject
-from photonpano_simulator.paths import camera_path, scene_motion
+from photonpano_simulator.paths import camera_path, camera_rotations, scene_motion
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.sensor import Draw, SpadSensor, bayer_of, filter_array, generator
+from photonpano_simulator.views import Views
 
 
 class SimulatorSource(Closing):
     """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
 
-    A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread. The flux
-    between the pixels of the scene is interpolated linearly. Pixels of the camera have an area if the scene is finer than they
-    are: its flux is averaged over whole pixels of the scene, and the averages are interpolated.
+    A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread.
 
     Raises:
         InputError: a file cannot be used, the camera path leaves the scene, or frames are dropped that do not exist.
@@ -36,23 +34,22 @@ class SimulatorSource(Closing):
         flux = config.flux * config.sensor.quantum_efficiency
         filters = filter_array(config.sensor, config.frame_shape) if isinstance(config.sensor, Sensor) else None
         self._filters = filters
-        self._scene = scene_flux(config.scene, flux, in_colour=filters is not None)
+        is_round = isinstance(config.path, TurnPath)
+        self._scene = scene_flux(config.scene, flux, in_colour=filters is not None, is_round=is_round)
         height, width = self._scene.shape[:2]
         self._homographies = camera_path(config, (height, width), self._seed)
-        # The side of the area of a pixel, in px of the scene. Averages over it are sampled where their middles lie.
-        side = max(1, round(config.scene_scale * config.fill_factor**0.5))
-        self._averages = _averaged(self._scene, side)
-        self._to_averages = translation(-(side - 1) / 2, -(side - 1) / 2)
+        self._config, self._views = config, Views(config)
+        self._averages = self._views.averaged(self._scene)
         self._taken = delivered(config)
-        self._lens = config.lens
-        self._points = None
-        if distorts(config.lens):
-            self._points = undistorted(config.lens, pixel_grid(config.frame_shape), config.frame_shape)
-        motion = scene_motion(self._homographies, config.frame_shape) if config.objects else np.zeros((config.n_frames, 2))
+        motion = (
+            scene_motion(self._homographies, config.frame_shape, config.path)
+            if config.objects
+            else np.zeros((config.n_frames, 2))
+        )
         self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
         self._light = config.drift ** np.linspace(0, 1, config.n_frames)
         self._lamps = shares(config.lamps, (height, width))
-        self._lit_parts = [_averaged(np.ascontiguousarray((self._scene.T * share.T).T), side) for share in self._lamps]
+        self._lit_parts = [self._views.averaged(np.ascontiguousarray((self._scene.T * share.T).T)) for share in self._lamps]
         self._lamp_light = np.zeros((len(config.lamps), config.n_frames))
         for place, lamp in enumerate(config.lamps):
             self._lamp_light[place] = brightness(lamp, config.n_frames, config.frame_rate_hz)
@@ -91,19 +88,22 @@ class SimulatorSource(Closing):
         """Return the ground truth of the frames.
 
         Convention:
-            Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres.
+            Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres. Of a path
+            of the kind `turn`, the scene is an equirectangular panorama, and they map to pixels of the same camera when it
+            looks level at the middle of the scene: K R K^-1 with determinant 1. Directions are x right, y down, z ahead.
 
         Returns:
             `homographies` (T, 3, 3) float64, those of a lens without distortion; `scene` (Hs, Ws) float32, the flux that is
             detected, in photons per pixel per frame period, without dark counts; `frame_shape` (2,); `frame_rate_hz` ();
-            `seed` (); of a sensor with colour filters, `scene` is (Hs, Ws, 3), of red, green and blue pixels, and `filters`
+            `seed` (). Unless the path is a file: `rotations` (T, 3, 3), directions of the frame camera to those of a camera
+            that looks straight at the middle of the scene, and `camera_matrix` (3, 3). `scene_projection`, "planar" or
+            "spherical". Of a sensor with colour filters, `scene` is (Hs, Ws, 3), of red, green and blue pixels, and `filters`
             (H, W, 3) uint8 what each pixel sees, 255 or 0; of a single-photon camera also `dark_rates` (H, W) float32, dark
-            counts per frame period, and
-            `hot_pixels` (H, W) bool. Captures that are disturbed have more: `distortion` (2,), k1 and k2 of the lens, and
-            `undistorted_corners` (4, 2), where a lens without distortion images the corners of the frame; `gains` (H, W)
-            float32, vignetting, sensitivity and dirt; `light` (T,), relative to the first frame; `lamps` (N, Hs, Ws) float32,
-            the share of each lamp in the light of each place, and `lamp_light` (N, T), 1 on average; `taken` (T,), the index
-            of each frame before drops and repeats.
+            counts per frame period, and `hot_pixels` (H, W) bool. Captures that are disturbed have more: `distortion`, (4,)
+            k1, k2, p1, p2 of OpenCV or (2,) k1 and k2 of `lens`, and `undistorted_corners` (4, 2), where a lens without
+            distortion images the corners of the frame; `gains` (H, W) float32, vignetting, sensitivity and dirt; `light` (T,),
+            relative to the first frame; `lamps` (N, Hs, Ws) float32, the share of each lamp in the light of each place, and
+            `lamp_light` (N, T), 1 on average; `taken` (T,), the index of each frame before drops and repeats.
         """
         truth: dict[str, NDArray[np.generic]] = {
             "homographies": self._homographies[self._taken],
@@ -111,13 +111,18 @@ class SimulatorSource(Closing):
             "frame_shape": np.array(self.info.frame_shape),
             "frame_rate_hz": np.array(self.info.frame_rate_hz),
             "seed": np.array(self._seed),
+            "scene_projection": np.array("spherical" if isinstance(self._config.path, TurnPath) else "planar"),
             **self._sensor.truth(),
         }
+        rotations = camera_rotations(self._config, self._homographies[self._taken], self._scene.shape[:2])
+        if rotations is not None:
+            truth["rotations"], truth["camera_matrix"] = rotations, camera(self._config).matrix
         if self._filters is not None:
             truth["filters"] = (255 * self._filters).astype(np.uint8)
-        if self._points is not None:
-            truth["distortion"] = np.array([self._lens.k1, self._lens.k2])
-            truth["undistorted_corners"] = undistorted(self._lens, corners(self.info.frame_shape), self.info.frame_shape)
+        if distorts(self._config):
+            lens, opencv = self._config.lens, self._config.distortion.coefficients
+            truth["distortion"] = np.array(opencv if any(opencv) else (lens.k1, lens.k2))
+            truth["undistorted_corners"] = undistorted(self._config, corners(self.info.frame_shape))
         if (self._gains != 1).any():
             truth["gains"] = self._gains
         if (self._light != 1).any():
@@ -160,26 +165,7 @@ class SimulatorSource(Closing):
 
     def _view(self, scene: NDArray[np.float32], homography: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the flux of a scene in a frame, (H, W)."""
-        height, width = self.info.frame_shape
-        homography = self._to_averages @ homography
-        # The path lies inside the scene, up to rounding errors.
-        border = cv2.BORDER_REPLICATE
-        if self._points is None:
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            view = cv2.warpPerspective(scene, homography, (width, height), flags=flags, borderMode=border)
-        else:
-            x, y = np.moveaxis(apply(homography, self._points.reshape(-1, 2)).reshape(height, width, 2), -1, 0).astype(
-                np.float32
-            )
-            view = cv2.remap(scene, x, y, cv2.INTER_LINEAR, borderMode=border)
+        view = self._views.view(scene, homography)
         if self._filters is not None:
             view = (view * self._filters).sum(axis=-1)
         return view.astype(np.float32, copy=False)
-
-
-def _averaged(scene: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Return the averages of squares of pixels of a scene, each where its first pixel lies."""
-    if side == 1:
-        return scene
-    averages = cv2.boxFilter(scene, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(averages, np.float32)

@@ -10,7 +10,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import apply, corners
-from photonpano_simulator.config import FrameObject, Lens, Sensor
+from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
 from photonpano_simulator.lens import undistorted
 from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.sensor import SpadSensor
@@ -39,14 +39,18 @@ def radii(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points - middle, axis=-1) / np.linalg.norm(middle)
 
 
+def lensed(k1: float, k2: float = 0) -> SimulatorConfig:
+    return SimulatorConfig(lens=Lens(k1=k1, k2=k2), frame_shape=SHAPE)
+
+
 def test_distortion_follows_the_division_model() -> None:
-    lens = Lens(k1=-0.03, k2=0.01)
+    lens = lensed(-0.03, 0.01)
     points = np.array([[0.0, 0.0], [51.0, 39.0], [10.0, 33.0], [40.0, 20.0]])
     r = radii(points)
-    np.testing.assert_allclose(radii(undistorted(lens, points, SHAPE)), r / (1 - 0.03 * r**2 + 0.01 * r**4), rtol=1e-12)
-    np.testing.assert_array_equal(undistorted(lens, [25.5, 19.5], SHAPE), [25.5, 19.5])
+    np.testing.assert_allclose(radii(undistorted(lens, points)), r / (1 - 0.03 * r**2 + 0.01 * r**4), rtol=1e-12)
+    np.testing.assert_array_equal(undistorted(lens, [25.5, 19.5]), [25.5, 19.5])
     # The corner is imaged 3 % nearer to the middle than without distortion.
-    np.testing.assert_allclose(radii(undistorted(Lens(k1=-0.03), corners(SHAPE), SHAPE)) * 0.97, 1, rtol=1e-12)
+    np.testing.assert_allclose(radii(undistorted(lensed(-0.03), corners(SHAPE))) * 0.97, 1, rtol=1e-12)
 
 
 def test_distorted_frames_agree_with_the_truth(simulated: Simulated) -> None:
@@ -55,12 +59,12 @@ def test_distorted_frames_agree_with_the_truth(simulated: Simulated) -> None:
     assert truth["distortion"].tolist() == [-0.2, 0.05]
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
-    seen = apply(truth["homographies"][0], undistorted(Lens(k1=-0.2, k2=0.05), pixels, SHAPE)).astype(np.float32)
+    seen = apply(truth["homographies"][0], undistorted(lensed(-0.2, 0.05), pixels)).astype(np.float32)
     flux = cv2.remap(truth["scene"], seen[:, :1], seen[:, 1:], cv2.INTER_LINEAR).reshape(SHAPE)
     z = z_scores(source, flux)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 5 * np.sqrt(2 / z.size)
-    np.testing.assert_allclose(truth["undistorted_corners"], undistorted(Lens(k1=-0.2, k2=0.05), corners(SHAPE), SHAPE))
+    np.testing.assert_allclose(truth["undistorted_corners"], undistorted(lensed(-0.2, 0.05), corners(SHAPE)))
     # A lens without distortion images something else there.
     assert z_scores(simulated(**STILL), flux).var() > 2
 

@@ -1,0 +1,113 @@
+"""What frames see of a scene: of a plane before the camera, or of an equirectangular panorama around it.
+
+Convention:
+    Points are (x, y), x right, y down; integers are pixel centres; sizes are (height, width). A direction is (x, y, z), x
+    right, y down, z ahead.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import FloatArray
+from photonpano.compiling import compiled
+from photonpano.geometry import apply, translation
+from photonpano_simulator.config import SimulationConfig, TurnPath
+from photonpano_simulator.lens import camera, distorts, pixel_grid, undistorted
+
+
+class Views:
+    """Renders frames of a scene.
+
+    The flux between the pixels of the scene is interpolated linearly. Pixels of the camera have an area if the scene is finer
+    than they are: its flux is averaged over squares of whole pixels of the scene, and the averages are interpolated.
+
+    Args:
+        config: of the simulation.
+
+    Raises:
+        InputError: the lens images nothing at some pixels.
+    """
+
+    def __init__(self, config: SimulationConfig) -> None:
+        self._shape = config.frame_shape
+        self._is_round = isinstance(config.path, TurnPath)
+        self._points = None
+        if distorts(config) or self._is_round:
+            self._points = undistorted(config, pixel_grid(config.frame_shape))
+        self._to_rays = np.linalg.inv(camera(config).matrix)
+        # The side of the area of a pixel, in px of the scene. Averages over it are sampled where their middles lie.
+        self._side = max(1, round(config.scene_scale * config.fill_factor**0.5))
+        self._offset = (self._side - 1) / 2
+
+    def averaged(self, scene: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the averages of squares of pixels of a scene, each where its first pixel lies."""
+        if self._side == 1:
+            return scene
+        if self._is_round:
+            scene = np.concatenate([scene, scene[:, : self._side]], axis=1)
+        averages = cv2.boxFilter(scene, -1, (self._side, self._side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(averages[:, : -self._side] if self._is_round else averages, np.float32)
+
+    def view(self, averages: NDArray[np.float32], homography: FloatArray) -> NDArray[np.float32]:
+        """Return the flux of a scene in a frame, (H, W) or (H, W, 3).
+
+        Args:
+            averages: from `averaged`.
+            homography: (3, 3), pixels of the frame to pixels of the scene; before a panorama, K R K^-1, scaled by a positive
+                number, where R turns directions of the frame to those of the panorama.
+        """
+        if self._points is not None and self._is_round:
+            return self._around(averages, self._points, homography)
+        height, width = self._shape
+        homography = translation(-self._offset, -self._offset) @ homography
+        # The path lies inside the scene, up to rounding errors.
+        border = cv2.BORDER_REPLICATE
+        if self._points is None:
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            return np.asarray(cv2.warpPerspective(averages, homography, (width, height), flags=flags, borderMode=border))
+        points = apply(homography, self._points.reshape(-1, 2)).reshape(height, width, 2)
+        x, y = np.moveaxis(points, -1, 0).astype(np.float32)
+        return np.asarray(cv2.remap(averages, x, y, cv2.INTER_LINEAR, borderMode=border))
+
+    def _around(self, averages: NDArray[np.float32], points: FloatArray, homography: FloatArray) -> NDArray[np.float32]:
+        height, width = averages.shape[:2]
+        columns, rows = np.empty(self._shape, np.float32), np.empty(self._shape, np.float32)
+        _look_around(points, self._to_rays @ homography, width, height, self._offset, columns, rows)
+        return np.asarray(cv2.remap(averages, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+
+
+@compiled
+def _look_around(
+    points: FloatArray,
+    rays: FloatArray,
+    width: int,
+    height: int,
+    offset: float,
+    columns: NDArray[np.float32],
+    rows: NDArray[np.float32],
+) -> None:
+    """Write where points of a frame lie in an equirectangular panorama.
+
+    Args:
+        points: (H, W, 2), pixels of the frame.
+        rays: (3, 3), pixels of the frame to directions.
+        width: of the panorama: 360 degrees.
+        height: of the panorama, whose middle is the horizon.
+        offset: subtracted from the positions.
+        columns: (H, W) output, at least 0 and below `width`.
+        rows: (H, W) output.
+    """
+    per_radian = width / (2 * np.pi)
+    for i in range(columns.shape[0]):
+        for j in range(columns.shape[1]):
+            x, y = points[i, j, 0], points[i, j, 1]
+            right = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
+            down = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
+            ahead = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
+            azimuth, pitch = np.arctan2(right, ahead), np.arctan2(down, np.sqrt(right * right + ahead * ahead))
+            column = per_radian * azimuth + (width - 1) / 2 - offset
+            columns[i, j] = column if column >= 0 else column + width
+            rows[i, j] = min(max(per_radian * pitch + (height - 1) / 2 - offset, 0.0), height - 1.0)
