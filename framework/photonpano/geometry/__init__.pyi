@@ -19,6 +19,9 @@ from .homographies import rescaling as rescaling
 from .homographies import step_motions as step_motions
 from .homographies import translation as translation
 from .plausibility import why_implausible as why_implausible
+from .projections import PROJECTIONS as PROJECTIONS
+from .projections import Projection as Projection
+from .projections import ProjectionName as ProjectionName
 from .rotations import nearest_rotations as nearest_rotations
 from .rotations import rotation_matrices as rotation_matrices
 from .rotations import rotation_vectors as rotation_vectors
@@ -30,3 +33,8 @@ from .shapes import violation as violation
 from .steps import generators as generators
 from .steps import slopes as slopes
 from .steps import unit_coordinates as unit_coordinates
+from .turning import Covered as Covered
+from .turning import canvas_around as canvas_around
+from .turning import covered_by as covered_by
+from .turning import level_horizon as level_horizon
+from .turning import outline_of as outline_of

@@ -1,13 +1,14 @@
-"""The canvas of a panorama: its size, and the map from the reference plane to its pixels."""
+"""The canvas of a panorama: its size, its projection, and the map to its pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from photonpano.geometry.homographies import apply, corners, rescaling, translation
+from photonpano.geometry.projections import PROJECTIONS, Projection
 from photonpano.values import FloatArray, Homography
 
 BLOCK_FRAMES = 8192
@@ -26,17 +27,80 @@ class Canvas:
     Attributes:
         height: rows.
         width: columns.
-        transform: (3, 3), pixels of the reference plane to pixels of the canvas.
+        transform: (3, 3), pixels of the reference plane to pixels of the canvas. If the canvas is not planar, it maps (a, b, 1)
+            to pixels, by a scale and a shift: see `PROJECTIONS`.
+        projection: name of the projection.
+        camera_matrix: (3, 3) of the reference camera; None for a planar canvas.
+        horizon: (3, 3) rotation from directions of the reference camera to those of which a and b are computed; None for none.
     """
 
     height: int
     width: int
     transform: Homography
+    projection: str = "planar"
+    camera_matrix: FloatArray | None = None
+    horizon: FloatArray | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width)."""
         return self.height, self.width
+
+    @property
+    def planar(self) -> bool:
+        """Whether a homography maps the reference plane to the canvas."""
+        return self.projection == "planar"
+
+    @property
+    def plane_to_rays(self) -> Homography:
+        """(3, 3): homogeneous pixels of the reference plane to the rays that `pixels` maps and `rays` returns.
+
+        For a planar canvas, rays are homogeneous pixels of the canvas.
+        """
+        if self.planar:
+            return self.transform
+        assert self.camera_matrix is not None
+        ahead = np.linalg.inv(self.camera_matrix)
+        return np.asarray(ahead if self.horizon is None else self.horizon @ ahead, np.float64)
+
+    @property
+    def period_px(self) -> float | None:
+        """Columns of a full turn; None for a planar canvas."""
+        return None if self.planar else float(2 * np.pi * self.transform[0, 0])
+
+    def columns(self) -> tuple[FloatArray, FloatArray]:
+        """Return p and s of each column, (W,): the ray of a pixel (x, y) is `(p[x] r[y], q[y], s[x] r[y])`."""
+        x = np.arange(self.width, dtype=np.float64)
+        return self._projection.across(x if self.planar else (x - self.transform[0, 2]) / self.transform[0, 0])
+
+    def rows(self) -> tuple[FloatArray, FloatArray]:
+        """Return q and r of each row: (H,)."""
+        y = np.arange(self.height, dtype=np.float64)
+        return self._projection.down(y if self.planar else (y - self.transform[1, 2]) / self.transform[1, 1])
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """Return where (..., 3) rays lie on the canvas: (..., 2). Columns of full turns are the same place."""
+        points = self._projection.points(rays)
+        return points if self.planar else np.asarray(points * np.diag(self.transform)[:2] + self.transform[:2, 2])
+
+    def part(self, left: int, top: int, height: int, width: int) -> Canvas:
+        """Return the canvas of a box of pixels."""
+        return replace(self, height=height, width=width, transform=translation(-left, -top) @ self.transform)
+
+    def same_as(self, other: Canvas) -> bool:
+        """Return whether both have the same pixels at the same places."""
+        pairs = (
+            (self.transform, other.transform),
+            (self.camera_matrix, other.camera_matrix),
+            (self.horizon, other.horizon),
+        )
+        return (self.shape, self.projection) == (other.shape, other.projection) and all(
+            one is two or (one is not None and two is not None and np.array_equal(one, two)) for one, two in pairs
+        )
+
+    @property
+    def _projection(self) -> Projection:
+        return PROJECTIONS[self.projection]
 
 
 def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
