@@ -60,8 +60,9 @@ def render(
 
     Raises:
         CanvasTooLargeError: the panorama would exceed `run.memory`.
-        InputError: the folder is no run folder, its capture cannot be opened, or it is another capture now.
-        OutputError: the new folder cannot be written, or it is the one of the run.
+        InputError: the folder is no run folder, its capture cannot be opened, or it is another capture now; `output` is
+            that folder.
+        OutputError: the new folder cannot be written.
         PluginError: the renderer or an exporter failed, or broke its contract.
         SpecError: a change is wrong.
     """

@@ -1,4 +1,4 @@
-"""A part of a capture: the frames that `source.with.frames` names."""
+"""A part of a capture: some of its frames, numbered from 0."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class Part(SourceWrapper):
     def __init__(self, source: Source, span: FrameSpan) -> None:
         super().__init__(source)
         self._span = span
+        self._info = replace(source.info, n_frames=len(span))
 
     def around(self, source: Source) -> Source:
         """See `SourceWrapper`."""
@@ -38,10 +39,11 @@ class Part(SourceWrapper):
     @property
     def info(self) -> StreamInfo:
         """Frames of the part, size, rate."""
-        return replace(self.wrapped.info, n_frames=len(self._span))
+        return self._info
 
     def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
         """Read the frames of the whole capture."""
+        self.info.require(span)
         start = self._span.start
         return super().read(method, FrameSpan(start + span.start, start + span.stop), shape)
 

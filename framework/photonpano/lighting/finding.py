@@ -69,7 +69,7 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
     return Light.of_frames(gain / mean, frequency, std / mean)
 
 
-def corrected(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
+def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
     """Correct light by what the panorama in it does not explain.
 
     Squares of the scene are brighter and darker inside, so that a sensor that saturates sees too little of their changes; a

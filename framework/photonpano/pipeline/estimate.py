@@ -11,7 +11,7 @@ from photonpano.context import Context
 from photonpano.contributions import MergerContribution
 from photonpano.corrections import Vignette, divided_by, estimate_vignette
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.lighting import corrected, decision_of, find_light, in_light, measure_light
+from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion
@@ -141,7 +141,7 @@ def _lit(
         results = first_level(again, known)
         in_this, within = lit(again)
         look = _look(plan, in_this, results, reference, within)
-        light = corrected(again, look.residuals.spans, *look.residuals.gains())
+        light = corrected_light(again, look.residuals.spans, *look.residuals.gains())
         if not changing:
             worse = _worse_in_light(look, _look(plan, source, steady, reference, context))
     except (LocationError, CanvasTooLargeError) as error:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from photonpano.captures.part import part_of
 from photonpano.context import Context
 from photonpano.geometry import canvas_of_box
 from photonpano.merging.colour import channels_of
@@ -16,10 +16,9 @@ from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels, build_renderer
 from photonpano.protocols import Source
 from photonpano.record.run_json import peak_memory_bytes
-from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
-from photonpano.values import FrameSpan, StreamInfo
+from photonpano.values import FrameSpan
 
 TRIAL_GROUPS = 12
 """Length of the trial, in groups of the first level. It is taken from the middle of the capture."""
@@ -47,39 +46,6 @@ class Forecast:
     seconds: dict[str, float]
     memory_bytes: int
     canvas: tuple[int, int]
-
-
-def part_of(source: Source, span: FrameSpan) -> PartOfSource:
-    """Return some frames of a capture as a source, with the optional methods that it has, but `truth`."""
-    capabilities = [each for each in capabilities_of(source) if each is not TruthWrapper]
-    return with_capabilities(PartOfSource, capabilities)(source, span)
-
-
-class PartOfSource(SourceWrapper):
-    """Some frames of a capture, numbered from 0: made by `part_of`. Closing it leaves the capture open."""
-
-    def __init__(self, source: Source, span: FrameSpan) -> None:
-        super().__init__(source)
-        self._span = span
-        self._info = replace(source.info, n_frames=len(span))
-
-    @property
-    def info(self) -> StreamInfo:
-        """Frames, size, rate."""
-        return self._info
-
-    def read(self, method: Callable[[FrameSpan], ArrayT], span: FrameSpan, shape: tuple[int, ...]) -> ArrayT:
-        """See `SourceWrapper`."""
-        del shape
-        self.info.require(span)
-        return method(FrameSpan(span.start + self._span.start, span.stop + self._span.start))
-
-    def around(self, source: Source) -> PartOfSource:
-        """See `SourceWrapper`."""
-        return part_of(source, self._span)
-
-    def close(self) -> None:
-        """Do nothing: the capture stays open."""
 
 
 def forecast(plan: Plan, source: Source) -> Forecast:
@@ -120,7 +86,7 @@ def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: tuple[int, 
     return height, width
 
 
-def _tried(plan: Plan, part: PartOfSource, threads: int) -> list[LevelResult]:
+def _tried(plan: Plan, part: Source, threads: int) -> list[LevelResult]:
     levels = build_levels(plan, part, [])
     with one_thread_inside():
         return estimate_motion(part, levels, plan.graph, part.info.n_frames // 2, Context(threads), plan.until_converged)
