@@ -166,12 +166,16 @@ class KnowsTruth(Protocol):
         """Return the ground truth as named arrays; there may be more than the following ones.
 
         Convention:
-            Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres.
+            Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres. Directions
+            are x right, y down, z ahead.
 
         Returns:
             `homographies` (T, 3, 3) float64, one for each frame, h33 = 1; `scene` (Hs, Ws) float32, the flux that is detected,
             in photons per pixel per frame, without dark counts, or (Hs, Ws, 3) of red, green and blue pixels; `frame_shape`
-            (2,), height and width of a frame.
+            (2,), height and width of a frame. If the camera only turned, also `rotations` (T, 3, 3), directions of a frame to
+            those of one camera, and `camera_matrix` (3, 3). If `scene_projection` is "spherical", the scene is an
+            equirectangular panorama, 360 degrees wide, whose middle that camera looks at; homographies are then K R K^-1 with
+            determinant 1.
         """
         ...
 

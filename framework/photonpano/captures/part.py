@@ -56,4 +56,7 @@ class _PartOfTruth(TruthWrapper):
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
         """Return what the frames of the part show."""
         truth = super().truth()
-        return {**truth, "homographies": truth["homographies"][self._span.start : self._span.stop]}
+        of_frames = {
+            name: truth[name][self._span.start : self._span.stop] for name in ("homographies", "rotations") if name in truth
+        }
+        return {**truth, **of_frames}

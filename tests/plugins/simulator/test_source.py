@@ -119,7 +119,10 @@ def test_written_capture_has_the_same_frames(simulated: Simulated, tmp_path: Pat
     assert packed.shape == (50, 40, 7)
     np.testing.assert_array_equal(np.unpackbits(packed, axis=-1, count=51), source.frames(source.info.span))
     with np.load(truth_path, allow_pickle=False) as truth:
-        assert sorted(truth) == ["dark_rates", "frame_rate_hz", "frame_shape", "homographies", "hot_pixels", "scene", "seed"]
+        names = (
+            "camera_matrix dark_rates frame_rate_hz frame_shape homographies hot_pixels rotations scene scene_projection seed"
+        )
+        assert sorted(truth) == names.split()
         assert (truth["homographies"].shape, truth["homographies"].dtype) == ((50, 3, 3), np.float64)
         assert (truth["scene"].shape, truth["scene"].dtype) == ((150, 200), np.float32)
         assert truth["frame_shape"].tolist() == [40, 51]
