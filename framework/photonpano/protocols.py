@@ -32,7 +32,7 @@ from photonpano.values import (
 )
 
 if TYPE_CHECKING:
-    from photonpano.geometry import Canvas
+    from photonpano.geometry import Camera, Canvas
 
 
 class Source(Protocol):
@@ -153,6 +153,24 @@ class LitSource(Source, Protocol):
 def light_of(source: Source) -> Light | None:
     """Return the changing light of a capture; None if it is steady, or not known."""
     return source.light if isinstance(source, LitSource) else None
+
+
+@runtime_checkable
+class LensedSource(Source, Protocol):
+    """A source whose camera is known.
+
+    Frames are warped through its lens: homographies then map ideal pixels, those without distortion, to ideal pixels.
+    """
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all frames."""
+        ...
+
+
+def camera_of(source: Source) -> Camera | None:
+    """Return the camera of a capture; None if it is not known."""
+    return source.camera if isinstance(source, LensedSource) else None
 
 
 @runtime_checkable

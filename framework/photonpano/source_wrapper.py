@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.protocols import ColouredSource, KnowsTruth, LinearlyCorrectedSource, PackedSource, Source, WeightedSource
-from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Response, StreamInfo
+from photonpano.protocols import (
+    ColouredSource,
+    KnowsTruth,
+    LensedSource,
+    LinearlyCorrectedSource,
+    LitSource,
+    PackedSource,
+    Source,
+    WeightedSource,
+)
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Camera
 
 ArrayT = TypeVar("ArrayT", bound="NDArray[Any]")
 WrapperT = TypeVar("WrapperT", bound="SourceWrapper")
@@ -31,8 +43,9 @@ class Closing:
 class SourceWrapper(Closing):
     """A source around another source, to which it passes every call. Subclasses override what they change.
 
-    The optional methods `packed`, `corrected`, `weights`, `colours` and `truth` come from the classes `PackedWrapper`,
-    `LinearlyCorrectedWrapper`, `WeightedWrapper`, `ColouredWrapper` and `TruthWrapper`: see `with_capabilities`.
+    The optional members `packed`, `corrected`, `weights`, `light`, `camera`, `colours` and `truth` come from the classes
+    `PackedWrapper`, `LinearlyCorrectedWrapper`, `WeightedWrapper`, `LitWrapper`, `LensedWrapper`, `ColouredWrapper` and
+    `TruthWrapper`: see `with_capabilities`.
 
     Attributes:
         wrapped: the other source.
@@ -103,6 +116,24 @@ class WeightedWrapper(SourceWrapper):
         return cast("WeightedSource", self.wrapped).weights()
 
 
+class LitWrapper(SourceWrapper):
+    """A wrapper of a `LitSource`."""
+
+    @property
+    def light(self) -> Light:
+        """The gain of each frame."""
+        return cast("LitSource", self.wrapped).light
+
+
+class LensedWrapper(SourceWrapper):
+    """A wrapper of a `LensedSource`."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all frames."""
+        return cast("LensedSource", self.wrapped).camera
+
+
 class ColouredWrapper(SourceWrapper):
     """A wrapper of a `ColouredSource`, whose sources it wraps as well.
 
@@ -136,6 +167,8 @@ def capabilities_of(source: Source) -> list[type[SourceWrapper]]:
         PackedSource: PackedWrapper,
         LinearlyCorrectedSource: LinearlyCorrectedWrapper,
         WeightedSource: WeightedWrapper,
+        LitSource: LitWrapper,
+        LensedSource: LensedWrapper,
         ColouredSource: ColouredWrapper,
         KnowsTruth: TruthWrapper,
     }
@@ -148,3 +181,26 @@ def with_capabilities(wrapper: type[WrapperT], capabilities: list[type[SourceWra
     `isinstance` with `PackedSource` and the other protocols is then decided by the class of an object.
     """
     return type(wrapper.__name__, (*capabilities, wrapper), {})
+
+
+def seen_through(source: Source, camera: Camera) -> SeenThrough:
+    """Return a capture with its camera: a `LensedSource`. It replaces a camera that the source has."""
+    capabilities = [each for each in capabilities_of(source) if each is not LensedWrapper]
+    return with_capabilities(SeenThrough, capabilities)(source, camera)
+
+
+class SeenThrough(SourceWrapper):
+    """A source whose camera is known: made by `seen_through`. Its counts stay as they are; what warps frames uses the lens."""
+
+    def __init__(self, source: Source, camera: Camera) -> None:
+        super().__init__(source)
+        self._camera = camera
+
+    def around(self, source: Source) -> Source:
+        """Return the source of one colour, with the same camera."""
+        return seen_through(source, self._camera)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all frames."""
+        return self._camera

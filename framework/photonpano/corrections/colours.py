@@ -12,6 +12,7 @@ import numpy as np
 from photonpano.protocols import LinearlyCorrectedSource
 from photonpano.reading import COLOURS
 from photonpano.source_wrapper import (
+    LensedWrapper,
     LinearlyCorrectedWrapper,
     PackedWrapper,
     SourceWrapper,
@@ -99,7 +100,7 @@ def filtered(source: Source, colour: Callable[[], NDArray[np.int8]], decisions: 
         colour: returns the place in `COLOURS` of the colour of each pixel, (H, W).
         decisions: what was chosen because of what the capture shows; the gains of the colours are added.
     """
-    kept = PackedWrapper, TruthWrapper
+    kept = PackedWrapper, TruthWrapper, LensedWrapper
     capabilities: list[type[SourceWrapper]] = [each for each in capabilities_of(source) if each in kept]
     return with_capabilities(FilteredSource, capabilities)(source, colour, decisions)
 
@@ -111,7 +112,7 @@ def of_pixels(source: Source, pixels: BoolArray) -> OnePart:
         source: the capture; closing it closes the part.
         pixels: (H, W), those to keep.
     """
-    kept = PackedWrapper, LinearlyCorrectedWrapper
+    kept = PackedWrapper, LinearlyCorrectedWrapper, LensedWrapper
     return with_capabilities(OnePart, [each for each in capabilities_of(source) if each in kept])(source, pixels)
 
 

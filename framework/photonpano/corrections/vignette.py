@@ -11,6 +11,7 @@ from photonpano.geometry import apply, corner_displacements, inverse
 from photonpano.protocols import LinearlyCorrectedSource
 from photonpano.source_wrapper import (
     ColouredWrapper,
+    LensedWrapper,
     PackedWrapper,
     SourceWrapper,
     WeightedWrapper,
@@ -103,7 +104,7 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
 
 def divided_by(source: Source, vignette: Vignette) -> FlatSource:
     """Return a source whose corrected sums are those of a lens without vignette."""
-    known = PackedWrapper, WeightedWrapper, ColouredWrapper
+    known = PackedWrapper, WeightedWrapper, ColouredWrapper, LensedWrapper
     return with_capabilities(FlatSource, [each for each in capabilities_of(source) if each in known])(source, vignette)
 
 

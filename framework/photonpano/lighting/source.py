@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from photonpano.protocols import Source
-from photonpano.source_wrapper import SourceWrapper, capabilities_of, with_capabilities
+from photonpano.source_wrapper import LitWrapper, SourceWrapper, capabilities_of, with_capabilities
 from photonpano.values import Light
 
 
 def in_light(source: Source, light: Light) -> InLight:
     """Return a capture with the gain of each of its frames: a `LitSource`."""
-    return with_capabilities(InLight, capabilities_of(source))(source, light)
+    capabilities = [each for each in capabilities_of(source) if each is not LitWrapper]
+    return with_capabilities(InLight, capabilities)(source, light)
 
 
 class InLight(SourceWrapper):

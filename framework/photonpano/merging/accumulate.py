@@ -12,12 +12,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from photonpano.geometry import translation
+from photonpano.geometry import Canvas, translation
+from photonpano.merging.bent import BentFootprint, BentGrid, Rays, add_bent, padded
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.light import LightTerms, LitFrames
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
-from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource, light_of
+from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource, camera_of, light_of
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
 _BATCH = 16
@@ -64,7 +65,7 @@ class PhotonSum:
 def accumulate(
     source: Source,
     chunks: Sequence[Chunk],
-    onto: Homography,
+    onto: Homography | Canvas,
     shape: tuple[int, int],
     advance: Callable[[int], None] | None = None,
     pool: Executor | None = None,
@@ -78,9 +79,10 @@ def accumulate(
 
     Args:
         source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected, pixels
-            of a `WeightedSource` are weighted, and frames of a `LitSource` by their gains.
+            of a `WeightedSource` are weighted, and frames of a `LitSource` by their gains. Frames of a `LensedSource` are
+            warped through its lens.
         chunks: frames, with their maps to the reference plane.
-        onto: (3, 3), pixels of the reference plane to pixels of the grid.
+        onto: (3, 3), pixels of the reference plane to pixels of the grid; or a canvas of any projection, which is the grid.
         shape: (height, width) of the grid.
         advance: called with the number of frames of each chunk that is done; first with that of all chunks off the grid.
         pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on its
@@ -89,15 +91,23 @@ def accumulate(
     """
     light = light_of(source)
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
-    total = _Total.zeros(shape, 1 if terms is None else terms.number)
+    canvas = onto if isinstance(onto, Canvas) else Canvas(*shape, onto)
+    grid = BentGrid.of(canvas, camera_of(source))
+    total = _Total.zeros(shape, 1 if terms is None else terms.number, None if grid is None else grid.rays)
     # Parts are narrow, so that every thread has work wherever frames lie on the grid. Their number does not depend on that of
     # the threads, since OpenCV rounds a warp by where it starts.
     n_parts = max(1, shape[0] // _PART_ROWS) if pool else 1
     parts = [total.rows(part) for part in divided(shape[0], n_parts)]
     masked = weights_of(source)
     corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-    footprints = footprints_of(onto @ np.array([chunk.homography for chunk in chunks]), source.info.frame_shape, shape)
-    visible = [(chunk, at) for chunk, at in zip(chunks, footprints, strict=True) if at.rows and at.columns]
+    homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
+    footprints: Sequence[Footprint | BentFootprint]
+    if grid is None:
+        footprints = footprints_of(canvas.transform @ homographies, frame_shape, shape)
+    else:
+        footprints = grid.footprints(homographies, frame_shape)
+    pairs: Iterable[tuple[Chunk, Footprint | BentFootprint]] = zip(chunks, footprints, strict=True)
+    visible = [(chunk, at) for chunk, at in pairs if at.rows and at.columns]
     advance = advance or (lambda _: None)
     if off_grid := sum(len(chunk.span) for chunk in chunks) - sum(len(chunk.span) for chunk, _ in visible):
         advance(off_grid)
@@ -115,7 +125,7 @@ def accumulate(
     counts, coverages = total.result()
     if light is None or terms is None:
         return PhotonSum(counts, coverages[0])
-    lit = terms.lit_frames(coverages, light, onto)
+    lit = terms.lit_frames(coverages, light, canvas)
     return PhotonSum(counts, lit.weight, lit)
 
 
@@ -133,12 +143,12 @@ class _Summed:
     Attributes:
         footprint: where it lies on the grid.
         amounts: (P,) what each pixel adds to the coverages: the number of frames, and in changing light terms of their gains.
-        counts: (h, w) float32 or uint32.
+        counts: (h, w) float32 or uint32; with zeros around it for a `BentFootprint`.
         seen: (h, w) float32, the share of each pixel that was seen; None if it is 1 for all. In steady light, times the number
-            of frames.
+            of frames, but not for a `BentFootprint`.
     """
 
-    footprint: Footprint
+    footprint: Footprint | BentFootprint
     amounts: FloatArray
     counts: FluxImage | Counts
     seen: FluxImage | None
@@ -150,23 +160,28 @@ def _summed(
     masked: FluxImage | None,
     terms: LightTerms | None,
     chunk: Chunk,
-    footprint: Footprint,
+    footprint: Footprint | BentFootprint,
 ) -> _Summed:
-    n_frames, shrink = len(chunk.span), footprint.shrink
+    n_frames, shrink, bent = len(chunk.span), footprint.shrink, isinstance(footprint, BentFootprint)
     amounts = np.array([float(n_frames)]) if terms is None else terms.amounts(chunk.span)
-    of_frame = n_frames if terms is None else 1
+    of_frame = n_frames if terms is None and not bent else 1
     raw = counts_of(chunk.span)
     counts: FluxImage | Counts = np.ascontiguousarray(raw)
     if corrected is not None:
         counts = np.ascontiguousarray(corrected(raw, n_frames))
+    seen: FluxImage | None = None
     if masked is not None:
         lit, seen = counts.astype(np.float32) * masked, masked * np.float32(of_frame)
-        return _Summed(footprint, amounts, average_squares(lit, shrink), average_squares(seen, shrink))
-    if shrink == 1:
-        return _Summed(footprint, amounts, counts if footprint.straight else counts.astype(np.float32), None)
-    whole = not any(side % shrink for side in counts.shape)
-    everywhere = None if whole else average_squares(np.full(counts.shape, of_frame, np.float32), shrink)
-    return _Summed(footprint, amounts, average_squares(counts, shrink), everywhere)
+        counts, seen = average_squares(lit, shrink), average_squares(seen, shrink)
+    elif shrink > 1:
+        if any(side % shrink for side in counts.shape):
+            seen = average_squares(np.full(counts.shape, of_frame, np.float32), shrink)
+        counts = average_squares(counts, shrink)
+    if isinstance(footprint, BentFootprint):
+        return _Summed(footprint, amounts, padded(counts), None if seen is None else padded(seen))
+    if shrink == 1 and not footprint.straight:
+        counts = counts.astype(np.float32, copy=False)
+    return _Summed(footprint, amounts, counts, seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,28 +194,35 @@ class _Total:
         coverages: (P, H, W) float32, coverages from the borders of frames and from masked frames.
         steps: (P, H, W + 1) float32, row-wise differences of the coverages inside of frames; `result` adds their cumulative
             sums to the coverages.
+        rays: of all columns and rows of a `BentGrid`; None if homographies map frames to the grid.
     """
 
     first: int
     counts: FluxImage
     coverages: FluxImage
     steps: FluxImage
+    rays: Rays | None
 
     @classmethod
-    def zeros(cls, shape: tuple[int, int], number: int) -> _Total:
+    def zeros(cls, shape: tuple[int, int], number: int, rays: Rays | None) -> _Total:
         height, width = shape
         coverages, steps = (np.zeros((number, height, columns), np.float32) for columns in (width, width + 1))
-        return cls(0, np.zeros(shape, np.float32), coverages, steps)
+        return cls(0, np.zeros(shape, np.float32), coverages, steps, rays)
 
     def rows(self, rows: range) -> _Total:
         """Return a view of some of the rows."""
         part = slice(rows.start, rows.stop)
-        return _Total(rows.start, self.counts[part], self.coverages[:, part], self.steps[:, part])
+        return _Total(rows.start, self.counts[part], self.coverages[:, part], self.steps[:, part], self.rays)
 
     def add(self, summed: Sequence[_Summed]) -> None:
         """Add sums of chunks, in order."""
         for each in summed:
             if each.footprint.rows.start >= self.first + len(self.counts) or each.footprint.rows.stop <= self.first:
+                continue
+            if isinstance(each.footprint, BentFootprint):
+                assert self.rays is not None
+                image = np.asarray(each.counts, np.float32), each.seen, each.amounts
+                add_bent(*image, each.footprint, self.rays, self.first, self.counts, self.coverages)
                 continue
             to_image = each.footprint.to_image @ translation(0, self.first)
             if each.seen is None:

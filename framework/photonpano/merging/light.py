@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import inverse
+from photonpano.geometry import Canvas, inverse
 from photonpano.protocols import Source, light_of
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Response
 
@@ -17,6 +17,8 @@ _ROUNDS = 8
 """Steps that solve for the flux of bright pixels in frames of different gains. Each at least halves the error."""
 _ACCURACY = 1e-4
 """The steps end when no flux changes by more than this share."""
+_FAR = 1e4
+"""A place on a map of amplitudes that lies beyond its end, in px."""
 _SEEN = 1e-3
 """Sums of less than this many frames are rounding errors."""
 
@@ -118,18 +120,19 @@ class LightTerms:
         of_class = self.classes[span.start : span.stop] == np.array(self.present)[:, None]
         return np.asarray((of_class.astype(float) @ values.T).ravel())
 
-    def lit_frames(self, coverages: FluxImage, light: Light, onto: Homography) -> LitFrames:
+    def lit_frames(self, coverages: FluxImage, light: Light, onto: Homography | Canvas) -> LitFrames:
         """Return the frames and gains of each pixel.
 
         Args:
             coverages: (number, H, W).
             light: of the capture.
-            onto: (3, 3), pixels of the reference plane to pixels of the grid.
+            onto: (3, 3), pixels of the reference plane to pixels of the grid; or a canvas of any projection.
         """
         shape = coverages.shape[1:]
         by_class = coverages.reshape(len(self.present), -1, *shape)
         gains = by_class[:, 1].copy()
-        for index, image in enumerate(amplitudes(light, inverse(onto), (shape[0], shape[1]))):
+        canvas = onto if isinstance(onto, Canvas) else Canvas(shape[0], shape[1], onto)
+        for index, image in enumerate(amplitudes_on(light, canvas)):
             gains += image * by_class[:, 2 + index]
         return LitFrames(np.ascontiguousarray(by_class[:, 0]), np.maximum(gains, 0))
 
@@ -148,6 +151,17 @@ def amplitudes(light: Light, to_plane: Homography, shape: tuple[int, int]) -> li
         np.asarray(cv2.warpPerspective(each, light.to_map @ to_plane, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
         for each in light.maps
     ]
+
+
+def amplitudes_on(light: Light, canvas: Canvas) -> list[FluxImage]:
+    """Return the amplitudes of the lamps at the pixels of a canvas; where the maps end, those of their borders."""
+    if canvas.planar:
+        return amplitudes(light, inverse(canvas.transform), canvas.shape)
+    (p, s), (q, r) = canvas.columns(), canvas.rows()
+    to_map = light.to_map @ np.linalg.inv(canvas.plane_to_rays)
+    u, v, depth = (a * np.outer(r, p) + b * q[:, None] + c * np.outer(r, s) for a, b, c in to_map)
+    x, y = (np.clip(each / np.maximum(depth, 1e-6), -1, _FAR).astype(np.float32) for each in (u, v))
+    return [np.asarray(cv2.remap(each, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)) for each in light.maps]
 
 
 def gain_image(light: Light, span: FrameSpan, to_plane: Homography, shape: tuple[int, int]) -> FluxImage:

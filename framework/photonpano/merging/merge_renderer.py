@@ -35,6 +35,6 @@ class MergeRenderer:
         """Merge the frames of a span on a canvas: see `Renderer`."""
         chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
         with ThreadPoolExecutor(self._threads, thread_name_prefix="render") as pool:
-            photons = accumulate(source, chunks, canvas.transform, canvas.shape, advance, pool)
+            photons = accumulate(source, chunks, canvas, canvas.shape, advance, pool)
         flux, weight = photons.estimate(source.response)
         return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)
