@@ -49,6 +49,7 @@ from .pipeline.run import run as run
 from .protocols import ColouredSource as ColouredSource
 from .protocols import Exporter as Exporter
 from .protocols import FinishedPanorama as FinishedPanorama
+from .protocols import InterpolatesTurns as InterpolatesTurns
 from .protocols import Interpolator as Interpolator
 from .protocols import KeepsHypotheses as KeepsHypotheses
 from .protocols import KnowsTruth as KnowsTruth

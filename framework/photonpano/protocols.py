@@ -302,6 +302,26 @@ class Interpolator(Protocol):
         ...
 
 
+@runtime_checkable
+class InterpolatesTurns(Protocol):
+    """An interpolator that knows how a camera turns; others get the homographies of small turns instead."""
+
+    def fit_turns(
+        self, instants: FloatArray, turns: FloatArray, information: FloatArray | None
+    ) -> Callable[[FloatArray], FloatArray]:
+        """Fit small turns beyond a path that is known.
+
+        Args:
+            instants: (N,) float64, increasing, in frames; N is at least 1.
+            turns: (N, 3) rotation vectors in radians, up to about half a radian.
+            information: (N, 3, 3) inverse covariances of the turns, None if unknown.
+
+        Returns:
+            A function from (M,) instants to (M, 3) turns, defined for every instant.
+        """
+        ...
+
+
 class PanoramaView(Protocol):
     """The panorama along a motion, as frames of the camera would see it."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import sparse
@@ -12,7 +12,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_ban
 from photonpano import FloatArray
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.trajectories import ParameterTrajectory, interpolating_spline
+from photonpano_core.trajectories import ParameterTrajectory, SplinePath, interpolating_spline
 
 ORDER = 3
 """Order of the derivative that is penalised. Parabolas, which fit any three knots, are not penalised."""
@@ -57,6 +57,21 @@ class SmoothingSplineInterpolator:
             homographies = self._smoothed(instants, homographies, information)
         return ParameterTrajectory(instants, interpolating_spline(instants, parameters(homographies)), self._config.hold_frames)
 
+    def fit_turns(
+        self, instants: FloatArray, turns: FloatArray, information: FloatArray | None
+    ) -> Callable[[FloatArray], FloatArray]:
+        """Smooth the turns of a camera in the same way: see `photonpano.InterpolatesTurns`.
+
+        The information is taken at its word. Without it, all turns have equal and independent errors, whose size is estimated.
+        """
+        if len(instants) > ORDER:
+            covariances: FloatArray = np.broadcast_to(np.eye(3), (len(instants), 3, 3))
+            if information is not None:
+                covariances = np.asarray(np.linalg.inv(information))
+            noise = None if information is None else 1.0
+            turns = _smoothed_modes(instants, turns, covariances, range(3), noise)
+        return SplinePath(instants, interpolating_spline(instants, turns), self._config.hold_frames).at
+
     def _smoothed(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> FloatArray:
         """Return the smoothed (N, 3, 3) homographies of the knots."""
         covariances = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
@@ -64,20 +79,24 @@ class SmoothingSplineInterpolator:
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             covariances = _covariances(information, _TO_MODES @ derivatives)
         paths = apply(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
-        moved = _smoothed_modes(instants, paths, covariances) @ _TO_MODES
+        moved = _smoothed_modes(instants, paths, covariances, _QUIET) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
 
-def _smoothed_modes(instants: FloatArray, knots: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return a smoothing spline at its knots: (N, 8).
+def _smoothed_modes(
+    instants: FloatArray, knots: FloatArray, covariances: FloatArray, quiet: Sequence[int], noise: float | None = None
+) -> FloatArray:
+    """Return a smoothing spline at its knots: (N, K).
 
     With normal noise of the knots, and white noise as the jerk, third differences are normally distributed. The part of them
     that the jerk does not explain is noise (Reinsch 1967; de Hoog and Hutchinson 1987).
 
     Args:
         instants: (N,), more than three.
-        knots: (N, 8) modes of the corners, in px.
-        covariances: (N, 8, 8) of the knots, up to a common factor.
+        knots: (N, K) modes, such as those of the corners.
+        covariances: (N, K, K) of the knots, up to a common factor.
+        quiet: modes by which that factor is estimated.
+        noise: the factor, where it is known.
     """
     n_knots, n_modes = knots.shape
     times = instants * ((n_knots - 1) / (instants[-1] - instants[0]))
@@ -89,10 +108,10 @@ def _smoothed_modes(instants: FloatArray, knots: FloatArray, covariances: FloatA
         for mode in range(n_modes)
     ]
     every = sparse.kron(difference, sparse.eye_array(n_modes))
-    noise = sparse.bsr_array((covariances, np.arange(n_knots), np.arange(n_knots + 1)))
-    expected = every @ noise @ every.T + sparse.kron(jerk, sparse.diags_array(_most_likely_scales(modes)))
+    of_knots = sparse.bsr_array((covariances, np.arange(n_knots), np.arange(n_knots + 1)))
+    expected = every @ of_knots @ every.T + sparse.kron(jerk, sparse.diags_array(_most_likely_scales(modes, quiet, noise)))
     explained = solveh_banded(_banded(expected, (ORDER + 1) * n_modes - 1), observed.ravel())
-    return np.asarray(knots - (noise @ (every.T @ explained)).reshape(n_knots, n_modes))
+    return np.asarray(knots - (of_knots @ (every.T @ explained)).reshape(n_knots, n_modes))
 
 
 class _Mode:
@@ -124,12 +143,13 @@ class _Mode:
         return self.n_observed * np.log(noises)[:, None] + self.squares / noises[:, None] + self.determinants
 
 
-def _most_likely_scales(modes: Sequence[_Mode]) -> list[float]:
-    """Return the most likely scale of the jerk of each mode, given the most likely noise of the quiet modes."""
-    quiet = [modes[index] for index in _QUIET]
-    largest = sum(mode.squares[0] for mode in quiet) / sum(mode.n_observed for mode in quiet)
-    noises = max(largest, _TINY) * _NOISES
-    noise = noises[np.argmin(sum(mode.deviances(noises).min(axis=1) for mode in quiet))]
+def _most_likely_scales(modes: Sequence[_Mode], quiet: Sequence[int], noise: float | None) -> list[float]:
+    """Return the most likely scale of the jerk of each mode, given the noise, or else that of the quiet modes."""
+    if noise is None:
+        still = [modes[index] for index in quiet]
+        largest = sum(mode.squares[0] for mode in still) / sum(mode.n_observed for mode in still)
+        noises = max(largest, _TINY) * _NOISES
+        noise = float(noises[np.argmin(sum(mode.deviances(noises).min(axis=1) for mode in still))])
     return [mode.scales[mode.deviances(np.array([noise])).argmin()] for mode in modes]
 
 

@@ -51,8 +51,8 @@ class HeldTrajectory(ABC):
         """
 
 
-class ParameterTrajectory(HeldTrajectory):
-    """A spline of p1..p8."""
+class SplinePath(HeldTrajectory):
+    """A spline of K numbers; `at` returns these, (N, K)."""
 
     def __init__(self, instants: FloatArray, spline: BSpline, hold_frames: float | None) -> None:
         super().__init__(instants, hold_frames)
@@ -60,7 +60,14 @@ class ParameterTrajectory(HeldTrajectory):
         self._velocity = spline.derivative()
 
     def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
-        return from_parameters(self._spline(inside) + self._velocity(inside) * beyond[:, None])
+        return np.asarray(self._spline(inside) + self._velocity(inside) * beyond[:, None])
+
+
+class ParameterTrajectory(SplinePath):
+    """A spline of p1..p8."""
+
+    def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
+        return from_parameters(super()._extrapolated(inside, beyond))
 
 
 class GroupTrajectory(HeldTrajectory):

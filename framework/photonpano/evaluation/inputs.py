@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.geometry import corners, normalised, translation
+from photonpano.geometry import Camera, corners, normalised, translation
 from photonpano.reading import read_arrays, reading
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
@@ -42,6 +42,7 @@ class RunTrajectory:
         frame_shape: (height, width) of a frame.
         located: (T,), False where a frame lies outside what was located.
         std_px: (T,) expected corner error; NaN if the run did not record it.
+        camera: that turns; None if the run knows homographies only.
     """
 
     homographies: FloatArray
@@ -49,6 +50,7 @@ class RunTrajectory:
     frame_shape: tuple[int, int]
     located: BoolArray
     std_px: FloatArray
+    camera: Camera | None = None
 
 
 def load_truth(path: Path) -> Truth:
@@ -88,7 +90,8 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
     if not path.exists():
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
     required, error = ("homographies", "canvas", "frame_shape", "located"), ("std_px",)
-    names = ((*required, *error), ()) if needs_std_px else (required, error)
+    of_camera = ("camera_matrix", "distortion")
+    names = ((*required, *error), of_camera) if needs_std_px else (required, (*error, *of_camera))
     arrays = _read_archive(path, "the trajectory of a run", *names)
     homographies = _homographies(path, arrays)
     canvas, located = arrays["canvas"], arrays["located"]
@@ -101,8 +104,17 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
         raise InputError(f"{path}: located must have a flag for each of {len(homographies)} frames, got {located.shape}")
     if std_px.shape != (len(homographies),):
         raise InputError(f"{path}: std_px must have a number for each of {len(homographies)} frames, got {std_px.shape}")
+    camera = None
+    if "camera_matrix" in arrays:
+        camera = Camera(arrays["camera_matrix"].astype(np.float64), arrays["distortion"].astype(np.float64))
+        homographies = camera.homographies(camera.rotations(homographies))
     return RunTrajectory(
-        homographies, canvas.astype(np.float64), _frame_shape(path, arrays), located.astype(bool), std_px.astype(np.float64)
+        homographies,
+        canvas.astype(np.float64),
+        _frame_shape(path, arrays),
+        located.astype(bool),
+        std_px.astype(np.float64),
+        camera,
     )
 
 

@@ -1,4 +1,5 @@
 from .alignment import align_planes as align_planes
+from .alignment import align_rotations as align_rotations
 from .camera import Camera as Camera
 from .camera import camera_matrix as camera_matrix
 from .canvas import Canvas as Canvas
@@ -16,6 +17,7 @@ from .homographies import normalised as normalised
 from .homographies import parameters as parameters
 from .homographies import rescaled as rescaled
 from .homographies import rescaling as rescaling
+from .homographies import scaled_ahead as scaled_ahead
 from .homographies import step_motions as step_motions
 from .homographies import translation as translation
 from .plausibility import why_implausible as why_implausible

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from photonpano.geometry.homographies import apply, corners, from_parameters, normalised
+from photonpano.geometry.rotations import nearest_rotations
+from photonpano.geometry.steps import unit_coordinates
 from photonpano.values import FloatArray, Homography
 
 FIT_FRAMES = 300
@@ -15,7 +17,9 @@ _FAR_PX = 1e6
 """Residual of points mapped to infinity."""
 
 
-def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int, int]) -> Homography:
+def align_planes(
+    estimated: FloatArray, true: FloatArray, frame_shape: tuple[int, int], start: Homography | None = None
+) -> Homography:
     """Return the map G from the estimated reference plane to the true plane that fits both trajectories best.
 
     A trajectory is determined up to the choice of its reference plane. G minimises the sum over frames t and corners c of
@@ -31,9 +35,10 @@ def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int
         estimated: (T, 3, 3), frame pixels to pixels of the estimated reference plane.
         true: (T, 3, 3), frame pixels to pixels of the true plane.
         frame_shape: (height, width) of a frame.
+        start: (3, 3) near the result; needed where a camera turns too far for one plane, and G has another h33 there.
 
     Returns:
-        (3, 3), pixels of the estimated reference plane to pixels of the true plane, h33 = 1.
+        (3, 3), pixels of the estimated reference plane to pixels of the true plane; h33 = 1 without a start.
 
     Raises:
         ValueError: the trajectories are empty, or differ in length.
@@ -48,20 +53,32 @@ def align_planes(estimated: FloatArray, true: FloatArray, frame_shape: tuple[int
     frame = corners(frame_shape)
     from_points, to_points = apply(estimated[chosen], frame), apply(true[chosen], frame)
     to_frame = np.linalg.inv(true[chosen])
-    condition, target_condition = _conditioning(from_points), _conditioning(to_points)
-    start = _direct_linear(apply(condition, from_points), apply(target_condition, to_points))
-    left = np.linalg.inv(target_condition) @ start
+    if start is None:
+        condition, target_condition = _conditioning(from_points), _conditioning(to_points)
+        linear = _direct_linear(apply(condition, from_points), apply(target_condition, to_points))
+        left = np.linalg.inv(target_condition) @ linear
+    else:
+        condition = unit_coordinates(frame_shape)
+        left = start @ np.linalg.inv(condition)
 
     def plane(p: FloatArray) -> Homography:
         # Steps from the linear solution, in conditioned coordinates in which all eight parameters have the same scale.
         return left @ from_parameters(p) @ condition
 
     def residuals(p: FloatArray) -> FloatArray:
-        residual = apply(to_frame @ plane(p), from_points) - frame
+        if start is None:
+            residual = apply(to_frame @ plane(p), from_points) - frame
+        else:  # points of the plane may lie behind the camera, or at infinity
+            residual = apply(to_frame @ plane(p) @ estimated[chosen], frame) - frame
         return np.nan_to_num(residual, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
 
     fit = least_squares(residuals, np.zeros(8), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    return normalised(plane(fit.x))
+    return normalised(plane(fit.x)) if start is None else plane(fit.x)
+
+
+def align_rotations(estimated: FloatArray, true: FloatArray) -> FloatArray:
+    """Return the rotation G that brings G estimated_t nearest to true_t: (3, 3), for (T, 3, 3) rotations (Kabsch 1976)."""
+    return nearest_rotations((true @ np.swapaxes(estimated, -1, -2)).mean(axis=0))
 
 
 def _conditioning(points: FloatArray) -> Homography:

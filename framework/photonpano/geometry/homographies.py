@@ -28,9 +28,22 @@ def normalised(matrices: ArrayLike) -> Homography:
     return np.asarray(matrices / h33[..., None, None])
 
 
+def scaled_ahead(matrices: ArrayLike) -> Homography:
+    """Scale (..., 3, 3) matrices so that h33 = 1 where it is positive; others stay: their sign tells what lies behind a camera.
+
+    Raises:
+        ValueError: a matrix is not finite.
+    """
+    matrices = np.asarray(matrices, dtype=np.float64)
+    if not np.isfinite(matrices).all():
+        raise ValueError("a homography must be finite")
+    h33 = matrices[..., 2, 2]
+    return np.asarray(matrices / np.where(h33 > 0, h33, 1.0)[..., None, None])
+
+
 def inverse(homographies: Homography) -> Homography:
-    """Return the inverse maps, (..., 3, 3) with h33 = 1."""
-    return normalised(np.linalg.inv(homographies))
+    """Return the inverse maps, (..., 3, 3) with h33 = 1 where that can be: see `scaled_ahead`."""
+    return scaled_ahead(np.linalg.inv(homographies))
 
 
 def translation(x: float, y: float) -> Homography:

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from photonpano.geometry import (
-    apply,
-    corners,
-    from_parameters,
-    generators,
-    inverse,
-    normalised,
-    parameters,
-    slopes,
-    unit_coordinates,
-)
+from photonpano.geometry import apply, corners, from_parameters, generators, inverse, slopes
 from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
@@ -41,12 +34,32 @@ _DAMPING, _TINY = 1e-10, 1e-200
 SAMPLES = 64
 """Solutions drawn to estimate the expected error of each node, to a few per cent."""
 
+StateT = TypeVar("StateT")
 
-class Adjustment:
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assessment:
+    """How well a graph determines its unknowns.
+
+    Attributes:
+        information: (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its
+            homography, or of a rotation vector in its own frame. NaN for a single node.
+        std_px: (N,) expected error of the corners of each node, after the best alignment of the planes.
+        std_shared: (s,) expected errors of the unknowns that all nodes share.
+    """
+
+    information: FloatArray
+    std_px: FloatArray
+    std_shared: FloatArray
+
+
+class Adjustment(ABC, Generic[StateT]):
     """The least-squares problem of a connected graph.
 
-    The unknowns of a node are p1..p8 of a small homography of its own frame, in coordinates of about unit size, so that their
-    meaning does not depend on where the frame lies.
+    Each node has k unknowns, which move it a little in its own frame; all nodes may share some more. Unknowns have about unit
+    size: a change by one moves the ends of a frame by about half its side, wherever the frame lies.
+
+    Subclasses say what a state is, such as the homographies of the nodes, and how it changes.
     """
 
     def __init__(
@@ -56,6 +69,7 @@ class Adjustment:
         observed: FloatArray,
         motions: Sequence[Located],
         frame_shape: tuple[int, int],
+        n_shared: int = 0,
     ) -> None:
         """Set up the problem.
 
@@ -65,120 +79,163 @@ class Adjustment:
             observed: (E, 3, 3) homographies of the edges, pixels of the moving frame to pixels of the fixed one.
             motions: the motions of the edges, with their information.
             frame_shape: (height, width) of a frame.
+            n_shared: unknowns that all nodes share.
         """
         self._moving, self._fixed = pairs.T
         self._anchor = anchor
         self._n_nodes = int(pairs.max()) + 1
+        self._n_shared = n_shared
         self._corners = corners(frame_shape)
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
         self._targets = apply(observed, self._corners)
         self._whitening = _whitening(motions, self._rows)
         self._half = max(frame_shape) / 2
-        self._unit = unit_coordinates(frame_shape)
-        self._generators = generators(frame_shape)
+        self._frame_shape = frame_shape
 
-    def minimise(self, homographies: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return the homographies of least cost, (N, 3, 3), and the norm of the whitened residual of each edge, (E,).
+    @abstractmethod
+    def homographies(self, state: StateT) -> FloatArray:
+        """Return the maps from pixels of each node's frame to those of the anchor's: (N, 3, 3)."""
+
+    @abstractmethod
+    def changed(self, state: StateT, nodes: FloatArray, shared: FloatArray) -> StateT:
+        """Return the state after a step: (N, k) changes of the nodes, and (s,) of what they share."""
+
+    def anchored(self, state: StateT) -> StateT:
+        """Return the state without rounding errors of the anchor."""
+        return state
+
+    @abstractmethod
+    def generators(self, state: StateT) -> FloatArray:
+        """Return the derivatives of the small motion of a frame by the unknowns of its node: (k, 3, 3)."""
+
+    @abstractmethod
+    def information(self, state: StateT, blocks: FloatArray) -> FloatArray:
+        """Convert (N, k, k) information on the unknowns of each node to what `Assessment` holds."""
+
+    def shared_slopes(self, state: StateT) -> FloatArray:
+        """Return the derivatives of the corners that each edge maps by the shared unknowns: (E, 8, s)."""
+        del state
+        return np.zeros((len(self._moving), 8, 0))
+
+    def shared_errors(self, state: StateT) -> FloatArray:
+        """Return the derivatives of the corners of each node's frame by the shared unknowns: (N, 8, s)."""
+        del state
+        return np.zeros((self._n_nodes, 8, 0))
+
+    def prior(self, state: StateT) -> tuple[FloatArray, FloatArray]:
+        """Return residuals of unit variance of what is known of the shared unknowns, (s,), and their derivatives, (s, s)."""
+        del state
+        return np.zeros(self._n_shared), np.zeros((self._n_shared, self._n_shared))
+
+    def relative(self, state: StateT) -> FloatArray:
+        """Return the homography that a state expects of each edge: (E, 3, 3)."""
+        homographies = self.homographies(state)
+        return np.linalg.solve(homographies[self._fixed], homographies[self._moving])
+
+    def minimise(self, state: StateT, kept: BoolArray) -> tuple[StateT, FloatArray]:
+        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,).
 
         Args:
-            homographies: (N, 3, 3) where to start.
+            state: where to start.
             kept: (E,) False for outliers.
         """
         # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
         weights = kept.astype(np.float64)
         for _ in range(MAX_ITERATIONS):
-            jacobians, residuals = self._linearised(homographies, weights)
-            free = self._free
-            step = np.zeros(8 * self._n_nodes)
+            jacobians, residuals = self._linearised(state, weights)
+            free = self._free(state)
+            step = np.zeros(len(free))
             step[free] = -_solved((jacobians.T @ jacobians)[free][:, free], (jacobians.T @ residuals)[free])
-            stepped = self._stepped(homographies, step, weights, float(residuals @ residuals))
+            stepped = self._stepped(state, step, weights, float(residuals @ residuals))
             if stepped is None:
                 break
-            homographies, norms = stepped
+            state, norms = stepped
             weights = self._robust_weights(norms, kept)
             if np.abs(step).max() * self._half < CONVERGED_PX:
                 break
-        # The anchor is fixed; this removes rounding errors.
-        homographies[self._anchor] = np.eye(3)
-        return homographies, self._norms(homographies)
+        state = self.anchored(state)
+        return state, self._norms(state)
 
     def inliers(self, norms: FloatArray) -> BoolArray:
         """Return which edges are no outliers, from the norms of their whitened residuals: (E,)."""
         return np.asarray(norms <= OUTLIER * self._residual_scale(norms, np.ones(len(norms), dtype=bool)))
 
-    def residuals_px(self, homographies: FloatArray) -> FloatArray:
+    def residuals_px(self, state: StateT) -> FloatArray:
         """Return the root mean square residual at the corners, for each edge: (E,) in px."""
-        return np.asarray(np.sqrt(np.mean(np.sum(self._residuals(homographies) ** 2, axis=-1), axis=-1)))
+        return np.asarray(np.sqrt(np.mean(np.sum(self._residuals(state) ** 2, axis=-1), axis=-1)))
 
-    def assess(self, homographies: FloatArray, norms: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def cost(self, norms: FloatArray, kept: BoolArray) -> tuple[float, int]:
+        """Return the sum of the squared residuals of unit variance of the edges that are kept, and its degrees of freedom."""
+        return float(8 * (norms[kept] ** 2).sum()), 8 * int(kept.sum()) - self._n_node * (self._n_nodes - 1) - self._n_shared
+
+    def assess(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Assessment:
         """Return the information on each node while the others are held, and the expected error of its corners.
 
         The error is that of solutions drawn from the covariance, each aligned with the best one as an evaluation aligns planes.
         If residuals exceed what the information of the edges predicts, the covariance is scaled up accordingly.
-
-        Returns:
-            (N, 8, 8) inverse covariances of p1..p8 of the homographies; (N,) in px.
         """
         misfit = self._residual_scale(norms, kept) / MEDIAN_NORM
-        jacobians, _ = self._linearised(homographies, self._robust_weights(norms, kept) / misfit**2)
-        normal, free = jacobians.T @ jacobians, self._free
-        nodes = np.arange(self._n_nodes)
-        blocks = np.stack([normal[8 * node : 8 * node + 8, 8 * node : 8 * node + 8].toarray() for node in nodes])
+        jacobians, _ = self._linearised(state, self._robust_weights(norms, kept) / misfit**2)
+        normal, free = jacobians.T @ jacobians, self._free(state)
+        k = self._n_node
+        blocks = np.stack([normal[k * node : k * node + k, k * node : k * node + k].toarray() for node in range(self._n_nodes)])
         draws = np.random.default_rng(0).normal(size=(jacobians.shape[0], SAMPLES))
-        changes = np.zeros((8 * self._n_nodes, SAMPLES))
+        changes = np.zeros((len(free), SAMPLES))
         changes[free] = _solved(normal[free][:, free], (jacobians.T @ draws)[free], draws=True)
-        return self._in_parameters(homographies, blocks), self._corner_std_px(homographies, changes)
+        std_shared = np.sqrt((changes[k * self._n_nodes :] ** 2).mean(axis=1))
+        return Assessment(self.information(state, blocks), self._corner_std_px(state, changes), std_shared)
 
-    def _stepped(
-        self, homographies: FloatArray, step: FloatArray, weights: FloatArray, cost: float
-    ) -> tuple[FloatArray, FloatArray] | None:
-        """Return the homographies after a step, halved until the cost falls, and the norms there; None if it never does.
+    @property
+    @abstractmethod
+    def _n_node(self) -> int:
+        """Unknowns of a node."""
+
+    def _stepped(self, state: StateT, step: FloatArray, weights: FloatArray, cost: float) -> tuple[StateT, FloatArray] | None:
+        """Return the state after a step, halved until the cost falls, and the norms there; None if it never does.
 
         A chain of many frames is far from linear: the perspective of the first bends the path of all others.
         """
+        n_nodes = self._n_node * self._n_nodes
         for _ in range(MAX_HALVINGS):
             # Too large a step may leave homographies that cannot be inverted.
             with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
-                change = np.linalg.inv(self._unit) @ from_parameters(step.reshape(-1, 8)) @ self._unit
-                changed = normalised(homographies @ change)
+                changed = self.changed(state, step[:n_nodes].reshape(self._n_nodes, -1), step[n_nodes:])
                 norms = self._norms(changed)
-                if 8 * weights @ norms**2 <= cost * (1 + NO_WORSE):
+                if 8 * weights @ norms**2 + float((self.prior(changed)[0] ** 2).sum()) <= cost * (1 + NO_WORSE):
                     return changed, norms
             step = step / 2
         return None
 
-    @property
-    def _free(self) -> BoolArray:
-        """The unknowns of all nodes but the anchor: (8 N,)."""
-        return np.repeat(np.arange(self._n_nodes) != self._anchor, 8)
+    def _free(self, state: StateT) -> BoolArray:
+        """The unknowns of all nodes but the anchor, and those that are shared: (k N + s,)."""
+        del state
+        nodes = np.repeat(np.arange(self._n_nodes) != self._anchor, self._n_node)
+        return np.concatenate([nodes, np.ones(self._n_shared, dtype=bool)])
 
-    def _corner_std_px(self, homographies: FloatArray, changes: FloatArray) -> FloatArray:
-        """Return the root mean square displacement of corners by (8 N, S) changes, after the best alignment of planes: (N,)."""
+    def _corner_std_px(self, state: StateT, changes: FloatArray) -> FloatArray:
+        """Return the rms displacement of corners by (k N + s, S) changes, after the best alignment of planes: (N,)."""
+        homographies, k = self.homographies(state), self._n_node
         here = np.broadcast_to(self._rows, (self._n_nodes, 3, 4))
-        to_corners = slopes(here, np.broadcast_to(self._generators @ self._rows, (self._n_nodes, 8, 3, 4)))
+        to_corners = slopes(here, np.broadcast_to(self.generators(state) @ self._rows, (self._n_nodes, k, 3, 4)))
         # Derivatives of the corners of each frame with respect to a change of the plane.
-        by_plane = inverse(homographies)[:, None] @ self._generators @ homographies[:, None] @ self._rows
+        of_planes = generators(self._frame_shape)
+        by_plane = inverse(homographies)[:, None] @ of_planes @ homographies[:, None] @ self._rows
         of_plane = slopes(here, by_plane).reshape(-1, 8)
-        errors = (to_corners @ changes.reshape(self._n_nodes, 8, -1)).reshape(len(of_plane), -1)
+        moved = to_corners @ changes[: k * self._n_nodes].reshape(self._n_nodes, k, -1)
+        if self._n_shared:
+            moved = moved + self.shared_errors(state) @ changes[k * self._n_nodes :]
+        errors = moved.reshape(len(of_plane), -1)
         scale = np.linalg.norm(of_plane, axis=0)
         best = np.linalg.lstsq(of_plane / scale, errors, rcond=None)[0]
         remaining = errors - of_plane / scale @ best
         return np.asarray(np.sqrt((remaining**2).reshape(self._n_nodes, -1).sum(axis=1) / (4 * remaining.shape[1])))
 
-    def _in_parameters(self, homographies: FloatArray, blocks: FloatArray) -> FloatArray:
-        """Convert (N, 8, 8) information on changes of nodes to that on p1..p8 of their homographies."""
-        changed = homographies[:, None] @ self._generators
-        slopes = changed - homographies[:, None] * changed[..., 2:, 2:]
-        to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
-        to_change = np.linalg.inv(to_parameters)
-        return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)
-
     def _residual_scale(self, norms: FloatArray, kept: BoolArray) -> float:
         """Return the robust scale of the whitened residuals: at least that of unit variance, which the information predicts."""
-        # Each node absorbs the residuals of one edge; the redundant edges determine the scale. The median alone would be too
+        # Each node absorbs some of the residuals; the redundant ones determine the scale. The median alone would be too
         # small where robust weights make half of the edges fit exactly.
         n_edges = int(kept.sum())
-        redundancy = n_edges - self._n_nodes + 1
+        redundancy = n_edges - (self._n_node * (self._n_nodes - 1) + self._n_shared) / 8
         scale = float(np.median(norms[kept])) * float(np.sqrt(n_edges / redundancy)) if redundancy > 0 else 0.0
         return max(scale, MEDIAN_NORM)
 
@@ -187,32 +244,37 @@ class Adjustment:
         scale = self._residual_scale(norms, kept) * CAUCHY
         return np.asarray(np.where(kept, 1 / (1 + (norms / scale) ** 2), 0.0))
 
-    def _relative(self, homographies: FloatArray) -> FloatArray:
-        return np.linalg.solve(homographies[self._fixed], homographies[self._moving])
+    def _residuals(self, state: StateT) -> FloatArray:
+        return apply(self.relative(state), self._corners) - self._targets
 
-    def _residuals(self, homographies: FloatArray) -> FloatArray:
-        return apply(self._relative(homographies), self._corners) - self._targets
-
-    def _norms(self, homographies: FloatArray) -> FloatArray:
-        whitened = np.einsum("eij,ej->ei", self._whitening, self._residuals(homographies).reshape(-1, 8))
+    def _norms(self, state: StateT) -> FloatArray:
+        whitened = np.einsum("eij,ej->ei", self._whitening, self._residuals(state).reshape(-1, 8))
         return np.asarray(np.linalg.norm(whitened, axis=1) / np.sqrt(8))
 
-    def _linearised(self, homographies: FloatArray, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
-        """Return the weighted derivatives of the residuals, (8 E, 8 N), and the weighted residuals, (8 E,)."""
-        relative = self._relative(homographies)
+    def _linearised(self, state: StateT, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
+        """Return the weighted derivatives of the residuals, (8 E + s, k N + s), and the weighted residuals, (8 E + s,)."""
+        relative, moves, k = self.relative(state), self.generators(state), self._n_node
         mapped = relative @ self._rows
-        d_moving = relative[:, None] @ (self._generators @ self._rows)
-        d_fixed = -self._generators @ mapped[:, None]
+        d_moving = relative[:, None] @ (moves @ self._rows)
+        d_fixed = -moves @ mapped[:, None]
         root = np.sqrt(weights)[:, None, None] * self._whitening
         n_edges = len(weights)
-        # Each residual depends on the eight unknowns of both nodes of its edge alone.
+        # Each residual depends on the unknowns of both nodes of its edge alone, and on the shared ones.
         entries = np.concatenate([root @ slopes(mapped, d) for d in (d_moving, d_fixed)], axis=2)
-        unknowns = (8 * np.stack([self._moving, self._fixed], axis=1)[..., None] + np.arange(8)).reshape(n_edges, 1, 16)
+        unknowns = (k * np.stack([self._moving, self._fixed], axis=1)[..., None] + np.arange(k)).reshape(n_edges, 1, 2 * k)
         columns = np.broadcast_to(unknowns, entries.shape).astype(np.int32)
-        starts = np.arange(0, entries.size + 1, 16, dtype=np.int32)
-        residuals = np.einsum("eij,ej->ei", root, self._residuals(homographies).reshape(-1, 8))
-        shape = 8 * n_edges, 8 * self._n_nodes
-        return sparse.csr_array((entries.ravel(), columns.ravel(), starts), shape=shape), residuals.ravel()
+        starts = np.arange(0, entries.size + 1, 2 * k, dtype=np.int32)
+        residuals = np.einsum("eij,ej->ei", root, self._residuals(state).reshape(-1, 8))
+        shape = 8 * n_edges, k * self._n_nodes
+        jacobians = sparse.csr_array((entries.ravel(), columns.ravel(), starts), shape=shape)
+        if not self._n_shared:
+            return jacobians, residuals.ravel()
+        known, of_known = self.prior(state)
+        of_shared = sparse.csr_array((root @ self.shared_slopes(state)).reshape(8 * n_edges, -1))
+        below = sparse.csr_array((len(known), shape[1]))
+        rows = sparse.vstack([sparse.hstack([jacobians, of_shared]), sparse.hstack([below, sparse.csr_array(of_known)])])
+        jacobians = sparse.csr_array(rows)
+        return jacobians, np.concatenate([residuals.ravel(), known])
 
 
 def _solved(normal: sparse.csr_array, right: FloatArray, draws: bool = False) -> FloatArray:

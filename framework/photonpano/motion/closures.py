@@ -139,6 +139,9 @@ def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int
     # Centres of cells: points on the border would leave the field of view at the least motion.
     x, y = (low[axis] + (high[axis] - low[axis]) * (np.arange(_GRID) + 0.5) / _GRID for axis in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    seen = apply(inverse(fixed) @ moving, points)
+    between = inverse(fixed) @ moving
+    seen = apply(between, points)
+    ahead = points @ between[:, 2, :2, None] + between[:, 2:, 2, None] > 0
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.all((seen >= low) & (seen <= high), axis=-1).mean(axis=-1))
+        inside = np.all((seen >= low) & (seen <= high), axis=-1) & ahead[..., 0]
+    return np.asarray(inside.mean(axis=-1))

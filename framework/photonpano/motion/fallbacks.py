@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.graph import components, solve
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.values import Edge, FloatArray, Located, NotLocated
 
 _CONTRADICTION = 0.05
@@ -15,7 +16,12 @@ frame."""
 
 
 def checked_fallbacks(
-    edges: Sequence[Edge], first_locator: str, n_groups: int, frame_shape: tuple[int, int], start: FloatArray | None
+    edges: Sequence[Edge],
+    first_locator: str,
+    n_groups: int,
+    frame_shape: tuple[int, int],
+    start: FloatArray | None,
+    model: MotionModel = HOMOGRAPHIES,
 ) -> tuple[Edge, ...]:
     """Return the pairs; those of fallback locators are not located that contradict what the first locator found between them.
 
@@ -28,6 +34,7 @@ def checked_fallbacks(
         n_groups: number of exposures.
         frame_shape: (height, width) of a frame.
         start: (N, 3, 3) homographies by the motion known so far; None at the first level.
+        model: what the motion may be.
     """
     firsts = [edge for edge in edges if edge.locator == first_locator]
     others = [edge for edge in edges if isinstance(edge.motion, Located) and edge.locator != first_locator]
@@ -39,7 +46,7 @@ def checked_fallbacks(
     for part in {int(parts[moving]) for moving, _ in tied}:
         of_part = [edge for edge in firsts if parts[edge.moving] == part]
         anchor = of_part[len(of_part) // 2].moving
-        homographies = solve(n_groups, of_part, anchor, frame_shape, start).homographies
+        homographies = solve(n_groups, of_part, anchor, frame_shape, start, model).homographies
         for edge in others:
             if (edge.moving, edge.fixed) in tied and parts[edge.moving] == part and isinstance(edge.motion, Located):
                 between = inverse(homographies[edge.fixed]) @ homographies[edge.moving]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry import FrameTrajectory
+from photonpano.geometry import Camera, FrameTrajectory, nearest_rotations
 from photonpano.motion.loop import LevelResult
+from photonpano.motion.turning import TurningTrajectory
 from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, FloatArray, FrameSpan, StreamInfo
 
@@ -28,6 +29,7 @@ class FrameMotion:
         std_px: (T,) expected corner error, infinite outside `span`.
         reference: the frame whose homography is the identity.
         frame_shape: (height, width) of a frame.
+        camera: that turns; None where homographies are any. Theirs are K R K^-1 of determinant 1 otherwise.
     """
 
     trajectory: Trajectory
@@ -37,6 +39,12 @@ class FrameMotion:
     std_px: FloatArray
     reference: int
     frame_shape: tuple[int, int]
+    camera: Camera | None = None
+
+    @property
+    def rotations(self) -> FloatArray | None:
+        """Rotations from the camera at each frame to that at the reference frame, (T, 3, 3); None without a camera."""
+        return None if self.camera is None else nearest_rotations(self.camera.rotations(self.homographies))
 
 
 def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, reference: int) -> FrameMotion:
@@ -53,4 +61,5 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     std_px = np.where(located, last.uncertainty.at(frames), np.inf)
     homographies = last.trajectory.at(frames)
     trajectory = FrameTrajectory(homographies)
-    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape)
+    camera = last.trajectory.camera if isinstance(last.trajectory, TurningTrajectory) else None
+    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera)

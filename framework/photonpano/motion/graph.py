@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order
 
-from photonpano.geometry import inverse, normalised
-from photonpano.motion.adjustment import Adjustment
+from photonpano.geometry import inverse, nearest_rotations, normalised, scaled_ahead
+from photonpano.motion.adjustment import Adjustment, Assessment
+from photonpano.motion.homography_graph import HomographyAdjustment
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
+from photonpano.motion.rotation_graph import RotationAdjustment, Turns
 from photonpano.values import BoolArray, Edge, FloatArray, Located
+
+_EXPLAINED = 20.0
+"""A camera only turns if five unknowns more for each exposure lower the squared residuals by less than this for each of them,
+in units of those that remain. Noise alone lowers them by 1, and noise that pairs have in common by some more."""
 
 
 class GraphOptions(Protocol):
@@ -41,23 +48,55 @@ class GraphSolution:
     """The homographies of the exposures.
 
     Convention:
-        Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity.
+        Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity. Those of a
+        camera that only turns have determinant 1, all others h33 = 1.
 
     Attributes:
         homographies: (N, 3, 3), NaN for nodes that are not tied to the anchor.
         located: (N,) True for nodes that are tied to the anchor.
         outliers: positions, in the list that was solved, of edges that were dropped because they contradict the others.
         residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
-        assess: returns, for the L located nodes, the inverse covariances of p1..p8 while all other nodes are held, (L, 8, 8),
-            and the expected error of the corners after the best alignment of the planes, (L,) in px. NaN for a single node.
-            It takes about as long as to solve the graph.
+        assess: returns how well the L located nodes are determined. It takes about as long as to solve the graph.
+        turns: the rotations of the L located nodes, and the camera; None for homographies.
+        evidence: how well a camera that only turns explains the edges; None where one of the two models was not fitted.
     """
 
     homographies: FloatArray
     located: BoolArray
     outliers: tuple[int, ...]
     residual_px: float
-    assess: Callable[[], tuple[FloatArray, FloatArray]]
+    assess: Callable[[], Assessment]
+    turns: Turns | None = None
+    evidence: Evidence | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """How well a camera that only turns explains the pairs, compared with any homographies.
+
+    Attributes:
+        rotation: mean square of the whitened residuals of rotations, 1 where they are photon noise.
+        homography: that of homographies.
+        gain: by how much each additional unknown of the homographies lowers the sum of the squares, in units of `homography`.
+    """
+
+    rotation: float
+    homography: float
+    gain: float
+
+    @classmethod
+    def of(cls, free: _Fit, turned: _Fit) -> Evidence:
+        """Compare two fits to the same edges."""
+        kept = free.kept & turned.kept
+        (of_free, left_free), (of_turned, left_turned) = (fit.adjustment.cost(fit.norms, kept) for fit in (free, turned))
+        scale = max(of_free / max(left_free, 1), 1.0)
+        gain = (of_turned - of_free) / max(left_turned - left_free, 1) / scale
+        return cls(of_turned / max(left_turned, 1), of_free / max(left_free, 1), gain)
+
+    @property
+    def turns_only(self) -> bool:
+        """Whether homographies explain the pairs no better than rotations."""
+        return self.gain < _EXPLAINED
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
@@ -68,9 +107,14 @@ def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
 
 
 def solve(
-    n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int], start: FloatArray | None = None
+    n_nodes: int,
+    edges: Sequence[Edge],
+    anchor: int,
+    frame_shape: tuple[int, int],
+    start: FloatArray | None = None,
+    model: MotionModel = HOMOGRAPHIES,
 ) -> GraphSolution:
-    """Solve the graph: find the homographies with the least residuals of all located edges.
+    """Solve the graph: find the motions with the least residuals of all located edges.
 
     Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
     with Cauchy weights, from a spanning tree of edges to the nearest exposures unless a start is given. Outliers are dropped,
@@ -82,57 +126,157 @@ def solve(
         anchor: the node whose homography is the identity.
         frame_shape: (height, width) of a frame.
         start: (N, 3, 3) homographies to any plane, such as those of a solution without some of the edges.
+        model: what the motion of a node may be.
     """
-    located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
-    pairs = _pairs(edges)
-    order, parents = breadth_first_order(adjacency(n_nodes, pairs), anchor, directed=False)
-    located = np.zeros(n_nodes, dtype=bool)
-    located[order] = True
-    tied = [index for index, (moving, _) in enumerate(pairs) if located[moving]]
-    positions = np.array([located_edges[index][0] for index in tied], dtype=int)
-    motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
-    homographies = np.full((n_nodes, 3, 3), np.nan)
-    homographies[anchor] = np.eye(3)
-    if not tied:
-        return GraphSolution(homographies, located, (), 0.0, lambda: (np.full((1, 8, 8), np.nan), np.full(1, np.nan)))
-    pairs = pairs[tied]
-    observed = np.array([motion.homography for motion in motions])
-    if start is None:
-        _compose_tree(homographies, order[1:], parents, pairs, observed)
-    else:
-        homographies[located] = normalised(inverse(start[anchor]) @ start[located])
+    tied = _Tied.of(n_nodes, edges, anchor, frame_shape)
+    if not len(tied.motions):
+        return tied.alone(model)
+    if model.kind == "homography":
+        return tied.solution(_homographies(tied, start))
+    turned = _turns(tied, start, model)
+    try:
+        with np.errstate(all="ignore"):
+            free = _homographies(tied, start)
+        evidence = Evidence.of(free, turned)
+    except (ValueError, np.linalg.LinAlgError):  # no plane holds all frames
+        return tied.solution(turned)
+    return tied.solution(turned if evidence.turns_only or model.kind == "rotation" else free, evidence)
 
-    compact = np.cumsum(located) - 1
-    adjustment = Adjustment(compact[pairs], int(compact[anchor]), observed, motions, frame_shape)
-    kept = np.ones(len(tied), dtype=bool)
-    found, norms = adjustment.minimise(homographies[located], kept)
-    inliers = adjustment.inliers(norms)
-    if not inliers.all() and not component_labels(len(order), compact[pairs][inliers]).any():
-        kept = inliers
-        found, norms = adjustment.minimise(found, kept)
-    homographies[located] = found
-    residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[kept] ** 2)))
-    outliers = tuple(int(position) for position in positions[~kept])
-    return GraphSolution(homographies, located, outliers, residual_px, partial(adjustment.assess, found, norms, kept))
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """A solution of the graph.
+
+    Attributes:
+        adjustment: the problem.
+        state: of least cost.
+        norms: (E,) of the whitened residuals.
+        kept: (E,) False for outliers.
+    """
+
+    adjustment: Adjustment[Any]
+    state: Any
+    norms: FloatArray
+    kept: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tied:
+    """The part of a graph that is tied to its anchor.
+
+    Attributes:
+        located: (N,) which nodes.
+        order: these nodes, the anchor first, each after its parent.
+        parents: (N,) of the nodes.
+        positions: (E,) of the located edges between them, in the list that is solved.
+        pairs: (E, 2) their nodes.
+        motions: their motions.
+        frame_shape: (height, width) of a frame.
+    """
+
+    located: BoolArray
+    order: NDArray[np.integer]
+    parents: NDArray[np.integer]
+    positions: NDArray[np.integer]
+    pairs: NDArray[np.integer]
+    motions: Sequence[Located]
+    frame_shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:
+        """Find the edges that are tied to the anchor."""
+        located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
+        pairs = _pairs(edges)
+        order, parents = breadth_first_order(adjacency(n_nodes, pairs), anchor, directed=False)
+        located = np.zeros(n_nodes, dtype=bool)
+        located[order] = True
+        tied = [index for index, (moving, _) in enumerate(pairs) if located[moving]]
+        positions = np.array([located_edges[index][0] for index in tied], dtype=int)
+        motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
+        return cls(located, order, parents, positions, pairs[tied], motions, frame_shape)
+
+    @property
+    def anchor(self) -> int:
+        """The node that does not move."""
+        return int(self.order[0])
+
+    @property
+    def observed(self) -> FloatArray:
+        """The homographies of the edges: (E, 3, 3)."""
+        return np.array([motion.homography for motion in self.motions])
+
+    @property
+    def compact_pairs(self) -> NDArray[np.integer]:
+        """The nodes of the edges, numbered without those that are not tied: (E, 2)."""
+        return np.asarray((np.cumsum(self.located) - 1)[self.pairs])
+
+    def problem(self) -> tuple[NDArray[np.integer], int, FloatArray, Sequence[Located], tuple[int, int]]:
+        """Return the arguments of an `Adjustment`."""
+        return self.compact_pairs, int(self.located[: self.anchor].sum()), self.observed, self.motions, self.frame_shape
+
+    def composed(self, observed: FloatArray) -> FloatArray:
+        """Return the maps of the tied nodes to the anchor, each composed from its parent's along one edge: (L, 3, 3)."""
+        maps = np.full((len(self.located), 3, 3), np.nan)
+        maps[self.anchor] = np.eye(3)
+        edge_of = {(int(moving), int(fixed)): index for index, (moving, fixed) in enumerate(self.pairs)}
+        for node in map(int, self.order[1:]):
+            parent = int(self.parents[node])
+            forward = edge_of.get((node, parent))
+            step = observed[forward] if forward is not None else inverse(observed[edge_of[parent, node]])
+            maps[node] = scaled_ahead(maps[parent] @ step)
+        return maps[self.located]
+
+    def fit(self, adjustment: Adjustment[Any], state: Any) -> _Fit:
+        """Solve from a start; drop outliers, unless the graph would fall apart, and solve again."""
+        kept = np.ones(len(self.motions), dtype=bool)
+        found, norms = adjustment.minimise(state, kept)
+        inliers = adjustment.inliers(norms)
+        if not inliers.all() and not component_labels(len(self.order), self.compact_pairs[inliers]).any():
+            kept = inliers
+            found, norms = adjustment.minimise(found, kept)
+        return _Fit(adjustment, found, norms, kept)
+
+    def solution(self, fit: _Fit, evidence: Evidence | None = None) -> GraphSolution:
+        """Return a fit as the solution of the graph."""
+        adjustment, found = fit.adjustment, fit.state
+        homographies = np.full((len(self.located), 3, 3), np.nan)
+        homographies[self.located] = adjustment.homographies(found)
+        residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2)))
+        outliers = tuple(int(position) for position in self.positions[~fit.kept])
+        assess = partial(adjustment.assess, found, fit.norms, fit.kept)
+        turns = found if isinstance(found, Turns) else None
+        return GraphSolution(homographies, self.located, outliers, residual_px, assess, turns, evidence)
+
+    def alone(self, model: MotionModel) -> GraphSolution:
+        """Return the solution of a single node."""
+        homographies = np.full((len(self.located), 3, 3), np.nan)
+        homographies[self.anchor] = np.eye(3)
+        turns = None if model.kind == "homography" else Turns(np.eye(3)[None], model.camera(self.frame_shape))
+        nothing = Assessment(np.full((1, 8, 8), np.nan), np.full(1, np.nan), np.zeros(0))
+        return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, turns)
+
+
+def _homographies(tied: _Tied, start: FloatArray | None) -> _Fit:
+    state = tied.composed(tied.observed)
+    if start is not None:
+        state = normalised(inverse(start[tied.anchor]) @ start[tied.located])
+    return tied.fit(HomographyAdjustment(*tied.problem()), state)
+
+
+def _turns(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
+    problem = tied.problem()
+    adjustment = RotationAdjustment(*problem, find_focal=model.focal_px is None)
+    camera = model.camera(tied.frame_shape)
+    if model.focal_px is None:
+        camera = adjustment.likeliest_camera(camera)
+    if start is None:
+        turns = tied.composed(nearest_rotations(camera.rotations(tied.observed)))
+    else:
+        turns = camera.rotations(inverse(start[tied.anchor]) @ start[tied.located])
+    return tied.fit(adjustment, Turns(nearest_rotations(turns), camera))
 
 
 def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
     """Return the (moving, fixed) of the located edges: (E, 2)."""
     located = [(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]
     return np.array(located, dtype=int).reshape(-1, 2)
-
-
-def _compose_tree(
-    homographies: FloatArray,
-    order: NDArray[np.integer],
-    parents: NDArray[np.integer],
-    pairs: NDArray[np.integer],
-    observed: FloatArray,
-) -> None:
-    """Fill in the homographies of the nodes of `order`, each from its parent along one edge."""
-    edge_of = {(int(moving), int(fixed)): index for index, (moving, fixed) in enumerate(pairs)}
-    for node in map(int, order):
-        parent = int(parents[node])
-        forward = edge_of.get((node, parent))
-        step = observed[forward] if forward is not None else inverse(observed[edge_of[parent, node]])
-        homographies[node] = normalised(homographies[parent] @ step)

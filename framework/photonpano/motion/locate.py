@@ -16,6 +16,7 @@ from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.fallbacks import checked_fallbacks
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
 from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.start import starting_motion
@@ -32,10 +33,11 @@ class LocatedLevel:
         edges: every pair that was tried, with its motion or the reason why there is none.
         closures: those of them, at the end, that are candidates for loop closures.
         solution: one homography for each exposure.
-        information: (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held; None for a
-            single exposure.
+        information: (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held, or (N, 3, 3)
+            of its rotation vector for a camera that only turns; None for a single exposure.
         std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
         frame_shape: (height, width) of a frame.
+        std_shared: expected errors of the logarithm of the focal length, if that was found, of a camera that turns.
         ambiguity: pairs that fit the scene at more than one place; None where there are none.
     """
 
@@ -46,6 +48,7 @@ class LocatedLevel:
     information: FloatArray | None
     std_px: FloatArray
     frame_shape: tuple[int, int]
+    std_shared: FloatArray
     ambiguity: Ambiguity | None = None
 
     @property
@@ -75,7 +78,9 @@ class LocatedLevel:
         return tuple(edge for edge in self.edges if isinstance(edge.motion, NotLocated))
 
 
-def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -> LocatedLevel:
+def locate(
+    exposures: VirtualExposures, graph: GraphOptions, context: Context, model: MotionModel = HOMOGRAPHIES
+) -> LocatedLevel:
     """Register the pairs of a level, and solve the motion graph (paper, section 4, "Locate").
 
     Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and released after its last
@@ -98,32 +103,33 @@ def locate(exposures: VirtualExposures, graph: GraphOptions, context: Context) -
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
         require_motion(level, edges, shape, partial(_seen_px, exposures, edges, pool))
         with exposures.clock("locate"), solving(level.number):
-            edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane)
+            edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
             require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             start = registrar.to_plane
-            solution = solve(len(groups), edges, anchor, shape, start)
+            solution = solve(len(groups), edges, anchor, shape, start, model)
             candidates = closure_candidates(groups, solution, shape, graph)
         revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
         closures = tuple(registrar.closures(candidates, solution.homographies, pool, revisits))
     log.finish()
     with exposures.clock("locate"), solving(level.number):
         if closures:
-            alone, solution = solution, solve(len(groups), edges + closures, anchor, shape, start)
+            alone, solution = solution, solve(len(groups), edges + closures, anchor, shape, start, model)
             fair = _not_outvoting(closures, edges, alone, solution)
             if fair != closures:
-                closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, start)
-        information, std_px = solution.assess()
+                closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, start, model)
+        assessed = solution.assess()
     return LocatedLevel(
         groups,
         edges + closures,
         closures,
         solution,
-        information if len(std_px) > 1 else None,
-        std_px,
+        assessed.information if len(assessed.std_px) > 1 else None,
+        assessed.std_px,
         shape,
+        assessed.std_shared,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
 

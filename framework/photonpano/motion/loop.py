@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from numpy.typing import ArrayLike
-
 from photonpano.context import Context
-from photonpano.geometry import inverse, normalised
 from photonpano.motion.attribution import AttributedTrajectory
 from photonpano.motion.checks import require_groups, require_knots_kept
 from photonpano.motion.diagnosis import require_in_front
@@ -16,7 +13,9 @@ from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import merge
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.timeline import Timeline
+from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, fit_turns
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.protocols import Source, Trajectory
 from photonpano.threads import Stopwatch
@@ -63,6 +62,7 @@ def estimate_motion(
     until_converged: bool = False,
     previous: Trajectory | None = None,
     timeline: Timeline | None = None,
+    model: MotionModel = HOMOGRAPHIES,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -79,6 +79,7 @@ def estimate_motion(
         until_converged: stop as soon as a level changes the motion by no more than its expected error.
         previous: the motion that is known so far; None at level 1.
         timeline: repeated frames, and where the motion is cut; None for a capture without gaps.
+        model: what the motion of the camera may be.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -90,7 +91,7 @@ def estimate_motion(
         clock = Stopwatch(context.threads)
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
         exposures = merge(level, source, groups, previous, clock, timeline)
-        located = locate(exposures, graph, context)
+        located = locate(exposures, graph, context, model)
         trajectory = interpolate(level, located, timeline, reference, clock)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds))
@@ -120,6 +121,24 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
         LocationError: the interpolator failed because exposures reach the horizon of the plane.
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
+    turns = located.solution.turns
+
+    def kept(found: Trajectory, times: FloatArray, homographies: FloatArray, std_px: FloatArray) -> Trajectory:
+        free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
+        require_knots_kept(free, times, homographies, std_px, located.frame_shape)
+        return free
+
+    def turned(knots: slice, times: FloatArray) -> Trajectory:
+        assert turns is not None
+        information = None if located.information is None else located.information[knots].copy()
+        return fit_turns(
+            level.interpolator,
+            times,
+            turns.rotations[knots],
+            information,
+            turns.camera,
+            lambda found, homographies: kept(found, times, homographies, located.std_px[knots]),
+        )
 
     def fitted(knots: slice, times: FloatArray) -> Trajectory:
         homographies = located.homographies[knots]
@@ -129,28 +148,12 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
         except Exception as error:
             require_in_front(level.number, located.groups, located.solution, located.frame_shape, error)
             raise
-        free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
-        require_knots_kept(free, times, homographies, located.std_px[knots], located.frame_shape)
-        return free
+        return kept(found, times, homographies, located.std_px[knots])
 
     with clock("interpolate"), level.attributing("interpolator"):
+        if turns is not None:
+            return TurningTrajectory(timeline.fit(turned, located.instants), turns.camera, reference)
         return ReferencedTrajectory(timeline.fit(fitted, located.instants), reference)
-
-
-class ReferencedTrajectory:
-    """A trajectory whose homography at the reference frame is the identity.
-
-    Convention:
-        `at` maps a frame's pixels to the pixels of the reference frame; h33 = 1.
-    """
-
-    def __init__(self, free: Trajectory, reference: int) -> None:
-        self._free = free
-        self._to_reference = inverse(free.at([reference])[0])
-
-    def at(self, frame_indices: ArrayLike) -> FloatArray:
-        """Return the homographies of N instants: (N, 3, 3)."""
-        return normalised(self._to_reference @ self._free.at(frame_indices))
 
 
 def _summary(result: LevelResult) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photonpano.geometry import align_planes, corner_displacements, inverse
+from photonpano.geometry import align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.timeline import Timeline
+from photonpano.motion.turning import TurningTrajectory
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray
 
@@ -52,7 +53,7 @@ class Uncertainty:
             self._remaining_px = _BLUR_SHARE * corner_displacements(within_group, np.eye(3), shape).mean(axis=-1)
         else:
             before = previous.at(self._frames)
-            change = inverse(before) @ align_planes(current, before, shape) @ current
+            change = inverse(before) @ _aligned(trajectory, previous, self._frames, shape) @ current
             changes_px = corner_displacements(change, np.eye(3), shape).mean(axis=-1)
             self.change_px = float(changes_px.mean())
             self._remaining_px = _REMAINING_SHARE * changes_px
@@ -79,3 +80,12 @@ class Uncertainty:
             beyond = np.maximum((instants[0] - frames[here]) / first, (frames[here] - instants[-1]) / last)
             noise_px[here] = inside * (1 + 2 * np.maximum(beyond, 0))
         return np.asarray(np.hypot(noise_px, self._timeline.unknown_px(frames)))
+
+
+def _aligned(after: Trajectory, before: Trajectory, frames: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the best map from the reference plane of one trajectory to that of another: (3, 3)."""
+    if isinstance(after, TurningTrajectory) and isinstance(before, TurningTrajectory):
+        turned = align_rotations(after.rotations(frames), before.rotations(frames))
+        start = before.camera.homographies(turned)
+        return align_planes(after.at(frames), before.at(frames), frame_shape, start)
+    return align_planes(after.at(frames), before.at(frames), frame_shape)

@@ -15,6 +15,7 @@ from photonpano.lighting import corrected_light, decision_of, find_light, in_lig
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion
+from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.components import build_levels
 from photonpano.protocols import Source, Trajectory, light_of
@@ -68,7 +69,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     reference = _reference_frame(plan, source)
     levels = build_levels(plan, source, decisions)
     timeline = timeline_of(source, context)
-    results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline)
+    results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline, model=model_of(plan))
     first, later = results, levels[1:]
     known = first[0].trajectory
     if vignette := vignette_of(plan, source, known):
@@ -83,7 +84,9 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         levels = _in_whole_periods(plan, source, levels, decisions)
         known = first[0].trajectory
         results, later = first, levels[1:]
-    results += estimate_motion(source, later, plan.graph, reference, context, plan.until_converged, known, timeline)
+    results += estimate_motion(
+        source, later, plan.graph, reference, context, plan.until_converged, known, timeline, model_of(plan)
+    )
     found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context), vignette)
     if cuts := find_cuts(source, found.look, context):
         found = _cut_at(cuts, plan, found)
@@ -131,7 +134,9 @@ def _lit(
 
     def first_level(light: Light, known: Trajectory) -> list[LevelResult]:
         in_this, within = lit(light)
-        return estimate_motion(in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline)
+        return estimate_motion(
+            in_this, levels[:1], plan.graph, reference, within, previous=known, timeline=timeline, model=model_of(plan)
+        )
 
     worse = ""
     try:
@@ -188,7 +193,9 @@ def _cut_at(cuts: Sequence[Cut], plan: Plan, found: Estimate) -> Estimate:
     timeline = found.timeline.cut_at(cuts)
     try:
         levels = build_levels(plan, source, [])
-        results = estimate_motion(source, levels, plan.graph, reference, context, plan.until_converged, timeline=timeline)
+        results = estimate_motion(
+            source, levels, plan.graph, reference, context, plan.until_converged, timeline=timeline, model=model_of(plan)
+        )
         look = _look(plan, source, results, reference, context)
         # Frames that show nothing contradict any motion, and the surer it is the more; such a run is doubtful in any case.
         worse = "" if any(each.dark is not None for each in cuts) else look.worse_than(found.look)
@@ -201,6 +208,13 @@ def _cut_at(cuts: Sequence[Cut], plan: Plan, found: Estimate) -> Estimate:
     motion = look.motion
     measured = [each.along(motion.trajectory, motion.frame_shape) for each in cuts]
     return replace(found, results=results, timeline=timeline.cut_at(measured), look=look)
+
+
+def model_of(plan: Plan) -> MotionModel:
+    """Return what the motion of the camera may be, as a spec says it."""
+    camera = plan.camera
+    focal_px = None if camera.focal_px == "find" else camera.focal_px
+    return MotionModel(plan.motion.model, focal_px, camera.centre_px)
 
 
 def _reference_frame(plan: Plan, source: Source) -> int:

@@ -14,6 +14,7 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import box_of, plan_canvas, render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels, build_renderer
+from photonpano.pipeline.estimate import model_of
 from photonpano.protocols import Source
 from photonpano.record.run_json import peak_memory_bytes
 from photonpano.specs.plan import Plan
@@ -89,7 +90,9 @@ def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: tuple[int, 
 def _tried(plan: Plan, part: Source, threads: int) -> list[LevelResult]:
     levels = build_levels(plan, part, [])
     with one_thread_inside():
-        return estimate_motion(part, levels, plan.graph, part.info.n_frames // 2, Context(threads), plan.until_converged)
+        return estimate_motion(
+            part, levels, plan.graph, part.info.n_frames // 2, Context(threads), plan.until_converged, model=model_of(plan)
+        )
 
 
 def _middle(n_frames: int, length: int) -> FrameSpan:

@@ -10,10 +10,12 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.errors import OutputError
@@ -68,15 +70,15 @@ class RunFolder:
             raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
         with _writing(self.directory):
             (self.staging / "panorama.png").write_bytes(png.tobytes())
-            np.savez(
-                self.staging / "trajectory.npz",
-                homographies=motion.homographies,
-                canvas=panorama.canvas.transform,
-                frame_shape=np.array(motion.frame_shape),
-                reference=np.array(motion.reference),
-                located=motion.located,
-                std_px=motion.std_px,
-            )
+            motion_arrays: dict[str, Any] = {
+                "homographies": motion.homographies,
+                "canvas": panorama.canvas.transform,
+                "frame_shape": np.array(motion.frame_shape),
+                "reference": np.array(motion.reference),
+                "located": motion.located,
+                "std_px": motion.std_px,
+            }
+            np.savez(self.staging / "trajectory.npz", allow_pickle=False, **motion_arrays, **_of_camera(motion))
 
     def write_light(self, light: Light) -> None:
         """Write light.npz."""
@@ -155,6 +157,18 @@ def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Pat
                 f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
             ) from error
         yield folder
+
+
+def _of_camera(motion: FrameMotion) -> dict[str, NDArray[Any]]:
+    """Return what the archive of the motion holds beside the homographies, for a camera that only turns."""
+    if motion.camera is None or motion.rotations is None:
+        return {}
+    return {
+        "model": np.array("rotation"),
+        "rotations": motion.rotations,
+        "camera_matrix": motion.camera.matrix,
+        "distortion": motion.camera.distortion,
+    }
 
 
 @contextmanager

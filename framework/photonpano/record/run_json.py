@@ -18,9 +18,13 @@ from photonpano.captures.fingerprint import CaptureRecord
 from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.graph import Evidence
+from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.loop import LevelResult
 from photonpano.record.schema import (
+    CameraRecord,
     DecisionRecord,
+    EvidenceRecord,
     FailureRecord,
     LevelRecord,
     MotionRecord,
@@ -192,7 +196,28 @@ def level_record(result: LevelResult) -> LevelRecord:
         "change_px": result.change_px,
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
+        "camera": _camera_record(located),
+        "evidence": _evidence_record(located.solution.evidence),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
+    }
+
+
+def _evidence_record(evidence: Evidence | None) -> EvidenceRecord | None:
+    if evidence is None:
+        return None
+    return {"rotation": evidence.rotation, "homography": evidence.homography, "gain": evidence.gain}
+
+
+def _camera_record(located: LocatedLevel) -> CameraRecord | None:
+    if located.solution.turns is None:
+        return None
+    camera = located.solution.turns.camera
+    std = float(located.std_shared[0]) if len(located.std_shared) else 0.0
+    return {
+        "focal_px": camera.focal_px,
+        "std_focal_px": camera.focal_px * std,
+        "centre_px": list(camera.centre_px),
+        "distortion": camera.distortion.tolist(),
     }
 
 

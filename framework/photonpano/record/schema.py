@@ -54,13 +54,38 @@ class ClosureRecord(TypedDict):
     located: int
 
 
+class CameraRecord(TypedDict):
+    """A camera that turns: focal length and principal point in px of a frame, and k1, k2, p1, p2 of its lens.
+
+    `std_focal_px` is the expected error of a focal length that was found, 0 for one that was given.
+    """
+
+    focal_px: float
+    std_focal_px: float
+    centre_px: Sequence[float]
+    distortion: Sequence[float]
+
+
+class EvidenceRecord(TypedDict):
+    """How rotations explain the pairs of a level, compared with homographies.
+
+    `rotation` and `homography` are the mean squares of the residuals, 1 where they are photon noise; `gain` is by how much each
+    additional unknown of the homographies lowers the sum of the squares, about 1 where the camera only turns.
+    """
+
+    rotation: float
+    homography: float
+    gain: float
+
+
 class LevelRecord(TypedDict):
     """One level.
 
     `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them; `located_by` counts located pairs by
     locator. `revisits` are loop closures. `contradictions` are located pairs that were dropped as outliers. `change_px` is the
     mean distance by which the level moved the corners of the frames, None at the first level; `std_px` is the expected corner
-    error, None where a single exposure was located. `seconds` has an entry for each stage.
+    error, None where a single exposure was located. `camera` is that of a level whose camera turns, and `evidence` how well it
+    explains the pairs; None where homographies were fitted. `seconds` has an entry for each stage.
     """
 
     level: int
@@ -77,6 +102,8 @@ class LevelRecord(TypedDict):
     change_px: float | None
     std_px: float | None
     residual_px: float
+    camera: CameraRecord | None
+    evidence: EvidenceRecord | None
     seconds: Mapping[str, float]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import FrameTrajectory, corner_displacements, inverse
+from photonpano.geometry import FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
@@ -191,6 +191,9 @@ def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> 
             return None
         require_refined(found, motion.std_px)
         homographies = inverse(found.homographies[motion.reference]) @ found.homographies
+        if motion.camera is not None:
+            turned = nearest_rotations(motion.camera.rotations(homographies))
+            return replace(found, homographies=motion.camera.homographies(turned[motion.reference].T @ turned))
         return replace(found, homographies=homographies / homographies[:, 2:, 2:])
 
 

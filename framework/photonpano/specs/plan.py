@@ -14,7 +14,15 @@ if TYPE_CHECKING:
     from photonpano.contributions import Config, Contribution
     from photonpano.corrections import Correction
     from photonpano.registry import Observer, Origin
-    from photonpano.specs.settings import GraphSettings, LightSettings, OutputSettings, RenderSettings, RunSettings
+    from photonpano.specs.settings import (
+        CameraSettings,
+        GraphSettings,
+        LightSettings,
+        MotionSettings,
+        OutputSettings,
+        RenderSettings,
+        RunSettings,
+    )
     from photonpano.specs.written import Place
     from photonpano.values import Decision
 
@@ -66,6 +74,8 @@ class Plan:
         until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
         renderer: the component that renders the panorama.
         formats: the exporters that write it as files of other formats.
+        motion: what the motion of the camera may be.
+        camera: what is known of the camera.
         light: whether the light of the scene changes.
         graph: which pairs are registered, and what happens when the graph is disconnected.
         render: the panorama.
@@ -86,6 +96,8 @@ class Plan:
     renderer: Choice
     formats: tuple[Choice, ...]
     until_converged: bool
+    motion: MotionSettings
+    camera: CameraSettings
     light: LightSettings
     graph: GraphSettings
     render: RenderSettings

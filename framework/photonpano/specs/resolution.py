@@ -13,7 +13,16 @@ from photonpano.specs.aliases import Alias
 from photonpano.specs.checks import STAGES, complaints
 from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
-from photonpano.specs.settings import GraphSettings, LevelSettings, LightSettings, OutputSettings, RenderSettings, RunSettings
+from photonpano.specs.settings import (
+    CameraSettings,
+    GraphSettings,
+    LevelSettings,
+    LightSettings,
+    MotionSettings,
+    OutputSettings,
+    RenderSettings,
+    RunSettings,
+)
 from photonpano.specs.validation import validate
 from photonpano.specs.written import WrittenSpec, given
 from photonpano.text import listed
@@ -46,6 +55,8 @@ DEFAULT_REFINER = "short-spans"
 KIND_OF = {kind.section: kind for kind in KINDS.values()}
 """The kind of component that a section chooses."""
 SETTINGS: dict[str, type[BaseModel]] = {
+    "motion": MotionSettings,
+    "camera": CameraSettings,
     "light": LightSettings,
     "graph": GraphSettings,
     "render": RenderSettings,

@@ -42,6 +42,40 @@ class GraphSettings(Config):
     )
 
 
+class MotionSettings(Config):
+    """What the motion of the camera may be."""
+
+    model: Literal["homography", "rotation", "auto"] = Field(
+        "homography",
+        description="homography lets each frame have any homography; rotation is for a camera that only turns, by any angle, "
+        "and is more accurate there; auto takes rotation where homographies explain the pairs no better",
+    )
+
+
+Distortion = Literal["find"] | Annotated[float, Field(ge=-2, le=2)]
+
+
+class DistortionSettings(Config):
+    """What the lens does to the image, as OpenCV defines it, in units of the focal length."""
+
+    k1: Distortion = Field(0.0, description="radial distortion of second order; find measures it, for the model rotation")
+    k2: Distortion = Field(0.0, description="radial distortion of fourth order; find measures it, for the model rotation")
+    p1: Distortion = Field(0.0, description="tangential distortion along y; find measures it, for the model rotation")
+    p2: Distortion = Field(0.0, description="tangential distortion along x; find measures it, for the model rotation")
+
+
+class CameraSettings(Config):
+    """The camera, for the model rotation, and its lens."""
+
+    focal_px: Literal["find"] | Annotated[float, Field(ge=10, le=1e6)] = Field(
+        "find", description="focal length in px of a frame; find measures it, for the model rotation"
+    )
+    centre_px: tuple[float, float] | None = Field(
+        None, description="(x, y) of the principal point, in px of a frame; by default the middle of the frames"
+    )
+    distortion: DistortionSettings = Field(DistortionSettings(), description="of the lens; none by default")
+
+
 class LightSettings(Config):
     """The light of the scene."""
 

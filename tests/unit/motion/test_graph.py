@@ -156,10 +156,12 @@ def test_solve_with_outliers_equals_solve_without_them() -> None:
     assert without.outliers == ()
     assert corner_displacements(solution.homographies, without.homographies, SHAPE).max() < 1e-3
     assert solution.residual_px == pytest.approx(without.residual_px, rel=1e-4)
-    (information, std_px), (information_without, std_without_px) = solution.assess(), without.assess()
-    np.testing.assert_allclose(information, information_without, rtol=0.01, atol=1e-4 * information.max())
+    assessed, assessed_without = solution.assess(), without.assess()
+    np.testing.assert_allclose(
+        assessed.information, assessed_without.information, rtol=0.01, atol=1e-4 * assessed.information.max()
+    )
     # Both are estimated from 64 draws.
-    np.testing.assert_allclose(std_px, std_without_px, rtol=0.25)
+    np.testing.assert_allclose(assessed.std_px, assessed_without.std_px, rtol=0.25)
 
 
 def test_solve_keeps_outliers_if_graph_disconnects_without_them() -> None:
@@ -171,7 +173,7 @@ def test_solve_keeps_outliers_if_graph_disconnects_without_them() -> None:
     assert solution.outliers == ()
     assert error_px(solution.homographies, still, 10) < 1e-6
     assert solution.residual_px == pytest.approx(20 * np.sqrt(2 / len(edges)))
-    _, std_px = solution.assess()
+    std_px = solution.assess().std_px
     assert std_px[:20].max() < 2 < 5 < std_px[20] < 40
 
 
@@ -199,7 +201,8 @@ def test_solve_leaves_nodes_not_tied_to_the_anchor_unknown() -> None:
     np.testing.assert_array_equal(solution.located, [True, True, True, False, False, False, False])
     assert error_px(solution.homographies[:3], true[:3], 1) < 1e-9
     assert np.isnan(solution.homographies[3:]).all()
-    information, std_px = solution.assess()
+    assessed = solution.assess()
+    information, std_px = assessed.information, assessed.std_px
     assert (information.shape, std_px.shape) == ((3, 8, 8), (3,))
     assert np.isfinite(information).all()
     assert np.isfinite(std_px).all()
@@ -210,7 +213,8 @@ def test_solve_without_edges_locates_anchor_alone() -> None:
     np.testing.assert_array_equal(solution.located, [False, False, True])
     np.testing.assert_array_equal(solution.homographies[2], np.eye(3))
     assert np.isnan(solution.homographies[:2]).all()
-    information, std_px = solution.assess()
+    assessed = solution.assess()
+    information, std_px = assessed.information, assessed.std_px
     np.testing.assert_array_equal(information, np.full((1, 8, 8), np.nan))
     np.testing.assert_array_equal(std_px, [np.nan])
 
@@ -266,7 +270,7 @@ def test_expected_error_matches_actual_error_of_every_exposure(graph: str) -> No
     true = true_motion(10)
     found = [solve(10, GRAPHS[graph](true, np.random.default_rng(seed)), 5, SHAPE) for seed in range(16)]
     squares = np.array([squared_errors(solution.homographies, true) for solution in found])
-    expected = np.array([solution.assess()[1] for solution in found])
+    expected = np.array([solution.assess().std_px for solution in found])
     ratios = np.sqrt(squares.mean(axis=0) / (expected**2).mean(axis=0))
     assert 0.7 < ratios.min() < ratios.max() < 1.2
     # A single loop hardly determines the scale of errors; the larger one is taken.
@@ -285,13 +289,13 @@ def test_expected_error_of_a_chain_is_that_of_a_random_walk(n_nodes: int) -> Non
     steps = np.arange(1, n_nodes)
     shares = [np.where(steps <= k, steps, n_nodes - steps) / n_nodes for k in range(n_nodes)]
     walk = NOISE_PX * np.sqrt(2) * np.linalg.norm(shares, axis=1)
-    np.testing.assert_allclose(solution.assess()[1], walk, rtol=0.12)
+    np.testing.assert_allclose(solution.assess().std_px, walk, rtol=0.12)
 
 
 def test_expected_error_does_not_depend_on_the_anchor() -> None:
     true = true_motion(20)
     edges = measured(true, (1, 2), np.random.default_rng(0))
-    first, last = (solve(20, edges, anchor, SHAPE).assess()[1] for anchor in (0, 19))
+    first, last = (solve(20, edges, anchor, SHAPE).assess().std_px for anchor in (0, 19))
     np.testing.assert_allclose(first, last, rtol=0.01)
 
 
@@ -299,7 +303,11 @@ def test_expected_error_does_not_depend_on_the_anchor() -> None:
 def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tuple[int, ...]) -> None:
     true = true_motion(40)
     edges = measured(true, skips, np.random.default_rng(0))
-    honest, overconfident, modest = (solve(40, confident(edges, times), 20, SHAPE).assess()[1].mean() for times in (1, 5, 0.2))
+    honest, overconfident, modest = (
+        solve(40, confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
+    )
+        solve(40, confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
+    )
     assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.1)
     assert modest == pytest.approx(5 * honest, rel=0.15)
 
@@ -315,7 +323,7 @@ def test_information_of_a_node_is_the_curvature_of_the_cost_with_others_held() -
         edge(true, 4, 2),
     ]
     solution = solve(5, edges, 1, SHAPE)
-    found, _ = solution.assess()
+    found = solution.assess().information
 
     def cost(node: int, change: np.ndarray) -> float:
         homographies = solution.homographies.copy()
@@ -388,7 +396,8 @@ def test_solve_is_finite_for_any_information() -> None:
     for seed in range(25):
         n_nodes, edges = any_edges(seed)
         solution = solve(n_nodes, edges, 0, SHAPE)
-        information, std_px = solution.assess()
+        assessed = solution.assess()
+        information, std_px = assessed.information, assessed.std_px
         finite = [bool(np.isfinite(each).all()) for each in (solution.homographies[solution.located], information, std_px)]
         assert finite == [True] * 3, f"seed {seed}"
 
