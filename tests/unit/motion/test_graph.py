@@ -306,8 +306,6 @@ def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tupl
     honest, overconfident, modest = (
         solve(40, confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
     )
-        solve(40, confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
-    )
     assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.1)
     assert modest == pytest.approx(5 * honest, rel=0.15)
 
