@@ -6,9 +6,10 @@ import base64
 import importlib
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +17,18 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
+    from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
 
 JPEG_QUALITY = 90
 WIDTH_IN = 10.0
 MAX_MAP_HEIGHT_IN = 5.0
 MIN_MAP_IN = 0.8
+BAR_IN = 1.0
+"""Room for a colour bar to the right of a map, with its numbers and its label."""
 MAP_PIXELS = 1000
+_X_LABEL_IN, _Y_LABEL_IN = 0.25, 0.55
+"""Distance of the labels of axes from the axes."""
 
 # matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
 INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
@@ -77,26 +83,123 @@ def plain_figure(width_in: float, height_in: float) -> Iterator[Figure]:
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE):
-        yield Figure(figsize=(width_in, height_in), layout="constrained")
+        yield Figure(figsize=(width_in, height_in))
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Room around axes, in inches. It is fixed, as measuring all texts to find it takes longer than drawing them."""
+
+    left: float = 0.8
+    right: float = 0.1
+    top: float = 0.1
+    bottom: float = 0.5
+
+
+def add_axes(
+    figure: Figure,
+    margins: Margins,
+    rows: Sequence[float] = (1,),
+    columns: int = 1,
+    gap_in: float = 0.25,
+    share_x: bool = False,
+) -> list[Axes]:
+    """Add axes in a column or in a row, with their labels at fixed distances.
+
+    Args:
+        figure: a new one.
+        margins: around all axes.
+        rows: relative heights of the rows.
+        columns: number of equal columns.
+        gap_in: room between axes.
+        share_x: whether all have one range of x.
+    """
+    from matplotlib.transforms import ScaledTranslation
+
+    width, height = figure.get_size_inches()
+    inner = width - margins.left - margins.right, height - margins.top - margins.bottom
+    n_rows = len(rows)
+    grid = figure.add_gridspec(
+        n_rows,
+        columns,
+        left=margins.left / width,
+        right=1 - margins.right / width,
+        bottom=margins.bottom / height,
+        top=1 - margins.top / height,
+        hspace=gap_in * n_rows / (inner[1] - (n_rows - 1) * gap_in),
+        wspace=gap_in * columns / (inner[0] - (columns - 1) * gap_in),
+        height_ratios=rows,
+    )
+    axes = list(grid.subplots(squeeze=False, sharex=share_x).ravel())
+    for each in axes:
+        inches = figure.dpi_scale_trans
+        each.yaxis.set_label_coords(0, 0.5, each.transAxes + ScaledTranslation(-_Y_LABEL_IN, 0, inches))
+        each.xaxis.set_label_coords(0.5, 0, each.transAxes + ScaledTranslation(0, -_X_LABEL_IN, inches))
+    return axes
 
 
 @contextmanager
 def map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[Figure, Axes]]:
     """Open a figure with the proportions of a panorama, with `side_in` inches beside it for a colour bar."""
-    margin_in = 0.9 + side_in
+    margins = Margins(left=0.6, right=0.3 + side_in, top=0.15, bottom=0.35)
+    margin_in = margins.left + margins.right
     map_width = min(WIDTH_IN - margin_in, MAX_MAP_HEIGHT_IN * width / height)
     size_in = max(map_width, MIN_MAP_IN), max(map_width * height / width, MIN_MAP_IN)
-    with plain_figure(size_in[0] + margin_in, size_in[1] + 0.55) as figure:
-        axes = figure.subplots()
-        axes.grid(visible=False)
-        axes.set_xlim(-0.5, width - 0.5)
-        axes.set_ylim(height - 0.5, -0.5)
-        axes.set_aspect("equal")
+    with plain_figure(size_in[0] + margin_in, size_in[1] + margins.top + margins.bottom) as figure:
+        [axes] = add_axes(figure, margins)
+        _show_pixels(axes, height, width)
         axes.locator_params(axis="x", nbins=max(2, min(9, int(map_width))))
         axes.locator_params(axis="y", nbins=5)
-        for ticks in (axes.xaxis, axes.yaxis):
-            ticks.set_major_formatter("{x:,.0f}")
         yield figure, axes
+
+
+@contextmanager
+def maps_figure(height: int, width: int, n_maps: int) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Open a figure of 2 or 3 maps in a row, each with room for a colour bar, but the third."""
+    margins = Margins(left=0.6, right=BAR_IN if n_maps == 2 else 0.1, top=0.35, bottom=0.3)
+    gap_in = BAR_IN + 0.35
+    map_width = (WIDTH_IN - margins.left - margins.right - (n_maps - 1) * gap_in) / n_maps
+    map_height = float(np.clip(map_width * height / width, MIN_MAP_IN, 4.0))
+    with plain_figure(WIDTH_IN, map_height + margins.top + margins.bottom) as figure:
+        maps = add_axes(figure, margins, columns=n_maps, gap_in=gap_in)
+        for axes in maps:
+            _show_pixels(axes, height, width)
+            axes.set_facecolor(LINE)
+            axes.locator_params(nbins=4)
+        yield figure, maps
+
+
+def _show_pixels(axes: Axes, height: int, width: int) -> None:
+    """Give axes the coordinates of the pixels of an image."""
+    axes.grid(visible=False)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    for ticks in (axes.xaxis, axes.yaxis):
+        ticks.set_major_formatter("{x:,.0f}")
+
+
+def add_colour_bar(axes: Axes, image: Any, label: str, numbers: str) -> Colorbar:
+    """Add the colours of an image to the right of its axes.
+
+    Args:
+        axes: with `BAR_IN` inches of room.
+        image: drawn in them.
+        label: of the colours.
+        numbers: their format.
+    """
+    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
+
+    figure: Any = axes.get_figure(root=True)
+    right_edge: Any = axes.transAxes
+    inches = figure.dpi_scale_trans
+    beside = blended_transform_factory(inches + ScaledTranslation(1, 0, right_edge), axes.transAxes)
+    place = axes.inset_axes((0.1, 0.05, 0.16, 0.9), transform=beside)
+    bar: Colorbar = figure.colorbar(image, cax=place, format=numbers)
+    bar.outline.set_visible(False)
+    bar.set_label(label)
+    bar.ax.yaxis.set_label_coords(1, 0.5, bar.ax.transAxes + ScaledTranslation(_Y_LABEL_IN, 0, inches))
+    return bar
 
 
 def svg_of(figure: Figure, name: str) -> str:
@@ -115,6 +218,8 @@ def svg_of(figure: Figure, name: str) -> str:
 
 def add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:
     """Add the time along the top, in seconds or milliseconds."""
+    from matplotlib.transforms import ScaledTranslation
+
     factor, unit = (1.0, "s") if n_frames / frame_rate_hz >= 1 else (1e3, "ms")
     scale = factor / frame_rate_hz
 
@@ -126,6 +231,9 @@ def add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:
 
     time = axes.secondary_xaxis("top", functions=(to_time, to_frame))
     time.set_xlabel(f"time ({unit})")
+    figure: Any = axes.get_figure(root=True)
+    inches = figure.dpi_scale_trans
+    time.xaxis.set_label_coords(0.5, 1, axes.transAxes + ScaledTranslation(0, _X_LABEL_IN, inches))
     time.spines["top"].set_visible(False)
 
 

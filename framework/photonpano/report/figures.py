@@ -13,6 +13,7 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
 from photonpano.report.drawing import (
+    BAR_IN,
     INK,
     LINE,
     MAP_PIXELS,
@@ -20,6 +21,9 @@ from photonpano.report.drawing import (
     PAPER,
     SERIES,
     WIDTH_IN,
+    Margins,
+    add_axes,
+    add_colour_bar,
     add_time_axis,
     extent_of,
     map_figure,
@@ -47,7 +51,7 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
     centre = _centre(motion.frame_shape)
     path = apply(motion.homographies[instants], centre)[:, 0] - centre[0]
     with plain_figure(WIDTH_IN, 6.0) as figure:
-        position, speed, error = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
+        position, speed, error = add_axes(figure, Margins(right=0.3, top=0.55), rows=(3, 2, 2), share_x=True)
         for values, name, colour in zip(path.T, ("x", "y"), SERIES, strict=False):
             position.plot(instants, values, color=colour)
             end = instants[-1], values[-1]
@@ -74,7 +78,6 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
             _shade_not_located(axes, motion)
         if frame_rate_hz is not None and len(instants) > 1:
             add_time_axis(position, len(motion.homographies), frame_rate_hz)
-        figure.align_ylabels()
         return svg_of(figure, "path-over-time")
 
 
@@ -106,13 +109,11 @@ def coverage_map(coverage: FluxImage) -> str:
     """
     coverage = coverage if coverage.ndim == 2 else coverage.sum(axis=-1)
     height, width = coverage.shape
-    with map_figure(height, width, side_in=0.9) as (figure, axes):
+    with map_figure(height, width, side_in=BAR_IN) as (figure, axes):
         axes.set_facecolor(LINE)
         small = shrunk(np.nan_to_num(coverage), MAP_PIXELS)
         image = axes.imshow(np.ma.masked_less_equal(small, 0), cmap="viridis", vmin=0, extent=extent_of(height, width))
-        bar = figure.colorbar(image, ax=axes, fraction=0.15, pad=0.02, shrink=0.9, aspect=14, format="{x:,.0f}")
-        bar.outline.set_visible(False)
-        bar.set_label("frames")
+        add_colour_bar(axes, image, "frames", "{x:,.0f}")
         return svg_of(figure, "coverage")
 
 
@@ -120,7 +121,7 @@ def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) 
     """Draw the seconds of each stage of each level, and of the panorama."""
     names = [f"level {level['level']}" for level in levels] + (["panorama"] if panorama else [])
     with plain_figure(WIDTH_IN, 0.9 + 0.36 * len(names)) as figure:
-        axes = figure.subplots()
+        [axes] = add_axes(figure, Margins(right=0.6, top=0.35))
         ends = np.zeros(len(levels))
         for (stage, name), colour in zip(STAGE_NAMES.items(), SERIES, strict=False):
             seconds = np.array([level["seconds"].get(stage, 0.0) for level in levels])
@@ -137,7 +138,7 @@ def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) 
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", colors=INK)
         axes.set_xlabel("seconds")
-        figure.legend(loc="outside upper left", ncols=5, handlelength=1, handleheight=1, columnspacing=1.4)
+        figure.legend(loc="upper left", ncols=5, handlelength=1, handleheight=1, columnspacing=1.4)
         return svg_of(figure, "stage-times")
 
 

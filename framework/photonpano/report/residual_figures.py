@@ -9,13 +9,18 @@ import numpy as np
 from photonpano.geometry import apply
 from photonpano.merging.light import amplitudes
 from photonpano.report.drawing import (
+    BAR_IN,
     INK,
     LINE,
     MUTED,
     SERIES,
     WIDTH_IN,
+    Margins,
+    add_axes,
+    add_colour_bar,
     extent_of,
     map_figure,
+    maps_figure,
     plain_figure,
     svg_of,
 )
@@ -27,7 +32,6 @@ from photonpano.values import FloatArray, Homography, Light
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MAX_DOTS = 500
 """Number of spans whose shifts are drawn, evenly spaced."""
@@ -61,13 +65,13 @@ def misfit_over_panorama(residuals: Residuals, to_panorama: Homography, shape: t
     misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
     rows, columns = misfit.shape
     (left, top), (right, bottom) = apply(to_panorama, [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]])
-    with map_figure(*shape, side_in=0.9) as (figure, axes):
+    with map_figure(*shape, side_in=BAR_IN) as (figure, axes):
         axes.set_facecolor(LINE)
         extent = float(left), float(right), float(bottom), float(top)
         image = axes.imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
         axes.set_xlim(-0.5, shape[1] - 0.5)
         axes.set_ylim(shape[0] - 0.5, -0.5)
-        _add_colour_bar(figure, axes, image, "misfit", 0.15)
+        _add_colour_bar(axes, image, "misfit")
         return svg_of(figure, "misfit-panorama")
 
 
@@ -75,29 +79,17 @@ def over_sensor(residuals: Residuals) -> str:
     """Draw the misfit and the brightness of the blocks of the sensor, and their shifts if these are significant."""
     height, width = residuals.frame_shape
     shifts = significant_shifts(residuals)
-    n_maps = 2 if shifts is None else 3
-    map_in = WIDTH_IN / n_maps
-    with plain_figure(WIDTH_IN, float(np.clip((map_in - 0.8) * height / width, 1.0, 4.0)) + 0.9) as figure:
-        maps = figure.subplots(1, n_maps)
-        for axes in maps:
-            axes.grid(visible=False)
-            axes.set_facecolor(LINE)
-            axes.locator_params(nbins=4)
-            axes.xaxis.set_major_formatter("{x:,.0f}")
+    with maps_figure(height, width, 2 if shifts is None else 3) as (figure, maps):
         extent = _blocks_extent(residuals)
         misfit = np.ma.masked_invalid(residuals.block_misfit)
         image = maps[0].imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
-        _add_colour_bar(figure, maps[0], image, "misfit", 0.05)
+        _add_colour_bar(maps[0], image, "misfit")
         gain = np.ma.masked_invalid(100 * _brightness(residuals))
         limit = max(_GAIN_RANGE_PERCENT, float(np.abs(gain).max())) if gain.count() else _GAIN_RANGE_PERCENT
         image = maps[1].imshow(gain, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
-        _add_colour_bar(figure, maps[1], image, "brightness (%)", 0.05, "{x:+.3g}")
+        _add_colour_bar(maps[1], image, "brightness (%)", "{x:+.3g}")
         if shifts is not None:
             _draw_shifts(maps[2], shifts)
-        for axes in maps:
-            axes.set_xlim(-0.5, width - 0.5)
-            axes.set_ylim(height - 0.5, -0.5)
-            axes.set_aspect("equal")
         return svg_of(figure, "sensor")
 
 
@@ -106,7 +98,7 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
     found = residuals.steps()
     steps, stds = found.steps[:, :2], _noise_px(found.information)
     with plain_figure(WIDTH_IN, 5.2) as figure:
-        time, spectrum = figure.subplots(2, 1, height_ratios=(1, 1))
+        time, spectrum = add_axes(figure, Margins(top=0.35), rows=(1, 1), gap_in=0.6)
         shown = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), MAX_DOTS)).round().astype(int))
         instants, band = residuals.instants[shown], 2 * stds[shown].max(axis=1)
         band = np.where(np.isfinite(band), band, np.nan)
@@ -122,7 +114,6 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
         time.xaxis.set_major_formatter("{x:,.0f}")
         time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, handletextpad=0.2, columnspacing=1.2)
         _draw_spectrum(spectrum, residuals, frame_rate_hz)
-        figure.align_ylabels()
         return svg_of(figure, "shifts")
 
 
@@ -132,7 +123,7 @@ def light_over_time(residuals: Residuals) -> str | None:
     if np.ptp(gain) == 0:
         return None
     with plain_figure(WIDTH_IN, 2.4) as figure:
-        axes = figure.subplots()
+        [axes] = add_axes(figure, Margins())
         axes.axhline(1, color=MUTED, linewidth=1, linestyle="--")
         axes.plot(residuals.instants, gain, color=SERIES[0])
         axes.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
@@ -158,21 +149,13 @@ def flicker_over_panorama(light: Light | None, to_plane: Homography, shape: tupl
     cosine, sine = amplitudes(light, to_plane @ np.diag([step, step, 1.0]), small)
     extent = -0.5, small[1] * step - 0.5, small[0] * step - 0.5, -0.5
     depth = np.hypot(cosine, sine)
-    with plain_figure(WIDTH_IN, float(np.clip((WIDTH_IN / 2 - 0.8) * shape[0] / shape[1], 1.0, 4.0)) + 0.9) as figure:
-        left, right = figure.subplots(1, 2)
+    with maps_figure(*shape, 2) as (figure, (left, right)):
         image = left.imshow(depth, cmap="viridis", vmin=0, extent=extent)
-        _add_colour_bar(figure, left, image, "flicker / mean light", 0.05)
+        _add_colour_bar(left, image, "flicker / mean light")
         # Places that hardly flicker have no phase.
         phase = np.ma.masked_where(depth < _FLICKERS * depth.max(), np.degrees(np.arctan2(-sine, cosine)))
         image = right.imshow(phase, cmap="twilight", vmin=-180, vmax=180, extent=extent)
-        _add_colour_bar(figure, right, image, "phase (degrees)", 0.05)
-        for axes in (left, right):
-            axes.grid(visible=False)
-            axes.set_facecolor(LINE)
-            axes.locator_params(nbins=4)
-            axes.xaxis.set_major_formatter("{x:,.0f}")
-            axes.set_xlim(-0.5, shape[1] - 0.5)
-            axes.set_ylim(shape[0] - 0.5, -0.5)
+        _add_colour_bar(right, image, "phase (degrees)")
         return svg_of(figure, "flicker")
 
 
@@ -245,13 +228,11 @@ def _blocks_extent(residuals: Residuals) -> tuple[float, float, float, float]:
     return extent_of(rows * BLOCK_PX, columns * BLOCK_PX)
 
 
-def _add_colour_bar(figure: Figure, axes: Axes, image: Any, label: str, fraction: float, numbers: str = "{x:.3g}") -> None:
-    bar = figure.colorbar(image, ax=axes, fraction=fraction, pad=0.02, shrink=0.9, aspect=14, format=numbers)
+def _add_colour_bar(axes: Axes, image: Any, label: str, numbers: str = "{x:.3g}") -> None:
+    bar = add_colour_bar(axes, image, label, numbers)
     if image.norm.vmin > 0:
         bar.set_ticks([tick for tick in _MISFIT_TICKS if image.norm.vmin <= tick <= image.norm.vmax])
         bar.ax.minorticks_off()
-    bar.outline.set_visible(False)
-    bar.set_label(label)
 
 
 def _draw_shifts(axes: Axes, shifts: tuple[FloatArray, FloatArray]) -> None:
