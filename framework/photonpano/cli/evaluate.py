@@ -24,8 +24,9 @@ def evaluate(
 ) -> None:
     """Score a run against the truth of its capture.
 
-    Corner errors are in pixels of a frame, over the located frames, after the best alignment of both reference planes. PSNR
-    and SSIM compare the panorama with the true scene, where it was seen. The oracle is the panorama along the true motion.
+    Corner errors are in pixels of a frame, over the located frames, after the best alignment of both reference planes. Those
+    of rotations are angles, after the best common rotation. PSNR and SSIM compare the panorama with the true scene, where it
+    was seen. The oracle is the panorama along the true motion.
 
     Example: photonpano evaluate runs/scan --truth cube.truth.npz
     """
@@ -49,6 +50,13 @@ def _rows(evaluation: "Evaluation") -> list[list[str]]:
         ["frames located", f"{100 * motion.located_share:.1f} %"],
         ["frames within 3 std_px", f"{100 * evaluation.honest_share:.1f} %"],
     ]
+    if evaluation.rotation is not None:
+        rotation = evaluation.rotation
+        rows += [
+            ["rotation error, mean", f"{rotation.mean_deg:.4f} degrees"],
+            ["rotation error, worst", f"{rotation.max_deg:.4f} degrees"],
+            ["focal length", f"{100 * rotation.focal_error:+.3f} %"],
+        ]
     for name, score in (("panorama", evaluation.panorama), ("oracle", evaluation.oracle)):
         if score is not None:
             rows += [[f"PSNR, {name}", f"{score.psnr_db:.2f} dB"], [f"SSIM, {name}", f"{score.ssim:.4f}"]]
@@ -68,10 +76,18 @@ def _data(evaluation: "Evaluation") -> dict[str, Any]:
         },
         "located_share": motion.located_share,
         "within_three_std_share": evaluation.honest_share,
+        "rotation": _rotation(evaluation),
         "panorama": _scores(evaluation.panorama),
         "oracle": _scores(evaluation.oracle),
         "below_oracle_db": evaluation.below_oracle_db,
     }
+
+
+def _rotation(evaluation: "Evaluation") -> dict[str, float] | None:
+    score = evaluation.rotation
+    if score is None:
+        return None
+    return {"mean_deg": score.mean_deg, "max_deg": score.max_deg, "focal_error": score.focal_error}
 
 
 def _scores(score: "ImageScore | None") -> dict[str, float] | None:

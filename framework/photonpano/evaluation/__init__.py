@@ -3,6 +3,7 @@
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_run_trajectory, load_truth
+from photonpano.evaluation.rotations import RotationScore, Turn, rotation_errors
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 
@@ -10,9 +11,11 @@ __all__ = [
     "Evaluation",
     "ImageScore",
     "Renderer",
+    "RotationScore",
     "RunTrajectory",
     "TrajectoryScore",
     "Truth",
+    "Turn",
     "corner_errors",
     "covered",
     "evaluate",
@@ -21,6 +24,7 @@ __all__ = [
     "load_run_trajectory",
     "load_truth",
     "pair_bound_px",
+    "rotation_errors",
     "true_panorama",
     "white_flux",
 ]

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from photonpano.geometry import Canvas, apply, translation
+from photonpano.geometry import Canvas
 from photonpano.photometry import linear_to_srgb
-from photonpano.values import BoolArray, FluxImage, Homography
+from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
 WHITE_QUANTILE = 0.999
 """Quantile of the true scene that becomes white. The maximum may be a lamp, which would darken everything else."""
@@ -114,39 +114,62 @@ def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, whit
     return ImageScore(psnr_db=psnr, ssim=ssim, compared_share=float(compared.mean()))
 
 
-def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography) -> FluxImage:
+def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, around: FloatArray | None = None) -> FluxImage:
     """Return the true scene on the canvas of a panorama, interpolated bilinearly; NaN outside of the scene.
 
     A scene that is finer than the canvas is averaged over the areas of its pixels, rounded to whole pixels of the scene.
 
     Args:
         scene: (H, W), true flux on the true plane; or (H, W, 3).
-        canvas: the pixel grid of the panorama, whose transform maps the estimated reference plane to it.
+        canvas: the pixel grid of the panorama, which shows the estimated reference plane.
         alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
+        around: (3, 3), the matrix of the camera to whose pixels the alignment maps, if the scene is an equirectangular
+            panorama, 360 degrees wide, whose middle that camera looks at.
     """
     from scipy.ndimage import map_coordinates
 
-    to_scene = alignment @ np.linalg.inv(canvas.transform)
-    scene, offset = _averaged(scene, _pixels_along(to_scene, canvas))
-    to_scene = translation(-offset, -offset) @ to_scene
-    image = np.empty((*canvas.shape, *scene.shape[2:]), dtype=np.float32)
-    columns = np.arange(canvas.width)
+    shape = scene.shape
+    side = _pixels_along(canvas, alignment, around, shape)
+    margin = side if around is not None else 0
+    scene, offset = _averaged(_wrapped(scene, margin), side)
+    image = np.empty((*canvas.shape, *shape[2:]), dtype=np.float32)
     for top in range(0, canvas.height, _ROWS):
-        rows = np.arange(top, min(top + _ROWS, canvas.height))
-        points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        x, y = apply(to_scene, points).T
+        part = canvas.part(0, top, min(_ROWS, canvas.height - top), canvas.width)
+        x, y = np.moveaxis(_scene_points(part, alignment, around, shape), -1, 0)
+        places = [y - offset, x - offset + margin]
         for single, into in zip(_colours(scene), _colours(image), strict=True):
-            sampled = map_coordinates(single, [y, x], order=1, mode="constant", cval=np.nan, output=np.float32)
-            into[rows] = sampled.reshape(len(rows), canvas.width)
+            sampled = map_coordinates(single, places, order=1, mode="constant", cval=np.nan, output=np.float32)
+            into[top : top + part.height] = sampled
     return image
 
 
-def _pixels_along(to_scene: Homography, canvas: Canvas) -> int:
+def _scene_points(canvas: Canvas, alignment: Homography, around: FloatArray | None, scene_shape: tuple[int, ...]) -> FloatArray:
+    """Return the pixels of the scene that the pixels of a canvas show: (H, W, 2); see `true_panorama`."""
+    (p, s), (q, r) = canvas.columns(), canvas.rows()
+    rays = np.stack([np.outer(r, p), np.broadcast_to(q[:, None], canvas.shape), np.outer(r, s)], axis=-1)
+    on_plane = rays @ (alignment @ np.linalg.inv(canvas.plane_to_rays)).T
+    if around is None:
+        depth = on_plane[..., 2:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(on_plane[..., :2] / (depth if canvas.planar else np.where(depth > 0, depth, np.nan)))
+    x, y, z = np.moveaxis(on_plane @ np.linalg.inv(around).T, -1, 0)
+    height, width = scene_shape[:2]
+    angles = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
+    return np.asarray(angles * (width / (2 * np.pi)) + [(width - 1) / 2, (height - 1) / 2])
+
+
+def _pixels_along(canvas: Canvas, alignment: Homography, around: FloatArray | None, scene_shape: tuple[int, ...]) -> int:
     """Return the pixels of the scene along the side of a pixel in the middle of a canvas."""
-    middle = np.array([(canvas.width - 1) / 2, (canvas.height - 1) / 2])
-    here, right, below = apply(to_scene, middle + np.array([[0, 0], [1, 0], [0, 1]]))
+    middle = canvas.part((canvas.width - 1) // 2, (canvas.height - 1) // 2, 2, 2)
+    (here, right), (below, _) = _scene_points(middle, alignment, around, scene_shape)
     (a, b), (c, d) = right - here, below - here
-    return max(1, round(float(np.sqrt(abs(a * d - b * c)))))
+    area = abs(a * d - b * c)
+    return max(1, round(float(np.sqrt(area)))) if np.isfinite(area) else 1
+
+
+def _wrapped(scene: FluxImage, margin: int) -> FluxImage:
+    """Continue a scene all around by columns at both ends."""
+    return np.concatenate([scene[:, -margin:], scene, scene[:, :margin]], axis=1) if margin else scene
 
 
 def _averaged(scene: FluxImage, side: int) -> tuple[FluxImage, float]:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.geometry import Camera, corners, normalised, translation
+from photonpano.evaluation.rotations import Turn
+from photonpano.geometry import PROJECTIONS, Camera, Canvas, corners, nearest_rotations, normalised, translation
 from photonpano.reading import read_arrays, reading
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
@@ -25,11 +26,18 @@ class Truth:
         frame_shape: (height, width) of a frame.
         scene: (H, W) float32, photons per pixel per frame; (H, W, 3) of red, green and blue pixels; None if only the motion is
             known.
+        ideal_homographies: (T, 3, 3), those of a lens without distortion.
+        turn: rotations and camera; None if they are not known.
+        around: whether the scene is an equirectangular panorama, 360 degrees wide; homographies then map to pixels of the
+            camera that looks at its middle.
     """
 
     homographies: FloatArray
     frame_shape: tuple[int, int]
     scene: FluxImage | None
+    ideal_homographies: FloatArray
+    turn: Turn | None = None
+    around: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +46,13 @@ class RunTrajectory:
 
     Attributes:
         homographies: (T, 3, 3), frame pixels to reference pixels.
-        canvas: (3, 3), reference pixels to panorama pixels.
+        canvas: (3, 3), reference pixels to panorama pixels; (a, b, 1) to panorama pixels unless the projection is planar.
         frame_shape: (height, width) of a frame.
         located: (T,), False where a frame lies outside what was located.
         std_px: (T,) expected corner error; NaN if the run did not record it.
         camera: that turns; None if the run knows homographies only.
+        projection: of the panorama.
+        horizon: (3, 3) of the canvas; None for none.
     """
 
     homographies: FloatArray
@@ -51,6 +61,20 @@ class RunTrajectory:
     located: BoolArray
     std_px: FloatArray
     camera: Camera | None = None
+    projection: str = "planar"
+    horizon: FloatArray | None = None
+
+    def canvas_of(self, shape: tuple[int, int]) -> Canvas:
+        """Return the canvas of the panorama, whose (height, width) is known."""
+        matrix = None if self.camera is None or self.projection == "planar" else self.camera.matrix
+        return Canvas(*shape, self.canvas, self.projection, matrix, self.horizon)
+
+    @property
+    def turn(self) -> Turn | None:
+        """Rotations and camera; None if the run knows homographies only."""
+        if self.camera is None:
+            return None
+        return Turn(nearest_rotations(self.camera.rotations(self.homographies)), self.camera)
 
 
 def load_truth(path: Path) -> Truth:
@@ -63,14 +87,17 @@ def load_truth(path: Path) -> Truth:
     Raises:
         InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
     """
-    optional = ("scene", "undistorted_corners")
+    optional = ("scene", "undistorted_corners", "rotations", "camera_matrix", "distortion")
     arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), optional)
     scene = arrays.get("scene")
-    frame_shape = _frame_shape(path, arrays)
+    frame_shape, homographies = _frame_shape(path, arrays), _homographies(path, arrays)
     return Truth(
-        homographies=_homographies(path, arrays) @ _lens(path, arrays, frame_shape),
+        homographies=homographies @ _lens(path, arrays, frame_shape),
         frame_shape=frame_shape,
         scene=None if scene is None else _scene(path, scene),
+        ideal_homographies=homographies,
+        turn=_turn(path, arrays),
+        around=str(arrays.get("scene_projection", "planar")) == "spherical",
     )
 
 
@@ -90,7 +117,7 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
     if not path.exists():
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
     required, error = ("homographies", "canvas", "frame_shape", "located"), ("std_px",)
-    of_camera = ("camera_matrix", "distortion")
+    of_camera = ("camera_matrix", "distortion", "horizon")
     names = ((*required, *error), of_camera) if needs_std_px else (required, (*error, *of_camera))
     arrays = _read_archive(path, "the trajectory of a run", *names)
     homographies = _homographies(path, arrays)
@@ -104,7 +131,9 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
         raise InputError(f"{path}: located must have a flag for each of {len(homographies)} frames, got {located.shape}")
     if std_px.shape != (len(homographies),):
         raise InputError(f"{path}: std_px must have a number for each of {len(homographies)} frames, got {std_px.shape}")
-    camera = None
+    camera, projection = None, str(arrays.get("projection", "planar"))
+    if projection not in PROJECTIONS or (projection != "planar" and "camera_matrix" not in arrays):
+        raise InputError(f"{path}: the projection {projection} is not known, or lacks its camera_matrix")
     if "camera_matrix" in arrays:
         camera = Camera(arrays["camera_matrix"].astype(np.float64), arrays["distortion"].astype(np.float64))
         homographies = camera.homographies(camera.rotations(homographies))
@@ -115,6 +144,8 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
         located.astype(bool),
         std_px.astype(np.float64),
         camera,
+        projection,
+        arrays.get("horizon"),
     )
 
 
@@ -174,11 +205,27 @@ def _homographies(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:
     if homographies.ndim != 3 or homographies.shape[1:] != (3, 3) or not len(homographies):
         raise InputError(f"{path}: homographies must have the shape (frames, 3, 3), got {homographies.shape}")
     try:
-        homographies = normalised(homographies)
+        # Those of a camera that turns by more than 90 degrees have another h33.
+        turns = "camera_matrix" in arrays and np.isfinite(homographies).all()
+        homographies = homographies.astype(np.float64) if turns else normalised(homographies)
         np.linalg.inv(homographies)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise InputError(f"{path}: homographies must be finite and invertible") from error
     return homographies
+
+
+def _turn(path: Path, arrays: Mapping[str, NDArray[Any]]) -> Turn | None:
+    """Return the rotations and the camera of a truth that has them."""
+    if not {"rotations", "camera_matrix"} <= set(arrays):
+        return None
+    rotations, matrix = arrays["rotations"].astype(np.float64), arrays["camera_matrix"].astype(np.float64)
+    if rotations.shape != arrays["homographies"].shape or not np.isfinite(rotations).all():
+        raise InputError(f"{path}: rotations must be finite and of the shape of homographies, got {rotations.shape}")
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.linalg.det(matrix):
+        raise InputError(f"{path}: camera_matrix must be finite and invertible, of the shape (3, 3)")
+    distortion = arrays.get("distortion", np.zeros(4))
+    # Another model of the lens has two numbers.
+    return Turn(rotations, Camera(matrix, distortion.astype(np.float64) if distortion.shape == (4,) else np.zeros(4)))
 
 
 def _lens(path: Path, arrays: Mapping[str, NDArray[Any]], frame_shape: tuple[int, int]) -> Homography:

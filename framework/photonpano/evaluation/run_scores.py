@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
+
+import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.evaluation.images import ImageScore, covered, image_score, known, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
+from photonpano.evaluation.rotations import RotationScore, rotation_errors, turned_alignment
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
-from photonpano.geometry import Canvas, FrameTrajectory, inverse, normalised
+from photonpano.geometry import Canvas, FrameTrajectory, inverse, scaled_ahead
 from photonpano.protocols import Trajectory
 from photonpano.record.contents import require_one_run
 from photonpano.values import Panorama
@@ -30,6 +33,7 @@ class Evaluation:
 
     Attributes:
         trajectory: corner errors.
+        rotation: errors of the rotations and of the focal length; None if the run, or the truth, knows none.
         honest_share: share of the located frames whose corner error is at most three times the expected one, `std_px`.
         panorama: the panorama against the true scene; None if the truth has no scene.
         oracle: the panorama along the true motion, over the same pixels; None if it was not requested.
@@ -41,6 +45,7 @@ class Evaluation:
     panorama: ImageScore | None = None
     oracle: ImageScore | None = None
     white_flux: float | None = None
+    rotation: RotationScore | None = None
 
     @property
     def below_oracle_db(self) -> float | None:
@@ -66,10 +71,10 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     run = load_run_trajectory(folder)
     truth = load_truth(truth_path)
     _check_same_capture(folder, run, truth_path, truth)
-    motion = corner_errors(run.homographies, truth.homographies, run.frame_shape, run.located)
+    motion, rotation = _motion_scores(run, truth)
     honest_share = float((motion.errors_px <= 3 * run.std_px)[run.located].mean())
     if truth.scene is None:
-        return Evaluation(motion, honest_share)
+        return Evaluation(motion, honest_share, rotation=rotation)
 
     white = white_flux(truth.scene)
     if not white > 0:
@@ -78,12 +83,14 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     if flux.shape[2:] != truth.scene.shape[2:]:
         kinds = ["grey" if image.ndim == 2 else "in colour" for image in (flux, truth.scene)]
         raise InputError(f"{folder}: the panorama is {kinds[0]}, and the true scene of {truth_path} is {kinds[1]}")
-    canvas = Canvas(flux.shape[0], flux.shape[1], run.canvas)
-    true_image = true_panorama(truth.scene, canvas, motion.alignment)
+    canvas = run.canvas_of((flux.shape[0], flux.shape[1]))
+    around = truth.turn.camera.matrix if truth.around and truth.turn is not None else None
+    true_image = true_panorama(truth.scene, canvas, motion.alignment, around)
     compared = covered(weight) & known(true_image) & known(flux)
     oracle = None
     if render is not None:
-        true_motion = normalised(inverse(motion.alignment) @ truth.homographies)
+        true_homographies = truth.homographies if run.camera is None else truth.ideal_homographies
+        true_motion = scaled_ahead(inverse(motion.alignment) @ true_homographies)
         oracle = render(FrameTrajectory(true_motion), canvas)
         compared &= covered(oracle.weight)
     if not compared.any():
@@ -94,7 +101,24 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
         panorama=image_score(flux, true_image, compared, white),
         oracle=None if oracle is None else image_score(oracle.flux, true_image, compared, white),
         white_flux=white,
+        rotation=rotation,
     )
+
+
+def _motion_scores(run: RunTrajectory, truth: Truth) -> tuple[TrajectoryScore, RotationScore | None]:
+    """Compare the motion of a run with the true one."""
+    shape, located, found = run.frame_shape, run.located, run.turn
+    if found is not None and truth.turn is not None:
+        start = turned_alignment(found, truth.turn, truth.ideal_homographies, located)
+        motion = corner_errors(run.homographies, truth.ideal_homographies, shape, located, start)
+        return motion, rotation_errors(found, truth.turn, located)
+    if not truth.around:
+        return corner_errors(run.homographies, truth.homographies, shape, located), None
+    # No plane before the camera holds a whole turn, but that of a located frame holds what the run located in a plane.
+    places = np.flatnonzero(located)
+    plane = truth.homographies[places[len(places) // 2]]
+    motion = corner_errors(run.homographies, scaled_ahead(np.linalg.inv(plane) @ truth.homographies), shape, located)
+    return replace(motion, alignment=plane @ motion.alignment), None
 
 
 def _check_same_capture(folder: Path, run: RunTrajectory, truth_path: Path, truth: Truth) -> None:

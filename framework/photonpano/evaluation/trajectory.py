@@ -39,7 +39,11 @@ class TrajectoryScore:
 
 
 def corner_errors(
-    estimated: FloatArray, true: FloatArray, frame_shape: tuple[int, int], located: BoolArray | None = None
+    estimated: FloatArray,
+    true: FloatArray,
+    frame_shape: tuple[int, int],
+    located: BoolArray | None = None,
+    start: Homography | None = None,
 ) -> TrajectoryScore:
     """Score a trajectory against the true one.
 
@@ -51,6 +55,7 @@ def corner_errors(
         true: (T, 3, 3), frame pixels to pixels of the true plane.
         frame_shape: (height, width) of a frame.
         located: (T,) the frames to compare, and to which the planes are aligned; all by default.
+        start: (3, 3) near the alignment; needed where a camera turns too far for one plane.
 
     Raises:
         ValueError: the trajectories differ in length, or no frame is located.
@@ -58,7 +63,7 @@ def corner_errors(
     counted = np.ones(len(true), dtype=bool) if located is None else np.asarray(located, dtype=bool)
     if not len(estimated) == len(true) == len(counted):
         raise ValueError(f"{len(estimated)} estimated and {len(true)} true homographies, {len(counted)} flags: give one each")
-    alignment = align_planes(estimated[counted], true[counted], frame_shape)
+    alignment = align_planes(estimated[counted], true[counted], frame_shape, start)
     in_frame = np.linalg.inv(true) @ (alignment @ estimated)
     errors = corner_displacements(in_frame, np.eye(3), frame_shape).mean(axis=-1)
     compared = errors[counted]

@@ -54,7 +54,7 @@ def test_load_truth_names_missing_arrays(capture):
     capture.write()
     assert failure(capture) == (
         "truth.npz lacks homographies; a truth as `photonpano simulate` writes it contains homographies, frame_shape, scene, "
-        "undistorted_corners; this file contains frame_shape, scene"
+        "undistorted_corners, rotations, camera_matrix, distortion; this file contains frame_shape, scene"
     )
 
 
@@ -86,7 +86,8 @@ def test_load_truth_refuses_single_array(capture):
         np.save(file, capture.true["homographies"])
     assert failure(capture) == (
         "truth.npz lacks homographies and frame_shape; a truth as `photonpano simulate` writes it contains homographies, "
-        "frame_shape, scene, undistorted_corners; this file contains an array without a name"
+        "frame_shape, scene, undistorted_corners, rotations, camera_matrix, distortion; this file contains an array without a "
+        "name"
     )
 
 
