@@ -9,6 +9,8 @@ from .api.explanation import explain as explain
 from .api.explanation import forecast as forecast
 from .api.pictures import Preview as Preview
 from .api.pictures import preview as preview
+from .api.poses import ExportedPoses as ExportedPoses
+from .api.poses import export as export
 from .api.rendering import RenderResult as RenderResult
 from .api.rendering import render as render
 from .api.run_check import RunCheck as RunCheck

@@ -15,6 +15,7 @@ from photonpano.cli.ending import end_on_signals, leave
 from photonpano.cli.errors import FAILED, SIGNALLED, print_error, reported
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
+from photonpano.cli.export import export
 from photonpano.cli.info import info
 from photonpano.cli.plugins import plugins
 from photonpano.cli.preview import preview
@@ -49,7 +50,7 @@ app = typer.Typer(
 )
 _COMMANDS = (
     *(run, check, check_run, verify, render, explain, info, preview, convert),
-    *(simulate, dark, evaluate, clean, schema, warm_up),
+    *(export, simulate, dark, evaluate, clean, schema, warm_up),
 )
 for command in _COMMANDS:
     app.command()(command)

@@ -51,6 +51,7 @@ def test_commands_are_complete() -> None:
         "info",
         "preview",
         "convert",
+        "export",
         "simulate",
         "dark",
         "evaluate",

@@ -1,0 +1,77 @@
+"""Export the poses of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from photonpano.atomic import atomic_folder
+from photonpano.errors import InputError
+from photonpano.evaluation import load_run_trajectory
+from photonpano.poses import POSE_FORMATS, PoseFormat, Poses
+from photonpano.record.contents import require_one_run
+from photonpano.record.run_json import read_record
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedPoses:
+    """Poses that were written.
+
+    Attributes:
+        files: their paths.
+        n_frames: frames with a pose.
+    """
+
+    files: tuple[Path, ...]
+    n_frames: int
+
+
+def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, every: int = 1) -> ExportedPoses:
+    """Write the rotations and the camera of a run for another program.
+
+    Frames that were not located are left out.
+
+    Args:
+        run_folder: written by `run`, with the model `rotation`.
+        file_format: "colmap" (text model), "nerfstudio" (transforms.json) or "tum" (trajectory).
+        output: a new folder.
+        every: 1 for all located frames, 2 for every other, and so on.
+
+    Raises:
+        InputError: the folder is no run folder, the run knows no rotations, or no frame is located; for "tum", the frame rate
+            of the capture is not known.
+        OutputError: the folder cannot be written, or is there already.
+        ValueError: the format is not known, or `every` is below 1.
+    """
+    if file_format not in POSE_FORMATS or every < 1:
+        raise ValueError(
+            f"file_format must be one of {', '.join(POSE_FORMATS)}, and every at least 1; got {file_format!r} and {every}"
+        )
+    folder, output = Path(run_folder), Path(output)
+    files = POSE_FORMATS[file_format](poses := _poses(folder, every, needs_seconds=file_format == "tum"))
+    with atomic_folder(output) as written:
+        for name, text in files.items():
+            (written / name).write_text(text, encoding="utf-8")
+    return ExportedPoses(tuple(output / name for name in files), len(poses.frames))
+
+
+def _poses(folder: Path, every: int, needs_seconds: bool) -> Poses:
+    require_one_run(folder, ["trajectory.npz"])
+    run = load_run_trajectory(folder, needs_std_px=False)
+    if run.turn is None:
+        raise InputError(
+            f"{folder} knows homographies, and no rotations of a camera; run its spec again with --set motion.model=rotation"
+        )
+    frames = np.flatnonzero(run.located)[::every]
+    if not len(frames):
+        raise InputError(f"{folder}: the run located no frame, so that it has no poses")
+    rate = read_record(folder)["source"]["frame_rate_hz"]
+    if rate is None and needs_seconds:
+        raise InputError(
+            f"{folder} knows no frame rate, which the times of the format tum need; set source.with.frame_rate_hz and run "
+            "the spec again"
+        )
+    digits = len(str(len(run.located) - 1))
+    return Poses(run.turn.camera, run.frame_shape, frames, run.turn.rotations[frames], frames / (rate or 1.0), digits)
