@@ -55,6 +55,7 @@ from .protocols import InterpolatesTurns as InterpolatesTurns
 from .protocols import Interpolator as Interpolator
 from .protocols import KeepsHypotheses as KeepsHypotheses
 from .protocols import KnowsTruth as KnowsTruth
+from .protocols import LensedSource as LensedSource
 from .protocols import LinearlyCorrectedSource as LinearlyCorrectedSource
 from .protocols import LitSource as LitSource
 from .protocols import Locator as Locator
@@ -67,6 +68,7 @@ from .protocols import Resampler as Resampler
 from .protocols import Source as Source
 from .protocols import Trajectory as Trajectory
 from .protocols import WeightedSource as WeightedSource
+from .protocols import camera_of as camera_of
 from .registry import Catalog as Catalog
 from .registry import discover as discover
 from .specs import Plan as Plan

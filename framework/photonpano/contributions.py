@@ -292,12 +292,15 @@ class RendererContribution(StageContribution):
             memory of the run in tiles.
         divides_by_light: whether it divides by the gains of a `LitSource`, as `photonpano.merging.accumulate` does. If not, a
             run in changing light warns that the panorama shows the light of the moment.
+        renders_on_any_canvas: whether it renders on a canvas of any projection, and a `LensedSource` through its lens, as
+            `photonpano.merging.accumulate` does. If not, a run that needs it is refused.
     """
 
     kind: ClassVar[str] = "renderer"
     build: Callable[[Any, StageContext], Renderer]
     bytes_per_pixel: int = 40
     divides_by_light: bool = False
+    renders_on_any_canvas: bool = False
 
     def __post_init__(self) -> None:
         StageContribution.__post_init__(self)

@@ -22,6 +22,10 @@ class ExtentError(InputError):
     """No frame shows the part of the panorama that is to be rendered."""
 
 
+class ProjectionError(InputError):
+    """The motion does not suit the projection that was asked for."""
+
+
 class LocationError(PhotonpanoError):
     """Too few exposures could be located against each other to go on."""
 

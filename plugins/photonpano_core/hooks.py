@@ -158,6 +158,7 @@ def photonpano_renderers() -> Iterator[RendererContribution]:
         config=MergeConfig,
         build=_build_merge,
         divides_by_light=True,
+        renders_on_any_canvas=True,
     )
     yield RendererContribution(
         name="super-resolution",

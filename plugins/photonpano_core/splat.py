@@ -15,6 +15,7 @@ from photonpano import (
     Source,
     Trajectory,
     VirtualExposure,
+    camera_of,
 )
 from photonpano.geometry import apply, corners, inverse
 from photonpano.merging import PhotonSum, gain_image
@@ -40,13 +41,15 @@ class SplatMerger:
         """Merge a group; see `photonpano.Merger`.
 
         Raises:
-            InputError: the source corrects sums of frames, which this merger does not make.
+            InputError: the source corrects sums of frames, which this merger does not make, or its lens distorts.
         """
         if isinstance(source, LinearlyCorrectedSource):
             raise InputError(
                 "merge.use: splat warps photons one by one, so that it cannot subtract dark counts, interpolate pixels or "
                 "compare colours; use photon-mle, or only corrections that move or mask pixels"
             )
+        if (camera := camera_of(source)) is not None and camera.distorts:
+            raise InputError("merge.use: splat does not warp through a lens that distorts; use photon-mle")
         if trajectory is None:
             photons = unwarped_sum(source, group, scale)
         else:

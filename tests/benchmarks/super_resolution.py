@@ -35,7 +35,8 @@ from photonpano.evaluation.images import covered, image_score, true_panorama, wh
 from photonpano.evaluation.inputs import load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.trajectory import corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import render
 from photonpano.pipeline.components import open_source
 
 FLUXES = (0.5, 0.1, 0.02)

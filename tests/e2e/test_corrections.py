@@ -17,7 +17,8 @@ from photonpano.captures.writing import truth_path, write_packed
 from photonpano.cli.app import app
 from photonpano.context import Context
 from photonpano.evaluation import Evaluation
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import render
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import forecast
 from photonpano.specs import parse_spec

@@ -17,7 +17,7 @@ import photonpano
 from photonpano.captures.writing import truth_path
 from photonpano.evaluation import Evaluation, corner_errors
 from photonpano.geometry import rescaling, translation
-from photonpano.merging.panorama import BYTES_PER_PIXEL
+from photonpano.merging.canvas_plan import BYTES_PER_PIXEL
 from photonpano.pipeline.run import RunResult
 from photonpano.specs import Plan, parse_spec
 

@@ -68,6 +68,11 @@ class Canvas:
         """Columns of a full turn; None for a planar canvas."""
         return None if self.planar else float(2 * np.pi * self.transform[0, 0])
 
+    @property
+    def is_full_turn(self) -> bool:
+        """Whether the last column is beside the first one."""
+        return self.period_px is not None and abs(self.width - self.period_px) < 1e-6 * self.width
+
     def columns(self) -> tuple[FloatArray, FloatArray]:
         """Return p and s of each column, (W,): the ray of a pixel (x, y) is `(p[x] r[y], q[y], s[x] r[y])`."""
         x = np.arange(self.width, dtype=np.float64)
@@ -79,9 +84,18 @@ class Canvas:
         return self._projection.down(y if self.planar else (y - self.transform[1, 2]) / self.transform[1, 1])
 
     def pixels(self, rays: FloatArray) -> FloatArray:
-        """Return where (..., 3) rays lie on the canvas: (..., 2). Columns of full turns are the same place."""
+        """Return where (..., 3) rays lie on the canvas, or beside it: (..., 2); NaN behind a plane.
+
+        Of the columns of full turns, which are the same place, it is the one on the canvas.
+        """
         points = self._projection.points(rays)
-        return points if self.planar else np.asarray(points * np.diag(self.transform)[:2] + self.transform[:2, 2])
+        period = self.period_px
+        if period is None:
+            return points
+        places = np.asarray(points * np.diag(self.transform)[:2] + self.transform[:2, 2])
+        first = min(-0.5, (self.width - 1 - period) / 2)
+        places[..., 0] -= period * np.floor((places[..., 0] - first) / period)
+        return places
 
     def part(self, left: int, top: int, height: int, width: int) -> Canvas:
         """Return the canvas of a box of pixels."""
@@ -103,18 +117,21 @@ class Canvas:
         return PROJECTIONS[self.projection]
 
 
-def canvas_of(homographies: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
-    """Return the smallest canvas that holds every frame.
+def canvas_of(
+    homographies: FloatArray, frame_shape: tuple[int, int], scale: float, outline: FloatArray | None = None
+) -> Canvas:
+    """Return the smallest planar canvas that holds every frame.
 
     Args:
         homographies: (N, 3, 3), frame pixels to reference pixels.
         frame_shape: (height, width) of a frame.
         scale: pixels of the canvas per pixel of the reference frame.
+        outline: (P, 2) ideal pixels around a frame that a lens distorts; by default its corners.
 
     Raises:
         ValueError: a frame reaches the horizon of the reference plane, so that no finite canvas holds it.
     """
-    frame = corners(frame_shape)
+    frame = corners(frame_shape) if outline is None else outline
     depth = (homographies[:, 2:, :2] @ frame.T + homographies[:, 2:, 2:]).min(axis=(1, 2))
     if depth.min() <= 0:
         index = int(np.argmin(depth))

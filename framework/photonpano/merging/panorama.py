@@ -1,4 +1,4 @@
-"""Render the panorama: choose its canvas, divide it into tiles that fit into memory, render all located frames on each."""
+"""Render the panorama: divide its canvas into tiles that fit into memory, render all located frames on each."""
 
 from __future__ import annotations
 
@@ -12,20 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.errors import CanvasTooLargeError, ExtentError, LocationError
-from photonpano.geometry import Canvas, Extent, apply, canvas_of, canvas_of_box, inverse, rescaling, translation
+from photonpano.errors import ExtentError
+from photonpano.geometry import Canvas, Extent, rescaling
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
+from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, View, plan_canvas
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.light import bytes_of_light
 from photonpano.merging.merge_renderer import MergeRenderer
 from photonpano.photometry import Tone, WhiteBalance, balanced, picture_of
 from photonpano.protocols import Renderer, Source, Trajectory
 from photonpano.values import FluxImage, FrameSpan, Panorama
-
-BYTES_PER_PIXEL = 40
-"""Peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests."""
-MAX_EXCESS = 16
-"""A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time."""
 
 
 class RenderOptions(Protocol):
@@ -82,83 +78,6 @@ class Tile:
     canvas: Canvas
 
 
-def plan_canvas(
-    trajectory: Trajectory,
-    span: FrameSpan,
-    frame_shape: tuple[int, int],
-    scale: float,
-    memory: int,
-    bytes_per_pixel: int = BYTES_PER_PIXEL,
-    extent: Extent = "panorama",
-) -> Canvas:
-    """Choose the canvas that holds every frame of a span, or a part of it, before anything of its size is allocated.
-
-    Args:
-        trajectory: the motion, frame pixels to reference pixels.
-        span: the frames to show.
-        frame_shape: (height, width) of a frame.
-        scale: pixels of the canvas per pixel of the reference frame.
-        memory: bytes that rendering may take.
-        bytes_per_pixel: bytes that rendering takes for a pixel of the canvas.
-        extent: the part, by default everything.
-
-    Raises:
-        ExtentError: no frame shows the extent.
-        CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
-            a scale that fits.
-        LocationError: frames reach the horizon of the reference plane.
-    """
-    homographies = trajectory.at(np.arange(span.start, span.stop))
-    try:
-        canvas = canvas_of(homographies, frame_shape, scale)
-    except ValueError as error:
-        raise LocationError(
-            f"the motion turns so far away from the reference frame that a flat panorama cannot show it ({error}); "
-            "choose a render.reference in the middle of the motion, or fewer frames"
-        ) from error
-    if extent != "panorama":
-        canvas = _part_of(canvas, box_of(extent, frame_shape), scale)
-    excess = canvas.height * canvas.width * bytes_per_pixel / memory
-    if excess > MAX_EXCESS:
-        fitting = scale * np.sqrt(MAX_EXCESS / excess)
-        raise CanvasTooLargeError(
-            f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
-            f"{_gib(memory)} of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
-            "More often means that the motion is wrong. Raise run.memory, "
-            f"lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
-            "or choose a render.reference nearer to the middle of the motion"
-        )
-    return canvas
-
-
-def box_of(extent: Extent, frame_shape: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the box of a part of the panorama, in pixels of the reference frame.
-
-    Args:
-        extent: the part; not the whole panorama.
-        frame_shape: (height, width) of a frame.
-    """
-    return (0, 0, *frame_shape[::-1]) if isinstance(extent, str) else extent
-
-
-def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Canvas:
-    """Return the canvas of a box in pixels of the reference frame.
-
-    Raises:
-        ExtentError: it lies outside the whole canvas.
-    """
-    part = canvas_of_box(box, scale)
-    ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
-    (left, top), (right, bottom) = np.rint(apply(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
-    x0, y0, x1, y1 = box
-    if x1 <= left or x0 > right or y1 <= top or y0 > bottom:
-        raise ExtentError(
-            f"[{x0}, {y0}, {x1}, {y1}] lies outside the panorama, which holds x from {left} to {right} and "
-            f"y from {top} to {bottom}, in pixels of the reference frame"
-        )
-    return part
-
-
 def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL) -> tuple[tuple[Tile, ...], int]:
     """Divide the longer side of a canvas into tiles that are rendered one by one within the memory.
 
@@ -178,7 +97,7 @@ def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL
         size = min(length, longer - start)
         left, top = (start, 0) if canvas.width == longer else (0, start)
         height, width = (canvas.height, size) if canvas.width == longer else (size, canvas.width)
-        tiles.append(Tile(left, top, Canvas(height, width, translation(-left, -top) @ canvas.transform)))
+        tiles.append(Tile(left, top, canvas.part(left, top, height, width)))
     return tuple(tiles), reduction
 
 
@@ -318,7 +237,8 @@ def render_panorama(
     write_tile: Callable[[Tile, Panorama, Canvas], object],
     context: Context,
     bytes_per_pixel: int = BYTES_PER_PIXEL,
-    ready: Panorama | None = None,
+    view: View | None = None,
+    ready: tuple[Canvas, Panorama] | None = None,
 ) -> RenderedPanorama:
     """Render the frames of a span, in tiles if the panorama exceeds the memory.
 
@@ -332,21 +252,24 @@ def render_panorama(
         write_tile: called with each tile, its flux and weight, and the whole canvas.
         context: threads and progress.
         bytes_per_pixel: bytes that the renderer takes for a pixel of the canvas, in one colour.
-        ready: what `render` would render of the same frames along the same motion; used if it lies on the same canvas.
+        view: how the panorama is projected; on a plane by default.
+        ready: what `render` would render of the same frames along the same motion, and its canvas; used if it is the same.
 
     Raises:
         ExtentError: no frame shows the extent.
         CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
         LocationError: frames reach the horizon of the reference plane.
+        ProjectionError: the motion does not suit the projection.
     """
     start = time.perf_counter()
     bytes_per_pixel = (bytes_per_pixel + bytes_of_light(source)) * channels_of(source)
-    canvas = plan_canvas(trajectory, span, source.info.frame_shape, options.scale, memory, bytes_per_pixel, options.extent)
+    shown = trajectory, span, source.info.frame_shape
+    canvas = plan_canvas(*shown, options.scale, memory, bytes_per_pixel, options.extent, view)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas)
     dynamic_range = DynamicRange(noise)
-    if ready is not None and len(tiles) == 1 and _lies_on(ready, canvas):
-        rendered = iter([ready])
+    if ready is not None and len(tiles) == 1 and ready[0].same_as(canvas):
+        rendered = iter([ready[1]])
     else:
         rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
     for tile, images in zip(tiles, rendered, strict=True):
@@ -357,24 +280,10 @@ def render_panorama(
     if options.extent != "panorama" and not gathered.coverage_share:
         raise ExtentError("no frame that was located shows it; choose a part of the panorama")
     thumbnail = gathered.panorama
-    shown = balanced(thumbnail.flux, options.white_balance)
-    lit = shown[np.isfinite(shown)]
+    lit_picture = balanced(thumbnail.flux, options.white_balance)
+    lit = lit_picture[np.isfinite(lit_picture)]
     white_flux = (float(np.quantile(lit, options.white_quantile)) if lit.size else 0.0) or 1.0
-    picture = picture_of(shown, white_flux, options.tone, options.exposure_stops)
+    picture = picture_of(lit_picture, white_flux, options.tone, options.exposure_stops)
     seconds = time.perf_counter() - start
     share, white_flux = gathered.coverage_share, white_flux / 2**options.exposure_stops
     return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, noise, dynamic_range)
-
-
-def _lies_on(panorama: Panorama, canvas: Canvas) -> bool:
-    return panorama.flux.shape[:2] == canvas.shape and np.array_equal(panorama.canvas, canvas.transform)
-
-
-def _gib(size: float) -> str:
-    return f"{size / 1024**3:.2g} GiB"
-
-
-def _rounded_down(scale: float) -> float:
-    """Round down to two significant digits, so that the suggested scale fits."""
-    digit = 10.0 ** (np.floor(np.log10(scale)) - 1)
-    return float(np.floor(scale / digit) * digit)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from photonpano.geometry import Camera, FrameTrajectory, nearest_rotations
+from photonpano.merging.canvas_plan import View
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.turning import TurningTrajectory
-from photonpano.protocols import Trajectory
+from photonpano.protocols import Source, Trajectory, camera_of
 from photonpano.values import BoolArray, FloatArray, FrameSpan, StreamInfo
 
 
@@ -45,6 +46,12 @@ class FrameMotion:
     def rotations(self) -> FloatArray | None:
         """Rotations from the camera at each frame to that at the reference frame, (T, 3, 3); None without a camera."""
         return None if self.camera is None else nearest_rotations(self.camera.rotations(self.homographies))
+
+
+def view_of(motion: FrameMotion, source: Source, projection: str = "auto", *, level: bool = False) -> View:
+    """Return how the panorama of a capture along a motion is projected."""
+    turns = motion.camera is not None
+    return View(projection, level, motion.camera if turns else camera_of(source), turns)
 
 
 def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, reference: int) -> FrameMotion:

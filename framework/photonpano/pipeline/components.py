@@ -188,7 +188,8 @@ def build_renderer(plan: Plan, source: Source, decisions: list[Decision]) -> Att
             f"{choice.label} does not divide by the light, which changes: the panorama shows each place in the mean light of "
             "the frames that saw it; render with {use: merge} to divide by it"
         )
-    return AttributedRenderer(_built(choice, context), choice.label, contribution.bytes_per_pixel)
+    any_canvas = contribution.renders_on_any_canvas
+    return AttributedRenderer(_built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
 
 
 def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:

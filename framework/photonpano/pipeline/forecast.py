@@ -10,8 +10,9 @@ import numpy as np
 from photonpano.captures.part import part_of
 from photonpano.context import Context
 from photonpano.geometry import canvas_of_box
+from photonpano.merging.canvas_plan import box_of, plan_canvas
 from photonpano.merging.colour import channels_of
-from photonpano.merging.panorama import box_of, plan_canvas, render
+from photonpano.merging.panorama import render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels, build_renderer
 from photonpano.pipeline.estimate import model_of

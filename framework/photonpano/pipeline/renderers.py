@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photonpano.errors import InputError
 from photonpano.geometry import Canvas
 from photonpano.merging import MergeRenderer
 from photonpano.motion.attribution import BrokenContract, attributing, shown
-from photonpano.protocols import Renderer, Source, Trajectory
+from photonpano.protocols import Renderer, Source, Trajectory, camera_of
 from photonpano.values import FrameSpan, Panorama
 
 
@@ -22,11 +23,13 @@ class AttributedRenderer:
         component: the renderer.
         origin: who provides it, such as "renderer 'merge' of photonpano 0.1.0".
         bytes_per_pixel: peak memory of rendering for a pixel of the canvas.
+        any_canvas: whether it renders on a canvas of any projection, and through a lens.
     """
 
     component: Renderer
     origin: str
     bytes_per_pixel: int
+    any_canvas: bool = True
 
     @property
     def merges(self) -> bool:
@@ -45,10 +48,23 @@ class AttributedRenderer:
         """Render the frames of a span on a canvas.
 
         Raises:
+            InputError: it renders no such canvas, or not through a lens.
             PluginError: the renderer failed, or broke its contract.
         """
+        self._require_renderable(source, canvas)
         with attributing(self.origin, "the panorama"):
             return require_panorama(self.component.render(source, trajectory, span, canvas, tolerance_px, advance), canvas)
+
+    def _require_renderable(self, source: Source, canvas: Canvas) -> None:
+        if self.any_canvas:
+            return
+        if not canvas.planar:
+            raise InputError(
+                f"{self.origin} renders on a plane only, and this panorama is {canvas.projection}; write render.use: merge, or "
+                "render.projection: planar"
+            )
+        if (camera := camera_of(source)) is not None and camera.distorts:
+            raise InputError(f"{self.origin} does not render through a lens that distorts; write render.use: merge")
 
     def require_seen(self, coverage_share: float) -> None:
         """Refuse a panorama of which nothing was seen, although frames were located.

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 from photonpano.context import Context
 from photonpano.corrections import Vignette
-from photonpano.errors import ExtentError, InputError
+from photonpano.errors import ExtentError, InputError, ProjectionError
+from photonpano.geometry import Canvas
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
-from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.pipeline.components import build_exporters, build_renderer
 from photonpano.pipeline.exports import export_all
 from photonpano.pipeline.run_folder import RunFolder
@@ -37,7 +38,7 @@ def render_into(
     vignette: Vignette | None,
     motion: FrameMotion,
     context: Context,
-    ready: Panorama | None = None,
+    ready: tuple[Canvas, Panorama] | None = None,
 ) -> Rendering:
     """Render the panorama, and write it, its motion, and what its capture was divided by.
 
@@ -48,11 +49,11 @@ def render_into(
         vignette: by which it is divided.
         motion: of every frame.
         context: threads, progress and checkpoints.
-        ready: the merge of all frames along this motion, where it is known.
+        ready: the merge of all frames along this motion, and its canvas, where it is known.
 
     Raises:
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
-        InputError: no frame shows the extent.
+        InputError: no frame shows the extent, or the motion does not suit the projection.
         LocationError: frames reach the horizon of the reference plane.
         OutputError: a file cannot be written.
         PluginError: the renderer or an exporter failed, or broke its contract.
@@ -70,10 +71,13 @@ def render_into(
             folder.write_tile,
             context,
             renderer.bytes_per_pixel,
+            view_of(motion, source, plan.render.projection, level=plan.render.horizon == "level"),
             ready if renderer.merges else None,
         )
     except ExtentError as error:
         raise InputError(str(plan.place("render.extent").problem(str(error)))) from error
+    except ProjectionError as error:
+        raise InputError(str(plan.place("render.projection").problem(str(error)))) from error
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
     export_all(exporters, folder.staging, panorama)

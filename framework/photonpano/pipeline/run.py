@@ -116,7 +116,7 @@ def run(
         explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)
         verdict = judge(explained, found.results, decisions)
         motion = explained.motion
-        rendering = render_into(folder, plan, source, found.vignette, motion, context, explained.panorama)
+        rendering = render_into(folder, plan, source, found.vignette, motion, context, (explained.canvas, explained.panorama))
         panorama, rendered = rendering.panorama, rendering.decisions
         observers.rendered(panorama.canvas, panorama.seconds)
         seconds = time.perf_counter() - start

@@ -73,6 +73,8 @@ class RunFolder:
             motion_arrays: dict[str, Any] = {
                 "homographies": motion.homographies,
                 "canvas": panorama.canvas.transform,
+                "projection": np.array(panorama.canvas.projection),
+                "horizon": np.eye(3) if panorama.canvas.horizon is None else panorama.canvas.horizon,
                 "frame_shape": np.array(motion.frame_shape),
                 "reference": np.array(motion.reference),
                 "located": motion.located,

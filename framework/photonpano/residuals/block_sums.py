@@ -47,6 +47,26 @@ def sample_view(
 
 
 @compiled
+def sample_places(
+    mean: NDArray[np.float32], precision: NDArray[np.float32], places: NDArray[np.float32], into: NDArray[np.float32]
+) -> None:
+    """Sample two images at (h, w, 2) places, as `sample_view` does: (2, h, w); NaN where the images end."""
+    right, bottom = np.float32(mean.shape[1] - 1), np.float32(mean.shape[0] - 1)
+    for y in range(into.shape[1]):
+        for t in range(into.shape[2]):
+            u, v = places[y, t, 0], places[y, t, 1]
+            if not (u >= 0 and u <= right and v >= 0 and v <= bottom):
+                into[0, y, t] = into[1, y, t] = np.nan
+                continue
+            left, top = min(int(u), mean.shape[1] - 2), min(int(v), mean.shape[0] - 2)
+            a, b = u - np.float32(left), v - np.float32(top)
+            upper = mean[top, left] + a * (mean[top, left + 1] - mean[top, left])
+            lower = mean[top + 1, left] + a * (mean[top + 1, left + 1] - mean[top + 1, left])
+            into[0, y, t] = upper + b * (lower - upper)
+            into[1, y, t] = precision[top + int(b > 0.5), left + int(a > 0.5)]
+
+
+@compiled
 def add_block_sums(
     counts: NDArray[np.float32] | NDArray[np.int32],
     dark: NDArray[np.float32],

@@ -287,7 +287,7 @@ class _Colour:
 def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice) -> _Batch:
     first = predictions.first
     shape = first.frame_shape
-    grid, cells = n_blocks(shape), n_blocks(first.mean.shape)
+    grid, cells = n_blocks(shape), n_blocks(first.canvas.shape)
     spans, homographies = spans[batch], homographies[batch]
     height, width = shape
     row, column = np.mgrid[: grid[0], : grid[1]]
@@ -325,8 +325,7 @@ def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies
         total.misfit[index] = fold(
             sums,
             lever,
-            middle,
-            first.canvas @ homography,
+            *first.cells(homography, middle),
             1 - own,
             total.normal[index],
             total.gradient[index],

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import corners
+from photonpano.geometry import Camera, Canvas, corners
 from photonpano.merging.light import gain_image
-from photonpano.protocols import ColouredSource, Source, Trajectory, light_of
-from photonpano.residuals.block_sums import sample_view
-from photonpano.values import FluxImage, FrameSpan, Homography, Light, Panorama, Response
+from photonpano.protocols import ColouredSource, Source, Trajectory, camera_of, light_of
+from photonpano.residuals.block_sums import sample_places, sample_view
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
 _BLUR_PX = 0.7
 """Standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture."""
@@ -20,6 +20,8 @@ _INTERPOLATION_PX2 = 1 / 6
 """Variance of the kernel of one linear interpolation, averaged over the fractions of a pixel."""
 _MANY_FRAMES = 1e4
 """Frames for which the variance of a count is derived; it is then divided by them."""
+_MARGIN = 4
+"""Columns with which a full turn is continued on each side: more than the smoothing reaches."""
 _STRAIGHT_RUN_PX = 64
 """From this length of straight runs on, the compiled interpolation is faster than OpenCV's."""
 
@@ -32,17 +34,20 @@ class Prediction:
     its noise is low and its edges are where they were.
 
     Attributes:
-        canvas: (3, 3), pixels of the reference plane to pixels of the two images.
-        mean: (H, W) float32, expected count of a frame; NaN where the panorama was not seen.
+        canvas: of the panorama.
+        mean: (H, W) float32, expected count of a frame; NaN where the panorama was not seen. Of a full turn, it has `margin`
+            columns more on each side, which continue on the other side.
         precision: (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen.
         trajectory: the motion.
         frame_shape: (height, width) of a frame.
         frames_seen: frames that saw a place of the panorama, the median over its pixels.
         response: of the camera.
         light: the gain of each frame; None in steady light.
+        ideal: (H, W, 3) homogeneous ideal pixels of the pixels of a frame; None if homographies map them to the panorama.
+        margin: see `mean`.
     """
 
-    canvas: Homography
+    canvas: Canvas
     mean: FluxImage
     precision: FluxImage
     trajectory: Trajectory
@@ -50,25 +55,33 @@ class Prediction:
     frames_seen: float
     response: Response
     light: Light | None = None
+    ideal: FloatArray | None = None
+    margin: int = 0
 
     @classmethod
     def of(
         cls,
         panorama: Panorama,
+        canvas: Canvas,
         response: Response,
         trajectory: Trajectory,
         frame_shape: tuple[int, int],
         light: Light | None = None,
+        camera: Camera | None = None,
     ) -> Prediction:
         """Make the prediction of a panorama.
 
         Args:
             panorama: flux and weight, rendered along the trajectory.
+            canvas: on which it was rendered.
             response: the response of the camera.
             trajectory: frame pixels to reference pixels.
             frame_shape: (height, width) of a frame.
             light: the gain of each frame; None in steady light.
+            camera: of the frames; None if it is not known.
         """
+        margin = _MARGIN if canvas.is_full_turn else 0
+        panorama = _continued(panorama, margin)
         seen = panorama.weight > 0
         share = _smoothed(seen.astype(np.float32))
         lit = _smoothed(np.where(seen, panorama.flux, np.float32(0)))
@@ -82,7 +95,9 @@ class Prediction:
         precision = np.asarray(1 / _variance(flux, response), np.float32)
         precision[~inside] = 0
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
-        return cls(panorama.canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light)
+        bent = not canvas.planar or (camera is not None and camera.distorts)
+        ideal = _ideal(frame_shape, camera) if bent else None
+        return cls(canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light, ideal, margin)
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:
         """Sample both images at the pixels of a frame.
@@ -106,7 +121,12 @@ class Prediction:
         precision *= _variance(flux, self.response) / _variance(lit, self.response)
 
     def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
-        to_canvas = np.ascontiguousarray(self.canvas @ homography)
+        if self.ideal is not None:
+            places = self.canvas.pixels(self.ideal @ (self.canvas.plane_to_rays @ homography).T)
+            places[..., 0] += self.margin
+            sample_places(self.mean, self.precision, places.astype(np.float32), into)
+            return
+        to_canvas = np.ascontiguousarray(self.canvas.transform @ homography)
         if self._straight(to_canvas):
             sample_view(self.mean, self.precision, to_canvas, into)
             return
@@ -114,6 +134,17 @@ class Prediction:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         for image, place in zip((self.mean, self.precision), into, strict=True):
             cv2.warpPerspective(image, to_canvas, (width, height), place, flags, cv2.BORDER_CONSTANT, float("nan"))
+
+    def cells(self, homography: Homography, pixels: FloatArray) -> tuple[FloatArray, Homography]:
+        """Return pixels of a frame, (h, w, 2), and the (3, 3) map from them to pixels of the panorama.
+
+        Where no homography maps them, the places on the panorama are returned for the pixels, and the identity.
+        """
+        if self.ideal is None:
+            return pixels, self.canvas.transform @ homography
+        y, x = np.rint(np.moveaxis(pixels, -1, 0)[::-1]).astype(int)
+        places = self.canvas.pixels(self.ideal[y, x] @ (self.canvas.plane_to_rays @ homography).T)
+        return np.where(np.isfinite(places), places, -1e6), np.eye(3)
 
     def predicted(self, instant: float) -> tuple[FluxImage, FluxImage]:
         """Predict the frame of an instant: see `PanoramaView`."""
@@ -147,27 +178,31 @@ class Predictions:
     parts: tuple[tuple[Source, Prediction], ...]
 
     @classmethod
-    def of(cls, source: Source, panorama: Panorama, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Predictions:
+    def of(
+        cls, source: Source, panorama: Panorama, canvas: Canvas, trajectory: Trajectory, frame_shape: tuple[int, int]
+    ) -> Predictions:
         """Make the predictions of a panorama.
 
         Args:
             source: the capture.
             panorama: flux and weight along the trajectory, as `render` returns them for the source.
+            canvas: on which it was rendered.
             trajectory: frame pixels to reference pixels.
             frame_shape: (height, width) of a frame.
         """
+
+        def prediction(each: Source, single: Panorama) -> Prediction:
+            seen = trajectory, frame_shape, light_of(source), camera_of(source)
+            return Prediction.of(single, canvas, each.response, *seen)
+
         if not isinstance(source, ColouredSource):
-            return cls(((source, Prediction.of(panorama, source.response, trajectory, frame_shape, light_of(source))),))
+            return cls(((source, prediction(source, panorama)),))
         images = zip(np.moveaxis(panorama.flux, -1, 0), np.moveaxis(panorama.weight, -1, 0), strict=True)
         singles = [
             Panorama(np.ascontiguousarray(flux), np.ascontiguousarray(weight), panorama.canvas) for flux, weight in images
         ]
-        return cls(
-            tuple(
-                (each, Prediction.of(single, each.response, trajectory, frame_shape, light_of(source)))
-                for each, single in zip(source.colours().values(), singles, strict=True)
-            )
-        )
+        parts = zip(source.colours().values(), singles, strict=True)
+        return cls(tuple((each, prediction(each, single)) for each, single in parts))
 
     @property
     def first(self) -> Prediction:
@@ -188,6 +223,22 @@ class Predictions:
         for (source, _), (of_colour, its_variance) in zip(self.parts, images, strict=True):
             mean[source.valid], variance[source.valid] = of_colour[source.valid], its_variance[source.valid]
         return mean, variance
+
+
+def _continued(panorama: Panorama, margin: int) -> Panorama:
+    """Return a full turn with some columns of each end at the other end."""
+    if not margin:
+        return panorama
+    flux, weight = (np.pad(each, ((0, 0), (margin, margin)), mode="wrap") for each in (panorama.flux, panorama.weight))
+    return Panorama(flux, weight, panorama.canvas)
+
+
+def _ideal(frame_shape: tuple[int, int], camera: Camera | None) -> FloatArray:
+    """Return the homogeneous ideal pixels of the pixels of a frame: (H, W, 3)."""
+    y, x = np.mgrid[: frame_shape[0], : frame_shape[1]]
+    pixels = np.stack([x, y], axis=-1).astype(np.float64)
+    ideal = pixels if camera is None else camera.ideal(pixels)
+    return np.concatenate([ideal, np.ones((*frame_shape, 1))], axis=-1)
 
 
 def _smoothed(image: FluxImage) -> FluxImage:

@@ -10,12 +10,13 @@ import numpy as np
 
 from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import FrameTrajectory, corner_displacements, inverse, nearest_rotations
+from photonpano.geometry import Canvas, FrameTrajectory, corner_displacements, inverse, nearest_rotations
+from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
-from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
+from photonpano.merging.panorama import render
 from photonpano.motion.attribution import BrokenContract, attributing, shown
-from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
@@ -67,6 +68,7 @@ class Explained:
     Attributes:
         motion: of every frame; its expected error covers what the residuals show.
         panorama: rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array.
+        canvas: of the panorama.
         residuals: observed minus predicted photons.
         ratio: see `residual_ratio`.
         refinements: what each refiner did.
@@ -74,6 +76,7 @@ class Explained:
 
     motion: FrameMotion
     panorama: Panorama
+    canvas: Canvas
     residuals: Residuals
     ratio: float
     refinements: tuple[Refinement, ...]
@@ -98,21 +101,27 @@ class Look:
         self.ratio = residual_ratio(self.residuals)
 
     @cached_property
-    def panorama(self) -> Panorama:
-        """The panorama along the motion, at the scale of the frames or the largest that fits."""
-        motion, shape = self.motion, self.motion.frame_shape
+    def canvas(self) -> Canvas:
+        """The canvas at the scale of the frames, or at the largest that fits."""
+        motion, view = self.motion, view_of(self.motion, self._source)
+        shown = motion.trajectory, motion.span, motion.frame_shape
         bytes_per_pixel = channels_of(self._source) * (BYTES_PER_PIXEL + bytes_of_light(self._source))
-        canvas = plan_canvas(motion.trajectory, motion.span, shape, 1.0, self._memory, bytes_per_pixel)
+        canvas = plan_canvas(*shown, 1.0, self._memory, bytes_per_pixel, view=view)
         excess = canvas.height * canvas.width * bytes_per_pixel / self._memory
-        if excess > 1:
-            scale = float(0.99 / np.sqrt(excess))
-            canvas = plan_canvas(motion.trajectory, motion.span, shape, scale, self._memory, bytes_per_pixel)
-        return render(self._source, motion.trajectory, motion.span, canvas, self._tolerance_px, self._context)
+        if excess <= 1:
+            return canvas
+        return plan_canvas(*shown, float(0.99 / np.sqrt(excess)), self._memory, bytes_per_pixel, view=view)
+
+    @cached_property
+    def panorama(self) -> Panorama:
+        """The panorama along the motion."""
+        motion = self.motion
+        return render(self._source, motion.trajectory, motion.span, self.canvas, self._tolerance_px, self._context)
 
     @cached_property
     def predictions(self) -> Predictions:
         """The panorama as the camera would see it."""
-        return Predictions.of(self._source, self.panorama, self.motion.trajectory, self.motion.frame_shape)
+        return Predictions.of(self._source, self.panorama, self.canvas, self.motion.trajectory, self.motion.frame_shape)
 
     def _measured(self) -> Residuals:
         return measure(self.motion.span, self.predictions, self._context)
@@ -174,7 +183,7 @@ def refine(
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(start, look.motion), kept_out))
     left_px = unexplained_px(look.residuals, len(look.motion.std_px))
     motion = replace(look.motion, std_px=np.hypot(bounded_std_px(look.motion.std_px, look.residuals), left_px))
-    return Explained(motion, look.panorama, look.residuals, look.ratio, tuple(refinements))
+    return Explained(motion, look.panorama, look.canvas, look.residuals, look.ratio, tuple(refinements))
 
 
 def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> Refined | None:

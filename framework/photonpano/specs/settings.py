@@ -96,7 +96,18 @@ class RenderSettings(Config):
     extent: Extent = Field(
         "panorama",
         description="what panorama.tiff holds: panorama for every frame, reference for the reference frame (a stabilised "
-        "image), or a box [x0, y0, x1, y1] in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1",
+        "image), or a box [x0, y0, x1, y1] in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1. On a "
+        "cylinder or a sphere the box is in degrees: to the right and down from where the reference camera looks",
+    )
+    projection: Literal["auto", "planar", "cylindrical", "spherical"] = Field(
+        "auto",
+        description="on what the panorama is drawn. If the camera only turns, auto takes a plane for up to 90 degrees, then a "
+        "cylinder for up to 45 degrees up and down, then a sphere; otherwise it is a plane",
+    )
+    horizon: Literal["reference", "level"] = Field(
+        "reference",
+        description="where the horizon of a cylinder or a sphere lies: in the middle of the reference camera's view, as it was "
+        "held, or level along the whole motion",
     )
     tolerance_px: float = Field(
         0.125,

@@ -11,7 +11,8 @@ from photonpano import CanvasTooLargeError, FrameSpan, InputError, LocationError
 from photonpano.context import Context, Quiet
 from photonpano.geometry import Canvas, apply, from_parameters, translation
 from photonpano.merging import MergeRenderer
-from photonpano.merging.panorama import BYTES_PER_PIXEL, Thumbnail, Tile, plan_canvas, render, render_tiles, tiles_of
+from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
+from photonpano.merging.panorama import Thumbnail, Tile, render, render_tiles, tiles_of
 from photonpano.photometry import tone_mapped
 
 SHAPE = (30, 40)

@@ -111,7 +111,16 @@ def test_run_folder_holds_the_written_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tifffile.imread(directory / "coverage.tiff"), PANORAMA.weight)
     np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), PICTURE)
     with np.load(directory / "trajectory.npz") as archive:
-        assert set(archive.files) == {"homographies", "canvas", "frame_shape", "reference", "located", "std_px"}
+        assert set(archive.files) == {
+            "homographies",
+            "canvas",
+            "projection",
+            "horizon",
+            "frame_shape",
+            "reference",
+            "located",
+            "std_px",
+        }
         assert tuple(archive["frame_shape"]) == (48, 64)
     record = json.loads((directory / "run.json").read_text())
     assert record["warnings"] == ["a line"] * 2000

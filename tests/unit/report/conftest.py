@@ -216,7 +216,7 @@ def tremor() -> Residuals:
 
 @pytest.fixture(scope="session")
 def explained(motion: FrameMotion, panorama: RenderedPanorama, residuals: Residuals) -> Explained:
-    return Explained(motion, panorama.thumbnail, residuals, 1.0123, ())
+    return Explained(motion, panorama.thumbnail, panorama.canvas, residuals, 1.0123, ())
 
 
 @pytest.fixture

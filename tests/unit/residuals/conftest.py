@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Panorama
-from photonpano.geometry import FrameTrajectory
+from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
@@ -61,4 +61,4 @@ def explained(noise: Residuals) -> Explained:
         SHAPE,
     )
     image = np.ones(SHAPE, np.float32)
-    return Explained(motion, Panorama(image, image, np.eye(3)), noise, 1.05, ())
+    return Explained(motion, Panorama(image, image, np.eye(3)), Canvas(*image.shape, np.eye(3)), noise, 1.05, ())

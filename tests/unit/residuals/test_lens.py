@@ -8,7 +8,8 @@ import pytest
 from photonpano import open_source, parse_spec
 from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import render
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
@@ -29,8 +30,9 @@ def found(k1: float):
     with open_source(parse_spec({"version": 1, "source": {"use": "simulator", "with": simulator}})) as source:
         motion = FrameTrajectory(source.truth()["homographies"])
         span = source.info.span
-        panorama = render(source, motion, span, plan_canvas(motion, span, SHAPE, 1.0, 2**30), 0.25, Context())
-        residuals = measure(span, Predictions.of(source, panorama, motion, SHAPE), Context())
+        canvas = plan_canvas(motion, span, SHAPE, 1.0, 2**30)
+        panorama = render(source, motion, span, canvas, 0.25, Context())
+        residuals = measure(span, Predictions.of(source, panorama, canvas, motion, SHAPE), Context())
         return lens_distortion(*block_shifts(residuals), motion.at(np.arange(span.stop)), SHAPE)
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, translation
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import render
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
@@ -40,7 +41,7 @@ def residuals_of(source, tremor_px: float = 0.0, threads: int = 1) -> Residuals:
     span = source.info.span
     canvas = plan_canvas(trajectory, span, SHAPE, 1.0, 2**30)
     panorama = render(source, trajectory, span, canvas, 0.25, Context())
-    return measure(span, Predictions.of(source, panorama, trajectory, SHAPE), Context(threads))
+    return measure(span, Predictions.of(source, panorama, canvas, trajectory, SHAPE), Context(threads))
 
 
 def test_measure_finds_photon_noise_along_true_motion() -> None:
@@ -115,7 +116,7 @@ def test_predicted_view_is_the_scene_and_its_variance() -> None:
     trajectory = FrameTrajectory(np.array([shaken(frame, 0) for frame in range(FRAMES)]))
     canvas = plan_canvas(trajectory, source.info.span, SHAPE, 1.0, 2**30)
     panorama = render(source, trajectory, source.info.span, canvas, 0.25, Context())
-    mean, variance = Predictions.of(source, panorama, trajectory, SHAPE).predicted(400)
+    mean, variance = Predictions.of(source, panorama, canvas, trajectory, SHAPE).predicted(400)
     true = -np.expm1(-Scene(seed=5, flux=(0.1, 0.8)).view(shaken(400, 0), SHAPE))
     seen = np.isfinite(mean)
     assert seen.mean() > 0.9
