@@ -244,8 +244,12 @@ class Adjustment(ABC, Generic[StateT]):
         scale = self._residual_scale(norms, kept) * CAUCHY
         return np.asarray(np.where(kept, 1 / (1 + (norms / scale) ** 2), 0.0))
 
+    def mapped_corners(self, state: StateT) -> FloatArray:
+        """Return where a state expects the corners that each edge maps: (E, 4, 2) px."""
+        return apply(self.relative(state), self._corners)
+
     def _residuals(self, state: StateT) -> FloatArray:
-        return apply(self.relative(state), self._corners) - self._targets
+        return self.mapped_corners(state) - self._targets
 
     def _norms(self, state: StateT) -> FloatArray:
         whitened = np.einsum("eij,ej->ei", self._whitening, self._residuals(state).reshape(-1, 8))

@@ -10,7 +10,7 @@ import numpy as np
 from photonpano.geometry import Camera, FrameTrajectory, nearest_rotations
 from photonpano.merging.canvas_plan import View
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.turning import TurningTrajectory
+from photonpano.motion.turning import camera_of_motion
 from photonpano.protocols import Source, Trajectory, camera_of
 from photonpano.values import BoolArray, FloatArray, FrameSpan, StreamInfo
 
@@ -68,5 +68,5 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     std_px = np.where(located, last.uncertainty.at(frames), np.inf)
     homographies = last.trajectory.at(frames)
     trajectory = FrameTrajectory(homographies)
-    camera = last.trajectory.camera if isinstance(last.trajectory, TurningTrajectory) else None
+    camera = camera_of_motion(last.trajectory)
     return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera)

@@ -265,9 +265,9 @@ def _homographies(tied: _Tied, start: FloatArray | None) -> _Fit:
 
 def _turns(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
     problem = tied.problem()
-    adjustment = RotationAdjustment(*problem, find_focal=model.focal_px is None)
     camera = model.camera(tied.frame_shape)
-    if model.focal_px is None:
+    adjustment = RotationAdjustment(*problem, model.seen_by(tied.frame_shape), model.unknown)
+    if model.focal_px is None and model.known is None:
         camera = adjustment.likeliest_camera(camera)
     if start is None:
         turns = tied.composed(nearest_rotations(camera.rotations(tied.observed)))

@@ -20,6 +20,7 @@ from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.start import starting_motion
+from photonpano.protocols import camera_of
 from photonpano.threads import thread_pool
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
@@ -94,7 +95,7 @@ def locate(
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
     pairs = pairs_of(groups, graph.skips)
-    given = groups, pairs, exposures.previous_homographies(), exposures.timeline
+    given = groups, pairs, exposures.previous_homographies(), exposures.timeline, camera_of(exposures.source)
     log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:
         registrar = Registrar(exposures, pool, log)

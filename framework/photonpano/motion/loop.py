@@ -15,9 +15,10 @@ from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import merge
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, fit_turns
+from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, camera_of_motion, fit_turns
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.protocols import Source, Trajectory
+from photonpano.source_wrapper import seen_through
 from photonpano.threads import Stopwatch
 from photonpano.values import FloatArray, Group
 
@@ -89,8 +90,9 @@ def estimate_motion(
     timeline = timeline or Timeline.regular(source.info.n_frames)
     for level in levels:
         clock = Stopwatch(context.threads)
+        model = model.knowing(camera_of_motion(previous))
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
-        exposures = merge(level, source, groups, previous, clock, timeline)
+        exposures = merge(level, through_lens(source, model), groups, previous, clock, timeline)
         located = locate(exposures, graph, context, model)
         trajectory = interpolate(level, located, timeline, reference, clock)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
@@ -102,6 +104,12 @@ def estimate_motion(
         if until_converged and results[-1].converged and level.scale == levels[-1].scale:
             break
     return results
+
+
+def through_lens(source: Source, model: MotionModel) -> Source:
+    """Return a capture as the camera of a model sees it, whose lens bends frames as far as it is known."""
+    camera = model.seen_by(source.info.frame_shape)
+    return seen_through(source, camera) if camera.distorts else source
 
 
 def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
+
+import numpy as np
 
 from photonpano.geometry import Camera, camera_matrix
 
 ModelName = Literal["homography", "rotation", "auto"]
+_FIRST_FOCAL = 3.0
+"""A focal length to begin with, in sides of a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,18 +20,41 @@ class MotionModel:
 
     Attributes:
         kind: any homographies, rotations of one camera, or what the pairs say.
-        focal_px: of a camera that turns; None if it is to be found.
+        focal_px: of the camera; None if it is to be found.
         centre_px: (x, y) of its principal point; None for the middle of the frames.
+        distortion: k1, k2, p1, p2 of its lens; None for those that are to be found.
+        known: the camera that the level before has found.
     """
 
     kind: ModelName = "homography"
     focal_px: float | None = None
     centre_px: tuple[float, float] | None = None
+    distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
+    known: Camera | None = None
 
-    def camera(self, frame_shape: tuple[int, int], focal_px: float = 1000.0) -> Camera:
-        """Return the camera, with a given focal length where that is to be found."""
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Which numbers of the camera are to be found: 0 for the focal length, 1 to 4 for k1, k2, p1, p2."""
+        return tuple(index for index, number in enumerate((self.focal_px, *self.distortion)) if number is None)
+
+    def camera(self, frame_shape: tuple[int, int]) -> Camera:
+        """Return what is known of the camera so far; what is not begins at 3 sides of a frame, and without distortion."""
+        if self.known is not None:
+            return self.known
         middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
-        return Camera(camera_matrix(self.focal_px or focal_px, self.centre_px or middle))
+        matrix = camera_matrix(self.focal_px or _FIRST_FOCAL * max(frame_shape), self.centre_px or middle)
+        return Camera(matrix, np.array([number or 0.0 for number in self.distortion]))
+
+    def seen_by(self, frame_shape: tuple[int, int]) -> Camera:
+        """Return the camera by whose lens frames are warped: without distortion as long as its focal length is unknown."""
+        camera = self.camera(frame_shape)
+        if self.known is None and self.focal_px is None:
+            return Camera(camera.matrix)
+        return camera
+
+    def knowing(self, camera: Camera | None) -> MotionModel:
+        """Return the model after a level that has found the camera, or None."""
+        return self if camera is None else replace(self, known=camera)
 
 
 HOMOGRAPHIES = MotionModel()

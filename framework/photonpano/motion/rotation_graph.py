@@ -8,20 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import Camera, apply, nearest_rotations, rotation_matrices, slopes
+from photonpano.geometry import Camera, apply, camera_matrix, nearest_rotations, rotation_matrices, slopes
 from photonpano.motion.adjustment import Adjustment
+from photonpano.motion.lens_shift import LensShift
 from photonpano.values import FloatArray, Located
 
 _AXES = np.array(
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
 )
 """Derivatives of a small rotation by its rotation vector: (3, 3, 3)."""
-_ZOOM = np.diag([1.0, 1.0, 0.0])
-"""Derivative of a camera's matrix by the logarithm of its focal length, in coordinates about the principal point."""
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)
 """Focal lengths that are tried first, in sides of a frame."""
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
 """What is known of the focal length before: its logarithm is that of 3 sides of a frame, give or take 2."""
+_PRIOR_DISTORTION = 1.0
+"""What is known of the lens before: it moves the corners of a frame by up to about its half diagonal."""
+_STEP = 1e-5
+"""Change of an unknown by which derivatives are taken."""
 _MOST_TRIED = 400
 """Edges by which the first focal length is chosen."""
 
@@ -42,8 +45,8 @@ class Turns:
 class RotationAdjustment(Adjustment[Turns]):
     """The least-squares problem of a graph whose nodes are rotations of one camera.
 
-    The unknowns of a node are a rotation vector in its own frame; the logarithm of the focal length is shared unless it is
-    given.
+    The unknowns of a node are a rotation vector in its own frame. Those of the camera that are not given are shared: the
+    logarithm of its focal length, and the distortion of its lens.
     """
 
     _n_node = 3
@@ -55,19 +58,24 @@ class RotationAdjustment(Adjustment[Turns]):
         observed: FloatArray,
         motions: Sequence[Located],
         frame_shape: tuple[int, int],
-        find_focal: bool,
+        seen_by: Camera,
+        unknown: tuple[int, ...],
     ) -> None:
         """Set up the problem: see `Adjustment`.
 
         Args:
             pairs: (E, 2).
             anchor: the node that does not turn.
-            observed: (E, 3, 3).
+            observed: (E, 3, 3) homographies of ideal pixels of `seen_by`.
             motions: of the edges.
             frame_shape: (height, width) of a frame.
-            find_focal: whether the focal length is unknown.
+            seen_by: the camera by whose distortion the exposures were merged.
+            unknown: what is to be found of the camera: 0 for the focal length, 1 to 4 for k1, k2, p1, p2.
         """
-        super().__init__(pairs, anchor, observed, motions, frame_shape, n_shared=int(find_focal))
+        super().__init__(pairs, anchor, observed, motions, frame_shape, n_shared=len(unknown))
+        self._seen_by = seen_by
+        self._unknown = unknown
+        self._lens = LensShift.of(frame_shape, observed)
 
     def homographies(self, state: Turns) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
@@ -79,12 +87,23 @@ class RotationAdjustment(Adjustment[Turns]):
         return state.camera.homographies(between)
 
     def changed(self, state: Turns, nodes: FloatArray, shared: FloatArray) -> Turns:
-        """Turn each node, and change the focal length."""
+        """Turn each node, and change the camera."""
+        turned = state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px))
         camera = state.camera
-        turned = state.rotations @ rotation_matrices(nodes * (self._half / camera.focal_px))
-        if len(shared):
-            camera = replace(camera, matrix=camera.matrix @ np.diag([*np.exp([shared[0]] * 2), 1.0]))
+        for index, step in zip(self._unknown, shared * self._units(camera), strict=True):
+            camera = _changed(camera, index, float(step))
         return Turns(turned, camera)
+
+    def mapped_corners(self, state: Turns) -> FloatArray:
+        """Return where the corners are seen: (E, 4, 2) px.
+
+        Where the lens distorts otherwise than was known when the exposures were merged, no homography holds exactly; it is the
+        one that fits best where both exposures see the scene.
+        """
+        mapped = super().mapped_corners(state)
+        if not (state.camera.distorts or self._seen_by.distorts):
+            return mapped
+        return mapped + self._lens.of_corners(self.relative(state), state.camera, self._seen_by)
 
     def generators(self, state: Turns) -> FloatArray:
         """Return the derivatives by rotations that move the middle of the frame by about half its side: (3, 3, 3)."""
@@ -95,20 +114,36 @@ class RotationAdjustment(Adjustment[Turns]):
         return blocks * (state.camera.focal_px / self._half) ** 2
 
     def shared_slopes(self, state: Turns) -> FloatArray:
-        """Return the derivatives of the corners by the logarithm of the focal length: (E, 8, 1)."""
-        relative, zoom = self.relative(state), _zoom(state.camera)
-        return slopes(relative @ self._rows, ((zoom @ relative - relative @ zoom) @ self._rows)[:, None])[..., : self._n_shared]
+        """Return the derivatives of the corners by what is unknown of the camera: (E, 8, s)."""
+        here, found = self.mapped_corners(state), []
+        for index, unit in zip(self._unknown, self._units(state.camera), strict=True):
+            there = self.mapped_corners(Turns(state.rotations, _changed(state.camera, index, _STEP * unit)))
+            found.append((there - here).reshape(len(here), 8) / _STEP)
+        return np.stack(found, axis=-1)
 
     def shared_errors(self, state: Turns) -> FloatArray:
-        """Return how the corners of each frame move by the logarithm of the focal length: (N, 8, 1)."""
+        """Return how the corners of each frame move on the plane of the anchor by what is unknown of the camera: (N, 8, s)."""
         homographies, zoom = self.homographies(state), _zoom(state.camera)
         moved = (np.linalg.solve(homographies, zoom @ homographies) - zoom) @ self._rows
-        return slopes(np.broadcast_to(self._rows, moved.shape), moved[:, None])[..., : self._n_shared]
+        by_focal = slopes(np.broadcast_to(self._rows, moved.shape), moved[:, None])
+        frame, found = self._corners, []
+        for index, unit in zip(self._unknown, self._units(state.camera), strict=True):
+            changed = _changed(state.camera, index, _STEP * unit)
+            by_lens = ((changed.ideal(frame) - state.camera.ideal(frame)) / _STEP).reshape(1, 8, 1)
+            found.append(by_focal if index == 0 else np.broadcast_to(by_lens, by_focal.shape))
+        return np.concatenate(found, axis=-1)
 
     def prior(self, state: Turns) -> tuple[FloatArray, FloatArray]:
-        """Return what is known of the focal length before."""
-        away = np.log(state.camera.focal_px / (_PRIOR_FOCAL * 2 * self._half))
-        return np.array([away / _PRIOR_STD])[: self._n_shared], np.eye(self._n_shared) / _PRIOR_STD
+        """Return what is known before: a focal length of some sides of a frame, and a lens that distorts by less than that."""
+        units = self._units(state.camera)
+        away = [_away(state.camera, index, 2 * self._half) for index in self._unknown]
+        stds = np.where(np.array(self._unknown) == 0, _PRIOR_STD, _PRIOR_DISTORTION * units)
+        return np.asarray(away / stds), np.diag(units / stds)
+
+    def _units(self, camera: Camera) -> FloatArray:
+        """Return the change of each unknown that moves the ends of a frame by about half its side."""
+        end = float(np.hypot(*self._frame_shape)) / 2 / camera.focal_px
+        return np.array([1.0, end**-2, end**-4, end**-1, end**-1])[list(self._unknown)]
 
     def start(self, homographies: FloatArray, camera: Camera) -> Turns:
         """Return the rotations nearest to the homographies of the nodes: (N, 3, 3)."""
@@ -139,8 +174,7 @@ class RotationAdjustment(Adjustment[Turns]):
             "eij,ej->ei", whitening, (apply(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
         )
         squares = (residuals**2).sum(axis=1)
-        away = np.log(camera.focal_px / (_PRIOR_FOCAL * 2 * self._half)) / _PRIOR_STD
-        return float(np.log1p(squares / 8).sum() + away**2)
+        return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)
 
 
 def _zoom(camera: Camera) -> FloatArray:
@@ -150,9 +184,21 @@ def _zoom(camera: Camera) -> FloatArray:
 
 
 def _with_focal(camera: Camera, focal_px: float) -> Camera:
-    matrix = camera.matrix.copy()
-    matrix[0, 0] = matrix[1, 1] = focal_px
-    return replace(camera, matrix=matrix)
+    return replace(camera, matrix=camera_matrix(focal_px, camera.centre_px))
+
+
+def _changed(camera: Camera, index: int, step: float) -> Camera:
+    """Return a camera with another logarithm of its focal length (index 0), or another number of its distortion."""
+    if index == 0:
+        return _with_focal(camera, camera.focal_px * np.exp(step))
+    distortion = camera.distortion.copy()
+    distortion[index - 1] += step
+    return replace(camera, distortion=distortion)
+
+
+def _away(camera: Camera, index: int, side_px: float) -> float:
+    """Return how far a number of a camera is from where it may be expected."""
+    return float(np.log(camera.focal_px / (_PRIOR_FOCAL * side_px)) if index == 0 else camera.distortion[index - 1])
 
 
 def _rays(camera: Camera, points: FloatArray) -> FloatArray:

@@ -46,6 +46,11 @@ class TurningTrajectory:
         return nearest_rotations(self.camera.rotations(self._free.at(frame_indices)))
 
 
+def camera_of_motion(trajectory: Trajectory | None) -> Camera | None:
+    """Return the camera of a trajectory of rotations; None for any other, or where no motion is known."""
+    return trajectory.camera if isinstance(trajectory, TurningTrajectory) else None
+
+
 class ReferencedTrajectory:
     """A trajectory whose homography at the reference frame is the identity.
 
@@ -85,7 +90,7 @@ def fit_turns(
     """
     path = CoarsePath(instants, rotations)
     turns = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ rotations)
-    knots = camera.homographies(rotation_matrices(turns))
+    knots = scaled_ahead(camera.homographies(rotation_matrices(turns)))
     if isinstance(interpolator, InterpolatesTurns):
         fitted: Trajectory = _Turns(interpolator.fit_turns(instants, turns, information), camera)
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from photonpano.captures.repeats import timeline_of
 from photonpano.context import Context
@@ -14,9 +15,10 @@ from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.level import Level
-from photonpano.motion.loop import LevelResult, estimate_motion
+from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
+from photonpano.motion.turning import camera_of_motion
 from photonpano.pipeline.components import build_levels
 from photonpano.protocols import Source, Trajectory, light_of
 from photonpano.residuals.cuts import find_cuts
@@ -91,7 +93,8 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     if cuts := find_cuts(source, found.look, context):
         found = _cut_at(cuts, plan, found)
     decisions += found.timeline.decisions
-    return found
+    source, context = _in_view(plan, found.source, found.results, found.context)
+    return replace(found, source=source, context=context)
 
 
 def _in_whole_periods(plan: Plan, source: Source, levels: tuple[Level, ...], decisions: list[Decision]) -> tuple[Level, ...]:
@@ -181,6 +184,7 @@ def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette 
 
 def _look(plan: Plan, source: Source, results: Sequence[LevelResult], reference: int, context: Context) -> Look:
     motion = motion_of_frames(results, source.info, reference)
+    source, context = _in_view(plan, source, results, context)
     return Look(source, motion, plan.render.tolerance_px, int(plan.run.memory), context)
 
 
@@ -212,9 +216,22 @@ def _cut_at(cuts: Sequence[Cut], plan: Plan, found: Estimate) -> Estimate:
 
 def model_of(plan: Plan) -> MotionModel:
     """Return what the motion of the camera may be, as a spec says it."""
-    camera = plan.camera
-    focal_px = None if camera.focal_px == "find" else camera.focal_px
-    return MotionModel(plan.motion.model, focal_px, camera.centre_px)
+    camera, distortion = plan.camera, plan.camera.distortion
+    k1, k2, p1, p2 = (_given(each) for each in (distortion.k1, distortion.k2, distortion.p1, distortion.p2))
+    return MotionModel(plan.motion.model, _given(camera.focal_px), camera.centre_px, (k1, k2, p1, p2))
+
+
+def _given(number: float | Literal["find"]) -> float | None:
+    return None if number == "find" else number
+
+
+def _in_view(plan: Plan, source: Source, results: Sequence[LevelResult], context: Context) -> tuple[Source, Context]:
+    """Return a capture as the camera that the last level has found sees it, and the context of what is done with it."""
+    model = model_of(plan).knowing(camera_of_motion(results[-1].trajectory))
+    seen = through_lens(source, model)
+    if seen is source:
+        return source, context
+    return seen, replace(context, checkpoints=context.checkpoints.within(model.known))
 
 
 def _reference_frame(plan: Plan, source: Source) -> int:

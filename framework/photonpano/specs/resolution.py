@@ -147,6 +147,8 @@ class _Resolver:
         settings: dict[str, Any] = {
             name: validate(model, _settings(name, root.get(name)), name, spec) for name, model in SETTINGS.items()
         }
+        if isinstance(settings["motion"], MotionSettings) and isinstance(settings["camera"], CameraSettings):
+            self.check_camera(settings["motion"], settings["camera"])
         if source is None or renderer is None or spec.problems:
             return None
         until_converged = root.get("levels") == UNTIL_CONVERGED
@@ -178,6 +180,18 @@ class _Resolver:
             decisions=tuple(spec.decisions),
             corrects_itself=corrections is None,
         )
+
+    def check_camera(self, motion: MotionSettings, camera: CameraSettings) -> None:
+        """Refuse what the model homography cannot find: it knows no camera."""
+        if motion.model != "homography":
+            return
+        distortion = camera.distortion.model_dump()
+        for key in (key for key, number in distortion.items() if number == "find"):
+            message = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
+            self.spec.wrong(f"camera.distortion.{key}", message)
+        if camera.focal_px == "find" and any(distortion.values()):
+            message = "distortion is in units of the focal length: give camera.focal_px, or take motion.model: rotation"
+            self.spec.wrong_key("camera.distortion", message)
 
     def spell_out_light(self, root: dict[str, Any]) -> None:
         """Replace a word in the section `light` by the mapping that it stands for."""
