@@ -226,6 +226,16 @@ class Trajectory(Protocol):
         ...
 
 
+@runtime_checkable
+class TurningMotion(Trajectory, Protocol):
+    """A trajectory of a camera that only turns: homographies are K R K^-1 of determinant 1, with its matrix K."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all frames."""
+        ...
+
+
 class Merger(Protocol):
     """Merges a group into a virtual exposure along the current motion (paper, section 4, "Merge")."""
 

@@ -13,7 +13,7 @@ from photonpano.lighting.gains import Gains, seen_cells, solve_gains
 from photonpano.lighting.lamps import Lamps, lamp_frequency, measure_lamps
 from photonpano.lighting.series import gain_of_frames
 from photonpano.protocols import Source, Trajectory
-from photonpano.values import Decision, FloatArray, FrameSpan, Light
+from photonpano.values import Decision, FloatArray, FrameSpan, Homography, Light
 
 LIGHT_DECISION = "light"
 """What a record names the decision to divide by the gain of the light."""
@@ -61,8 +61,8 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
     gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
     frequency = lamp_frequency(gains)
-    if frequency:
-        return _light_of(measure_lamps(gains, frequency), gains, n_frames)
+    if frequency and gains.seen.to_cells is not None:
+        return _light_of(measure_lamps(gains, frequency), gains.seen.to_cells, gains, n_frames)
     lengths = np.array([len(span) for span in gains.seen.spans], float)
     gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
     mean = float(gain.mean())
@@ -93,13 +93,13 @@ def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray
     return Light.of_frames(found / mean, frequency, noise / mean)
 
 
-def _light_of(lamps: Lamps, gains: Gains, n_frames: int) -> Light:
+def _light_of(lamps: Lamps, to_map: Homography, gains: Gains, n_frames: int) -> Light:
     """Return the light of each frame, with lamps over parts of the scene."""
     frames = np.arange(n_frames)
     slow, std = (np.interp(frames, gains.seen.instants, each) for each in (lamps.slow, gains.std))
     turns = 2 * np.pi * lamps.frequency * frames
     maps = np.stack([lamps.cosine, lamps.sine])
-    return Light(slow / slow.mean(), np.stack([np.cos(turns), np.sin(turns)]), maps, gains.seen.to_cells, lamps.frequency, std)
+    return Light(slow / slow.mean(), np.stack([np.cos(turns), np.sin(turns)]), maps, to_map, lamps.frequency, std)
 
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:

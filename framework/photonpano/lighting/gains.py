@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.geometry import canvas_of
+from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
-from photonpano.protocols import Source, Trajectory
+from photonpano.protocols import Source, Trajectory, TurningMotion
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FrameSpan, Homography
 
@@ -39,6 +39,9 @@ _DARKEST = -7.0
 _WEAK = 1e-6
 """Weight of the prior that the light is steady, relative to that of the photons: it decides where frames share no place."""
 
+_WIDEST = np.pi / 2
+"""Widest field of view, in radians, of which squares lie on a plane."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenCells:
@@ -51,7 +54,7 @@ class SeenCells:
         photons: (N,) photons, those that a saturated pixel missed included.
         exposure: (N,) pixels times frames.
         shape: (h, w) rows and columns of squares, C in all.
-        to_cells: (3, 3), pixels of the reference plane to squares: integers are their middles.
+        to_cells: (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
     """
 
     spans: tuple[FrameSpan, ...]
@@ -60,7 +63,7 @@ class SeenCells:
     photons: FloatArray
     exposure: FloatArray
     shape: tuple[int, int]
-    to_cells: Homography
+    to_cells: Homography | None
 
     @property
     def n_cells(self) -> int:
@@ -112,10 +115,10 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     shape = source.info.frame_shape
     motions = trajectory.at([span.centre for span in spans])
     half = int(np.clip(min(shape) // _CELLS, 2, _LARGEST_PX)) // 2
-    canvas = canvas_of(motions, shape, 1 / half)
+    canvas = _canvas(trajectory, motions, shape, 1 / half)
     while canvas.height * canvas.width > 4 * _MOST_CELLS:
         half *= 2
-        canvas = canvas_of(motions, shape, 1 / half)
+        canvas = _canvas(trajectory, motions, shape, 1 / half)
     n_rows, n_columns = canvas.height // 2, canvas.width // 2
     # Masked pixels, and those of faint colours, cover less everywhere.
     weights = weights_of(source)
@@ -123,7 +126,7 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
 
     def seen(place: tuple[FrameSpan, Homography]) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
         span, homography = place
-        summed = accumulate(source, [Chunk(span, homography)], canvas.transform, canvas.shape)
+        summed = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
         counts, weight = (
             cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
             for image in (np.maximum(summed.counts, 0), summed.weight)
@@ -144,8 +147,17 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         np.concatenate([part[1] for part in parts]),
         np.concatenate([part[2] for part in parts]),
         (n_rows, n_columns),
-        np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform,
+        np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform if canvas.planar else None,
     )
+
+
+def _canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
+    """Return a canvas that holds all frames: a sphere if the camera turns far."""
+    if isinstance(trajectory, TurningMotion):
+        covered = covered_by(trajectory.camera.rotations(motions), trajectory.camera, frame_shape)
+        if covered.field_of_view > _WIDEST:
+            return canvas_around(covered, trajectory.camera, scale, "spherical")
+    return canvas_of(motions, frame_shape, scale)
 
 
 def solve_gains(seen: SeenCells) -> Gains:

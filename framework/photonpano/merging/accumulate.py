@@ -92,7 +92,8 @@ def accumulate(
     light = light_of(source)
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
     canvas = onto if isinstance(onto, Canvas) else Canvas(*shape, onto)
-    grid = BentGrid.of(canvas, camera_of(source))
+    homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
+    grid = BentGrid.of(canvas, camera_of(source), homographies, frame_shape)
     total = _Total.zeros(shape, 1 if terms is None else terms.number, None if grid is None else grid.rays)
     # Parts are narrow, so that every thread has work wherever frames lie on the grid. Their number does not depend on that of
     # the threads, since OpenCV rounds a warp by where it starts.
@@ -100,7 +101,6 @@ def accumulate(
     parts = [total.rows(part) for part in divided(shape[0], n_parts)]
     masked = weights_of(source)
     corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-    homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
     footprints: Sequence[Footprint | BentFootprint]
     if grid is None:
         footprints = footprints_of(canvas.transform @ homographies, frame_shape, shape)

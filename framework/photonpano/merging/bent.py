@@ -5,6 +5,7 @@ A pixel of the grid goes to a ray, through the motion and the lens to a pixel of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry import Camera, Canvas, outline_of, rescaling
+from photonpano.geometry import Camera, Canvas, corners, outline_of, rescaling
+from photonpano.merging.warping import average_squares
 from photonpano.values import FloatArray, FluxImage, Homography
 
 _NEAR_POLE = np.radians(75)
@@ -73,10 +75,19 @@ class BentGrid:
     camera: Camera | None
 
     @classmethod
-    def of(cls, onto: Canvas, camera: Camera | None) -> BentGrid | None:
-        """Return the grid; None if homographies map all frames to it."""
+    def of(
+        cls, canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]
+    ) -> BentGrid | None:
+        """Return the grid; None if homographies map all frames to it.
+
+        They do not if the canvas is no plane, or the lens distorts, or a frame reaches behind the plane.
+        """
         distorts = camera is not None and camera.distorts
-        return cls(onto, camera if distorts else None) if distorts or not onto.planar else None
+        bent = distorts or not canvas.planar
+        if not bent:
+            to_rays, frame = _to_rays(canvas, homographies), corners(frame_shape)
+            bent = bool((to_rays[:, 2:, :2] @ frame.T + to_rays[:, 2:, 2:] <= 0).any())
+        return cls(canvas, camera if distorts else None) if bent else None
 
     @property
     def rays(self) -> Rays:
@@ -90,7 +101,7 @@ class BentGrid:
             homographies: (N, 3, 3), ideal pixels of each frame to pixels of the reference plane.
             frame_shape: (height, width) of a frame.
         """
-        to_rays = self.canvas.plane_to_rays @ homographies
+        to_rays = _to_rays(self.canvas, homographies)
         shrink = self._shrink_factors(to_rays, frame_shape)
         rows, columns = self._touched(to_rays, frame_shape, max(shrink, default=1))
         lenses = {each: self._lens(each, frame_shape) for each in set(shrink)}
@@ -158,6 +169,12 @@ class BentGrid:
             _turned(first - 1, last + 2, width, period) for first, last in zip(left.tolist(), right.tolist(), strict=True)
         ]
         return rows, columns
+
+
+def _to_rays(canvas: Canvas, homographies: FloatArray) -> FloatArray:
+    """Return the maps from homogeneous ideal pixels of frames to rays of a canvas, (N, 3, 3), that keep what is ahead ahead."""
+    to_rays = canvas.plane_to_rays @ homographies
+    return np.asarray(to_rays * np.sign(np.linalg.det(to_rays))[:, None, None])
 
 
 def _clipped(first: float, last: float, length: int) -> range:
@@ -234,6 +251,35 @@ def add_bent(
             total[part, across],
             coverages[:, part, across],
         )
+
+
+def laid(
+    canvas: Canvas,
+    camera: Camera | None,
+    homographies: FloatArray,
+    images: Sequence[FluxImage],
+    valid: FluxImage,
+) -> tuple[FluxImage, FluxImage]:
+    """Lay images that move with a camera on a canvas, and add them up.
+
+    Args:
+        canvas: the grid.
+        camera: of the frames; None if it is not known.
+        homographies: (N, 3, 3), (ideal) pixels of the frame to pixels of the reference plane at N instants.
+        images: K images of a frame, (h, w) each.
+        valid: (h, w), 1 where they are known, otherwise 0.
+
+    Returns:
+        The sums of the images, (K, H, W), and of what is known, (H, W).
+    """
+    sums, share = np.zeros((len(images), *canvas.shape), np.float32), np.zeros((1, *canvas.shape), np.float32)
+    grid, once, never = BentGrid(canvas, camera if camera is not None and camera.distorts else None), np.ones(1), np.zeros(1)
+    for at in grid.footprints(homographies, (valid.shape[0], valid.shape[1])):
+        known = padded(average_squares(valid, at.shrink))
+        for number, (image, total) in enumerate(zip(images, sums, strict=True)):
+            counts = padded(average_squares(np.asarray(image * valid, np.float32), at.shrink))
+            add_bent(counts, known, never if number else once, at, grid.rays, 0, total, share)
+    return sums, share[0]
 
 
 @compiled

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from photonpano.geometry import Canvas, rescaling
+from photonpano.geometry import Camera, Canvas, rescaling
 from photonpano.merging.averaging import Averaging
+from photonpano.merging.bent import BentGrid, laid
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
-from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory
-from photonpano.values import BoolArray, FluxImage, FrameSpan, Response
+from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory, camera_of
+from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
 _INSTANTS = 64
 """Largest number of instants at which the corrections of the sensor are laid on the canvas."""
@@ -55,7 +57,7 @@ class CanvasNoise:
             span: the frames that are rendered.
             canvas: the pixel grid.
         """
-        averaging = Averaging.of(trajectory, span, source.info.frame_shape, canvas)
+        averaging = Averaging.of(trajectory, span, source.info.frame_shape, canvas, camera_of(source))
         if not isinstance(source, ColouredSource):
             return replace(cls._corrected(source, trajectory, span, canvas), averaging=averaging)
         # The grey source equalises the colours, which are rendered without it.
@@ -77,17 +79,9 @@ class CanvasNoise:
             return cls(source.response, *means)
         reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
-        to_map = rescaling(1 / reduction) @ canvas.transform
-        share, sums = np.zeros((height, width), np.float32), np.zeros((2, height, width), np.float32)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
-        for homography in trajectory.at(instants):
-
-            def laid(image: FluxImage, transform: FluxImage = to_map @ homography) -> FluxImage:
-                return np.asarray(cv2.warpPerspective(image, transform, (width, height)), np.float32)
-
-            share += laid(valid.astype(np.float32))
-            for total, image in zip(sums, (slope, offset), strict=True):
-                total += laid(np.where(valid, image, np.float32(0)))
+        coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
+        sums, share = _laid(coarse, camera_of(source), trajectory.at(instants), (slope, offset), valid)
         on_slope, on_offset = (
             np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
@@ -127,6 +121,24 @@ class CanvasNoise:
         )
         part = factor[np.ix_(rows, columns)]
         return part if part.ndim == flux.ndim else part[..., None]
+
+
+def _laid(
+    canvas: Canvas, camera: Camera | None, homographies: FloatArray, images: Sequence[FluxImage], valid: BoolArray
+) -> tuple[FluxImage, FluxImage]:
+    """Return the sums of images that move with a camera, and of their valid pixels: see `laid`."""
+    if BentGrid.of(canvas, camera, homographies, (valid.shape[0], valid.shape[1])) is not None:
+        return laid(canvas, camera, homographies, images, valid.astype(np.float32))
+    share, sums = np.zeros(canvas.shape, np.float32), np.zeros((len(images), *canvas.shape), np.float32)
+    for homography in homographies:
+
+        def warped(image: FluxImage, transform: FluxImage = canvas.transform @ homography) -> FluxImage:
+            return np.asarray(cv2.warpPerspective(image, transform, canvas.shape[::-1]), np.float32)
+
+        share += warped(valid.astype(np.float32))
+        for total, image in zip(sums, images, strict=True):
+            total += warped(np.where(valid, image, np.float32(0)))
+    return sums, share
 
 
 def _stacked(factors: list[Factor]) -> Factor:

@@ -7,6 +7,7 @@ import pytest
 from photonpano.geometry import (
     Camera,
     Canvas,
+    FrameTrajectory,
     canvas_around,
     canvas_of,
     covered_by,
@@ -14,7 +15,8 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.merging import Chunk, accumulate
-from photonpano.merging.bent import BentGrid
+from photonpano.merging.averaging import Averaging
+from photonpano.merging.bent import BentGrid, laid
 from photonpano.source_wrapper import seen_through
 from photonpano.testing.captures import MemorySource
 from photonpano.values import FloatArray, FluxImage, FrameSpan
@@ -144,7 +146,7 @@ def test_bent_warp_onto_a_plane_is_that_of_opencv() -> None:
     matrix = translation(-20, 10) @ CAMERA.homographies(rotation_matrices([0.05, 0.1, 0.2]))
     none = Camera(CAMERA.matrix, np.array([1e-12, 0, 0, 0]))
     canvas = Canvas(60, 80, np.eye(3))
-    (at,) = BentGrid.of(canvas, none).footprints(matrix[None], SHAPE)
+    (at,) = BentGrid(canvas, none).footprints(matrix[None], SHAPE)
     assert at.columns
     assert at.rows
     source = seen_through(MemorySource((image * 255).astype(np.uint8)[None]), none)
@@ -152,3 +154,42 @@ def test_bent_warp_onto_a_plane_is_that_of_opencv() -> None:
     pixels = (image * 255).astype(np.uint8).astype(np.float32)
     expected = cv2.warpPerspective(pixels, matrix, (80, 60), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     assert np.abs(photons.counts - expected).max() < 0.01 * 255
+
+
+def test_frames_behind_a_plane_leave_no_ghost() -> None:
+    """A part of the plane is rendered of a camera that turns all around."""
+    turns = rotations()
+    canvas = Canvas(*SHAPE, np.eye(3))
+    source = MemorySource(np.full((len(turns), *SHAPE), 7, np.uint8))
+    photons = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
+    ahead = np.degrees(np.arccos(np.clip(turns[:, 2, 2], -1, 1))) < 80
+    few = accumulate(source, [chunk for chunk, near in zip(chunks(turns, CAMERA), ahead, strict=True) if near], canvas, SHAPE)
+    assert np.allclose(photons.weight, few.weight, atol=1e-3)
+    assert np.allclose(photons.counts, few.counts, atol=0.02)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_noise_on_a_sphere_is_lowered_by_interpolation(camera: Camera) -> None:
+    """The variance of pixels between others is 4 / 9 on average."""
+    turns = rotations(np.arange(0.0, 100, 0.5))
+    canvas = canvas_around(covered_by(turns, camera, SHAPE), CAMERA, 1.0, "spherical")
+    span = FrameSpan(0, len(turns))
+    averaging = Averaging.of(FrameTrajectory(CAMERA.homographies(turns)), span, SHAPE, canvas, camera)
+    factor = averaging.std_factor(canvas.shape)
+    assert np.median(factor) == pytest.approx(2 / 3, abs=0.04)
+    part = averaging.std_factor((10, 20), 15, 60)
+    assert np.allclose(part, factor[15:25, 60:80], atol=0.02)
+
+
+def test_corrections_are_laid_on_a_sphere_as_counts_are() -> None:
+    turns = rotations()
+    canvas = canvas_around(covered_by(turns, LENS, SHAPE), CAMERA, 1.0, "spherical")
+    image = np.random.default_rng(0).integers(0, 255, SHAPE)
+    source = seen_through(MemorySource(np.repeat(image[None], len(turns), axis=0)), LENS)
+    photons = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
+    motions = CAMERA.homographies(turns)
+    images = [image.astype(np.float32), np.ones(SHAPE, np.float32)]
+    sums, share = laid(canvas, LENS, motions, images, np.ones(SHAPE, np.float32))
+    assert np.allclose(sums[0], photons.counts, rtol=1e-4, atol=0.1)
+    assert np.allclose(share, photons.weight, atol=1e-3)
+    assert np.allclose(sums[1], share, atol=1e-3)
