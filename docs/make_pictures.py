@@ -19,7 +19,19 @@ import tifffile
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from photonpano import FrameSpan, Group, StageContext, StreamInfo, discover, evaluate, load_spec, open_source, parse_spec, run
+from photonpano import (
+    FrameSpan,
+    Group,
+    StageContext,
+    StreamInfo,
+    discover,
+    evaluate,
+    load_spec,
+    open_source,
+    parse_spec,
+    run,
+    video,
+)
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.context import Context
 from photonpano.evaluation.images import true_panorama
@@ -175,6 +187,7 @@ def main() -> None:
         plan = parse_spec(tremor_spec(trembling), overrides=[f"refine={refiner}"], output=in_folder(folder, f"tremor {name}"))
         finish(plan, f"tremor {name}", trembling)
     save("tremor.png", tremor(folder, trembling))
+    save("video.png", video_pictures(in_folder(folder, "tremor with"), folder))
 
     save("night.png", night())
 
@@ -182,9 +195,9 @@ def main() -> None:
     finish(parse_spec(fine_spec(fine, "super-resolution"), output=in_folder(folder, "fine")), "super-resolution", fine)
     save("super-resolution.png", super_resolution(folder, fine))
 
-    video = filmed(parse_spec(HIGH_SPEED), folder / "high-speed.mp4")
-    source = {"use": "video", "with": {"path": str(video.absolute()), "frame_rate_hz": 500}}
-    finish(parse_spec({"version": 1, "source": source}, output=in_folder(folder, "high speed")), "high speed", video)
+    film = filmed(parse_spec(HIGH_SPEED), folder / "high-speed.mp4")
+    source = {"use": "video", "with": {"path": str(film.absolute()), "frame_rate_hz": 500}}
+    finish(parse_spec({"version": 1, "source": source}, output=in_folder(folder, "high speed")), "high speed", film)
     save("high-speed.png", high_speed(folder, source))
 
 
@@ -380,6 +393,22 @@ def tremor(folder: Path, cube: Path) -> Picture:
     drawn = FigureCanvasAgg(figure)
     drawn.draw()
     return np.asarray(drawn.buffer_rgba())[..., 2::-1]
+
+
+def video_pictures(run_folder: Path, folder: Path) -> Picture:
+    """Return three pictures of a video in the plane of the panorama, above three that follow the camera."""
+    rows = []
+    for view, extent in (("panorama", "panorama"), ("smooth", [12, 12, 228, 148])):
+        directory = folder / f"video-{view}"
+        if not directory.exists():
+            video(run_folder, directory, view=view, exposure=100, trail=view == "panorama", changes=[f"render.extent={extent}"])
+        files = sorted(directory.iterdir())
+        shown = [cv2.imread(str(files[place]), cv2.IMREAD_GRAYSCALE) for place in (0, len(files) // 2, -1)]
+        rows.append(beside(shown))
+    width = max(row.shape[1] for row in rows)
+    gap = np.full((GAP, width), 255, np.uint8)
+    padded = [np.pad(row, ((0, 0), (0, width - row.shape[1])), constant_values=255) for row in rows]
+    return stacked([padded[0], gap, padded[1]])
 
 
 def fine_spec(cube: Path, renderer: str, scale: float = 2.0) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from .api.runs import warm_up as warm_up
 from .api.verification import Verification as Verification
 from .api.verification import clean as clean
 from .api.verification import verify as verify
+from .api.video import Video as Video
+from .api.video import video as video
 from .contributions import Config as Config
 from .contributions import ExporterContribution as ExporterContribution
 from .contributions import InterpolatorContribution as InterpolatorContribution

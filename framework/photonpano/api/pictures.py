@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonpano.captures.picture_files import Picture, require_writable, write_pictures
+from photonpano.captures.picture_files import counted, require_writable, write_pictures
 from photonpano.captures.preview import Style, pictures, preview_spans, white_flux
 from photonpano.context import Progress, Quiet
 from photonpano.pipeline.components import build_source
@@ -51,7 +50,7 @@ def preview(
 
     Args:
         plan: of the capture; its corrections are applied.
-        output: a new folder for PNGs, or a file: .mp4 or .webp.
+        output: a new folder for PNGs, or a file: .mp4, .webp or .gif.
         group_size: frames of a picture.
         step: frames from the start of one picture to the next; by default `group_size`.
         quantile: the share of the pixels that is darker than white.
@@ -73,11 +72,5 @@ def preview(
         digits = len(str(source.info.n_frames))
         names = [f"frame_{span.start:0{digits}}" for span in spans]
         with (progress or Quiet()).stage(f"writing {output.name}", len(spans), "pictures") as advance:
-            write_pictures(output, _counted(pictures(source, spans, style, threads), advance), names, fps)
+            write_pictures(output, counted(pictures(source, spans, style, threads), advance), names, fps)
         return Preview(output, len(spans), len(spans[0]), style.white_flux, source.info)
-
-
-def _counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
-    for picture in made:
-        yield picture
-        advance(1)

@@ -67,7 +67,7 @@ def render(
         SpecError: a change is wrong.
     """
     for change in changes:
-        _require_harmless(change)
+        require_harmless(change)
     if any(_key(change) == "render.use" for change in changes):
         changes = ["render.with={}", *changes]  # the recorded keys are those of another renderer
     start, folder = time.perf_counter(), Path(run_folder)
@@ -80,14 +80,14 @@ def render(
         ) as written,
         one_thread_inside(),
     ):
-        _require_same_plane(opened)
+        require_same_plane(opened)
         context = Context(thread_count(opened.plan.run.threads), progress or Quiet())
         rendering = render_into(written, opened.plan, opened.source, opened.vignette, opened.motion, context)
         record = written.commit(_record(opened, rendering, time.perf_counter() - start))
     return RenderResult(opened.plan.output.directory, record)
 
 
-def _require_harmless(change: str) -> None:
+def require_harmless(change: str) -> None:
     """Refuse a change of what a rendering does not do."""
     if _key(change).partition(".")[0] not in _SECTIONS:
         raise InputError(
@@ -100,7 +100,8 @@ def _key(change: str) -> str:
     return change.partition("=")[0].strip()
 
 
-def _require_same_plane(opened: OpenedRun) -> None:
+def require_same_plane(opened: OpenedRun) -> None:
+    """Refuse another reference frame than that of the run."""
     recorded, wanted = opened.record["spec"]["render"]["reference"], opened.plan.render.reference
     if recorded != wanted:
         raise InputError(

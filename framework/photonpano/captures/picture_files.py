@@ -1,9 +1,9 @@
-"""Write pictures as a folder of PNGs, an MP4 or an animated WebP, whole or not at all."""
+"""Write pictures as a folder of PNGs, an MP4, or an animated WebP or GIF, whole or not at all."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,10 +15,13 @@ from photonpano.atomic import atomic_folder, atomic_path
 from photonpano.contributions import Requirement, install_command
 from photonpano.errors import OutputError
 
-Picture = NDArray[np.uint8]
+Picture = NDArray[np.uint8] | NDArray[np.uint16]
+"""Of 16 bits in a folder of PNGs only."""
 
-MOST_WEBP = 500
-"""Pictures of an animated WebP, which is made in memory."""
+MOST_ANIMATED = 500
+"""Pictures of an animated WebP or GIF, which is made in memory."""
+_MOST_H264_PX = 16_384
+_ANIMATED = {".webp": "WebP", ".gif": "GIF"}
 _WEBP_QUALITY, _CRF = 90, "18"
 """Quality of lossy compression, whose errors are hardly visible."""
 
@@ -29,12 +32,14 @@ def require_writable(path: Path, n_pictures: int) -> None:
     Raises:
         OutputError: no format has this suffix, the format holds fewer pictures, or its library is not installed.
     """
-    if path.suffix not in ("", ".mp4", ".webp"):
-        raise OutputError(f"cannot write {path}: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp")
-    if path.suffix == ".webp" and n_pictures > MOST_WEBP:
+    if path.suffix not in ("", ".mp4", *_ANIMATED):
         raise OutputError(
-            f"cannot write {path}: {n_pictures:,} pictures are too many for an animated WebP, which holds {MOST_WEBP}; "
-            "take a longer step, or write an .mp4"
+            f"cannot write {path}: pictures go to a folder, as PNGs, or to a file that ends in .mp4, .webp or .gif"
+        )
+    if path.suffix in _ANIMATED and n_pictures > MOST_ANIMATED:
+        raise OutputError(
+            f"cannot write {path}: {n_pictures:,} pictures are too many for an animated {_ANIMATED[path.suffix]}, which holds "
+            f"{MOST_ANIMATED}; take fewer, or write an .mp4"
         )
     if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
         install = install_command([Requirement("av", "photonpano[video]")])
@@ -45,10 +50,10 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
     """Write pictures of one size.
 
     Args:
-        path: a new or empty folder for PNGs; a file that ends in .mp4 or .webp for a film.
-        pictures: (H, W) uint8 each, or (H, W, 3), red first.
+        path: a new or empty folder for PNGs; a file that ends in .mp4, .webp or .gif for a film.
+        pictures: (H, W) uint8 each, or (H, W, 3), red first; uint16 for a folder only.
         names: of the PNGs, without suffix, as many as there are pictures.
-        fps: pictures per second of a film.
+        fps: pictures per second of a film; a GIF counts in 1/100 s.
 
     Raises:
         OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.
@@ -59,9 +64,16 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
             for name, picture in zip(names, pictures, strict=True):
                 (folder / f"{name}.png").write_bytes(_png(picture))
         return
-    write: Callable[[Path, Iterable[Picture], float], None] = _write_mp4 if path.suffix == ".mp4" else _write_webp
+    write: Callable[[Path, Iterable[Picture], float], None] = _write_mp4 if path.suffix == ".mp4" else _write_animated
     with atomic_path(path) as temporary:
         write(temporary, pictures, fps)
+
+
+def counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
+    """Yield pictures, and call `advance` with 1 when each is written."""
+    for picture in made:
+        yield picture
+        advance(1)
 
 
 def _png(picture: Picture) -> bytes:
@@ -84,13 +96,22 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
         stream.pix_fmt = "yuv420p"
         for number, frame in enumerate(frames):
             if number == 0:
+                _require_mp4(*frame.shape[:2])
                 stream.height, stream.width = frame.shape[:2]
             layout = "gray" if frame.ndim == 2 else "rgb24"
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=layout)))
         container.mux(stream.encode())
 
 
-def _write_webp(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+def _require_mp4(height: int, width: int) -> None:
+    if max(height, width) > _MOST_H264_PX:
+        raise OutputError(
+            f"cannot write an MP4 of {width} x {height} pixels: its sides hold up to {_MOST_H264_PX:,}; make them smaller, or "
+            "write PNGs to a folder"
+        )
+
+
+def _write_animated(path: Path, pictures: Iterable[Picture], fps: float) -> None:
     from PIL import Image
 
     first, *others = map(Image.fromarray, pictures)

@@ -25,6 +25,7 @@ from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
 from photonpano.cli.streams import prepare_streams
 from photonpano.cli.verify import verify
+from photonpano.cli.video import video
 from photonpano.cli.warm_up import warm_up
 from photonpano.errors import OutputError
 from photonpano.interrupts import interrupted_by
@@ -49,7 +50,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 _COMMANDS = (
-    *(run, check, check_run, verify, render, explain, info, preview, convert),
+    *(run, check, check_run, verify, render, video, explain, info, preview, convert),
     *(export, simulate, dark, evaluate, clean, schema, warm_up),
 )
 for command in _COMMANDS:

@@ -13,7 +13,7 @@ def preview(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="OUT", help="A new folder for PNGs, or an .mp4 or .webp file.", show_default=False
+            "--output", "-o", metavar="OUT", help="A new folder for PNGs, or an .mp4, .webp or .gif file.", show_default=False
         ),
     ],
     source: SourceName = None,

@@ -13,7 +13,7 @@ from photonpano.photometry.similarity import (
     tapered,
     without_local_mean,
 )
-from photonpano.photometry.tone import WhiteBalance, balanced, linear_to_srgb, srgb_to_linear, tone_mapped
+from photonpano.photometry.tone import WhiteBalance, balanced, grey_world, linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
@@ -29,6 +29,7 @@ __all__ = [
     "balanced",
     "debiased",
     "flux_std",
+    "grey_world",
     "linear_to_srgb",
     "measurable_range",
     "noise_free_correlation",

@@ -34,8 +34,13 @@ def balanced(flux: NDArray[np.float32], white_balance: WhiteBalance) -> NDArray[
         return flux
     if white_balance != "grey-world":
         return np.asarray(flux * np.array(white_balance, np.float32), np.float32)
+    return np.asarray(flux * grey_world(flux), np.float32)
+
+
+def grey_world(flux: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the factors of red, green and blue that make the means of an image equal, and keep that of green: (3,)."""
     means = np.nanmean(flux, axis=(0, 1)) if np.isfinite(flux).any() else np.ones(3, np.float32)
-    return np.asarray(flux * (means[1] / np.maximum(means, 1e-6)), np.float32)
+    return np.asarray(means[1] / np.maximum(means, 1e-6), np.float32)
 
 
 def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -> NDArray[np.uint8]:

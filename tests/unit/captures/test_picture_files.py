@@ -36,6 +36,13 @@ def test_folder_gets_lossless_pngs(tmp_path: Path, smooth: list[np.ndarray]) -> 
         np.testing.assert_array_equal(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), picture)
 
 
+def test_folder_keeps_16_bits(tmp_path: Path) -> None:
+    picture = np.arange(60, dtype=np.uint16).reshape(4, 5, 3) * 1000
+    write_pictures(tmp_path / "look", iter([picture]), NAMES[:1], 24)
+    read = cv2.imread(str(tmp_path / "look" / "frame_00.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(read[..., ::-1], picture)
+
+
 def test_mp4_has_even_sides_and_the_levels(tmp_path: Path, smooth: list[np.ndarray]) -> None:
     av = pytest.importorskip("av")
     write_pictures(tmp_path / "look.mp4", iter(smooth), NAMES, 12.5)
@@ -50,6 +57,16 @@ def test_mp4_has_even_sides_and_the_levels(tmp_path: Path, smooth: list[np.ndarr
         np.testing.assert_allclose(shown[41], shown[40], atol=6)
 
 
+def test_mp4_of_too_large_pictures_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    with pytest.raises(OutputError) as caught:
+        write_pictures(tmp_path / "look.mp4", iter([np.zeros((16, 16_386), np.uint8)]), NAMES[:1], 24)
+    assert str(caught.value) == (
+        "cannot write an MP4 of 16386 x 16 pixels: its sides hold up to 16,384; make them smaller, or write PNGs to a folder"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_webp_is_animated(tmp_path: Path, smooth: list[np.ndarray]) -> None:
     write_pictures(tmp_path / "look.webp", iter(smooth), NAMES, 20)
     with Image.open(tmp_path / "look.webp") as film:
@@ -61,7 +78,17 @@ def test_webp_is_animated(tmp_path: Path, smooth: list[np.ndarray]) -> None:
             assert np.abs(np.asarray(film.convert("L")).astype(int) - picture).max() <= 6
 
 
-@pytest.mark.parametrize("name", ["look", "look.mp4", "look.webp"])
+def test_gif_is_animated(tmp_path: Path, smooth: list[np.ndarray]) -> None:
+    write_pictures(tmp_path / "look.gif", iter(smooth), NAMES, 20)
+    with Image.open(tmp_path / "look.gif") as film:
+        assert (film.n_frames, film.size) == (3, (67, 41))
+        for place, picture in enumerate(smooth):
+            film.seek(place)
+            assert film.info["duration"] == 50
+            assert np.abs(np.asarray(film.convert("L")).astype(int) - picture).max() <= 2
+
+
+@pytest.mark.parametrize("name", ["look", "look.mp4", "look.webp", "look.gif"])
 def test_interrupted_writing_leaves_no_files(tmp_path: Path, smooth: list[np.ndarray], name: str) -> None:
     if name.endswith("mp4"):
         pytest.importorskip("av")
@@ -87,12 +114,11 @@ def test_folder_with_files_is_refused(tmp_path: Path, smooth: list[np.ndarray]) 
 
 
 def test_wrong_names_are_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert refused(tmp_path / "look.gif") == (
-        "cannot write look.gif: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp"
+    assert refused(tmp_path / "look.avi") == (
+        "cannot write look.avi: pictures go to a folder, as PNGs, or to a file that ends in .mp4, .webp or .gif"
     )
     assert refused(tmp_path / "look.webp", 501) == (
-        "cannot write look.webp: 501 pictures are too many for an animated WebP, which holds 500; "
-        "take a longer step, or write an .mp4"
+        "cannot write look.webp: 501 pictures are too many for an animated WebP, which holds 500; take fewer, or write an .mp4"
     )
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     assert refused(tmp_path / "look.mp4") == (

@@ -46,6 +46,7 @@ def test_commands_are_complete() -> None:
         "check",
         "check-run",
         "render",
+        "video",
         "verify",
         "explain",
         "info",

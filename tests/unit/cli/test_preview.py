@@ -38,5 +38,5 @@ def test_preview_refuses_unknown_suffix_at_once(cube: Path, invoke: Callable[...
     result = invoke("preview", "cube.npy", "-o", "look.jpg")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == (
-        "error: cannot write look.jpg: pictures go to a folder, as PNGs, or to a file that ends in .mp4 or .webp\n"
+        "error: cannot write look.jpg: pictures go to a folder, as PNGs, or to a file that ends in .mp4, .webp or .gif\n"
     )

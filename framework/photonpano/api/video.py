@@ -1,0 +1,197 @@
+"""Make a video along the motion of a finished run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from photonpano.api.opened_run import OpenedRun, opened_run
+from photonpano.api.rendering import require_harmless, require_same_plane
+from photonpano.captures.picture_files import counted, require_writable, write_pictures
+from photonpano.context import Progress, Quiet
+from photonpano.errors import ExtentError, InputError
+from photonpano.geometry import Canvas, canvas_of_box
+from photonpano.merging.colour import channels_of
+from photonpano.merging.light import bytes_of_light
+from photonpano.merging.panorama import BYTES_PER_PIXEL, box_of, plan_canvas
+from photonpano.pipeline.film import Film, merged
+from photonpano.registry import Catalog
+from photonpano.text import byte_size
+from photonpano.threads import one_thread_inside, thread_count
+from photonpano.values import FrameSpan
+
+View = Literal["panorama", "smooth"]
+_SMOOTH_S = 0.5
+"""Standard deviation of the smooth path, in seconds of the video."""
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+
+
+@dataclass(frozen=True, slots=True)
+class Video:
+    """A video, written by `video`.
+
+    Attributes:
+        path: the file, or the folder of pictures.
+        n_pictures: how many pictures it holds.
+        shape: (height, width) of a picture.
+        exposure: frames that a picture merges.
+        step: frames from one picture to the next.
+        speed: seconds of the capture that pass in a second of the video; None if the capture has no frame rate.
+    """
+
+    path: Path
+    n_pictures: int
+    shape: tuple[int, int]
+    exposure: int
+    step: float
+    speed: float | None
+
+
+def video(
+    run_folder: Path | str,
+    output: Path | str,
+    *,
+    view: View = "panorama",
+    exposure: int | str | None = None,
+    fps: float = 25,
+    speed: float | None = None,
+    trail: bool = False,
+    changes: Sequence[str] = (),
+    progress: Progress | None = None,
+    catalog: Catalog | None = None,
+) -> Video:
+    """Make a video along the motion of a finished run. Nothing is located again.
+
+    Each picture merges the frames of an exposure along the motion, in the view of its middle. The flux that is white in the
+    panorama of the run is white in all pictures.
+
+    Args:
+        run_folder: written by `run`.
+        output: a file that ends in .mp4, .webp or .gif; or a new folder, for PNGs of 16 bits.
+        view: "panorama" shows the canvas of the panorama, on which still things stand still; "smooth" is as large as a frame
+            and follows the camera without its tremor.
+        exposure: frames that a picture merges, or a time such as "5 ms"; by default as many as the groups of the last level.
+        fps: pictures per second of the video.
+        speed: seconds of the capture that pass in a second of the video; below 1 for slow motion. By default, each picture
+            begins where the exposure of the one before ends.
+        trail: whether to draw the outline of the frame, over the panorama.
+        changes: values of the recorded spec to change, such as `render.scale=0.5` or `render.extent=reference`.
+        progress: receives the stages; quiet by default.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        CanvasTooLargeError: the panorama would exceed `run.memory`.
+        InputError: the folder is no run folder, its capture cannot be opened, or is another capture now; or an argument is
+            wrong.
+        OutputError: the video cannot be written, or the library that writes it is missing.
+        SpecError: a change is wrong.
+    """
+    for change in changes:
+        require_harmless(change)
+    _require_arguments(view, fps, speed, trail)
+    output, progress = Path(output), progress or Quiet()
+    with opened_run(Path(run_folder), catalog, changes) as opened, one_thread_inside():
+        require_same_plane(opened)
+        n_frames, step = _timing(opened, exposure, fps, speed)
+        spans = _exposures(opened.motion.span, n_frames, step)
+        require_writable(output, len(spans))
+        film = _film(opened, view, trail, _SMOOTH_S * fps * step)
+        threads = thread_count(opened.plan.run.threads)
+        names = [f"frame_{number:0{len(str(len(spans)))}}" for number in range(len(spans))]
+        with progress.stage(f"writing {output.name}", len(spans), "pictures") as advance:
+            write_pictures(output, counted(film.pictures(spans, threads, 8 if output.suffix else 16), advance), names, fps)
+        rate = opened.source.info.frame_rate_hz
+        return Video(output, len(spans), film.canvas.shape, n_frames, step, None if rate is None else step * fps / rate)
+
+
+def _require_arguments(view: View, fps: float, speed: float | None, trail: bool) -> None:
+    if view not in ("panorama", "smooth"):
+        raise InputError(f"view: expected panorama or smooth, got {view}")
+    for name, value in (("fps", fps), ("speed", speed)):
+        if value is not None and not 0 < value < np.inf:
+            raise InputError(f"{name}: expected a number above 0, got {value:g}")
+    if trail and view == "smooth":
+        raise InputError("the trail is drawn over the panorama; choose the view panorama, or no trail")
+
+
+def _timing(opened: OpenedRun, exposure: int | str | None, fps: float, speed: float | None) -> tuple[int, float]:
+    """Return the frames of an exposure, and from one exposure to the next."""
+    rate = opened.source.info.frame_rate_hz
+    if speed is not None and rate is None:
+        raise InputError(
+            f"{opened.folder}: the speed of a video needs the frame rate of the capture, which is not known; "
+            "set source.with.frame_rate_hz, or leave the speed out"
+        )
+    n_frames = round(opened.record["levels"][-1]["group_frames"]) if exposure is None else _frames(str(exposure), rate)
+    located = len(opened.motion.span)
+    if n_frames > located:
+        raise InputError(
+            f"{opened.folder}: an exposure of {n_frames:,} frames is longer than the {located:,} frames that were located; "
+            "choose a shorter one"
+        )
+    return n_frames, float(n_frames) if speed is None or rate is None else speed * rate / fps
+
+
+def _frames(exposure: str, rate: float | None) -> int:
+    """Return the number of frames of an exposure."""
+    match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*(s|ms|us)?\s*", exposure)
+    if match is None or (match[2] is None and not match[1].isdigit()):
+        raise InputError(f"exposure: expected a number of frames, or a time such as 5ms, got {exposure}")
+    if match[2] is not None and rate is None:
+        raise InputError("exposure: the frame rate of the capture is not known; give a number of frames")
+    n_frames = int(match[1]) if match[2] is None else round(float(match[1]) * _UNITS[match[2]] * (rate or 0))
+    if n_frames < 1:
+        raise InputError(f"exposure: expected at least one frame, got {exposure}")
+    return n_frames
+
+
+def _exposures(span: FrameSpan, n_frames: int, step: float) -> list[FrameSpan]:
+    number = int((len(span) - n_frames) / step + 1e-9) + 1
+    starts = [span.start + round(place * step) for place in range(number)]
+    return [FrameSpan(start, start + n_frames) for start in starts if start + n_frames <= span.stop]
+
+
+def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> Film:
+    plan, source, motion, recorded = opened.plan, opened.source, opened.motion, opened.record["panorama"]
+    if recorded is None:
+        raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
+    canvas = _canvas(opened) if view == "panorama" else _view_canvas(opened)
+    memory, bytes_per_pixel = int(plan.run.memory), (BYTES_PER_PIXEL + bytes_of_light(source)) * channels_of(source)
+    if (needed := canvas.height * canvas.width * bytes_per_pixel) > memory:
+        raise InputError(
+            f"{opened.folder}: a picture of {canvas.width} x {canvas.height} pixels takes {byte_size(needed)}, more than the "
+            f"{byte_size(memory)} of run.memory; lower render.scale, or choose a part with render.extent"
+        )
+    tolerance_px = plan.render.tolerance_px
+    brighter = plan.render.exposure_stops - opened.record["spec"]["render"]["exposure_stops"]
+    return Film(
+        source,
+        motion,
+        canvas,
+        tolerance_px,
+        smooth_frames if view == "smooth" else None,
+        recorded["white_flux"] / 2**brighter,
+        plan.render.white_balance,
+        merged(source, motion, motion.span, canvas, tolerance_px, thread_count(plan.run.threads)) if trail else None,
+    )
+
+
+def _canvas(opened: OpenedRun) -> Canvas:
+    """Return the canvas of the panorama."""
+    plan, motion = opened.plan, opened.motion
+    shown = motion.trajectory, motion.span, motion.frame_shape
+    try:
+        return plan_canvas(*shown, plan.render.scale, int(plan.run.memory), extent=plan.render.extent)
+    except ExtentError as error:
+        raise InputError(str(plan.place("render.extent").problem(str(error)))) from error
+
+
+def _view_canvas(opened: OpenedRun) -> Canvas:
+    """Return the canvas of the view of a frame, or of a part of it."""
+    render, extent = opened.plan.render, opened.plan.render.extent
+    return canvas_of_box(box_of("reference" if extent == "panorama" else extent, opened.motion.frame_shape), render.scale)

@@ -1,0 +1,141 @@
+"""Make the pictures of a video: frames merged along the motion, in the plane of the panorama or along a smooth path."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from photonpano.captures.picture_files import Picture
+from photonpano.geometry import Canvas, outline_of
+from photonpano.merging.colour import composed, in_colours
+from photonpano.merging.merge_renderer import MergeRenderer
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.smooth_path import smooth_view
+from photonpano.photometry import WhiteBalance, balanced, grey_world, linear_to_srgb
+from photonpano.protocols import Source
+from photonpano.threads import in_order
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
+
+_BALANCED_ON = 16
+"""The white balance "grey-world" is that of 16 pictures all over the video, so that it does not flicker."""
+_DIMMED = 0.4
+"""Level of the panorama around the frame, as a part of what it is in a picture."""
+_LINES_PER_PX = 1 / 300
+"""Width of the outline, as a part of the longer side."""
+_THINNEST_PX, _MARGIN_PX = 2, 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Film:
+    """What the pictures of a video show.
+
+    Attributes:
+        source: the capture, divided by its vignette and in its light.
+        motion: of every frame.
+        canvas: of the panorama; of the view of a frame, if the path is smooth.
+        tolerance_px: motion within which frames are summed before they are warped.
+        smooth_frames: standard deviation of the smooth path, in frames; None for pictures in the plane of the panorama.
+        white_flux: flux that is white, photons per pixel per frame.
+        white_balance: of pictures in colour.
+        panorama: (H, W) or (H, W, 3) flux, shown around the frame, whose outline is drawn; None for neither.
+    """
+
+    source: Source
+    motion: FrameMotion
+    canvas: Canvas
+    tolerance_px: float
+    smooth_frames: float | None
+    white_flux: float
+    white_balance: WhiteBalance
+    panorama: FluxImage | None = None
+
+    def pictures(self, spans: Sequence[FrameSpan], threads: int, bits: Literal[8, 16]) -> Iterator[Picture]:
+        """Yield the picture of each exposure, in order: (H, W) or (H, W, 3), red first, in sRGB; unknown pixels are black.
+
+        Args:
+            spans: the frames of each exposure.
+            threads: how many pictures are made at once; they do not depend on it.
+            bits: of each pixel.
+        """
+        film = replace(self, white_balance=self._balance(spans)) if self.white_balance == "grey-world" else self
+        around = None if self.panorama is None else np.nan_to_num(_DIMMED * film._levels(self.panorama))
+
+        def picture(span: FrameSpan) -> Picture:
+            levels = film._picture(span, around)
+            if bits == 8:
+                return np.asarray(levels * 255 + 0.5).astype(np.uint8)
+            return np.asarray(levels * 65535 + 0.5).astype(np.uint16)
+
+        return in_order(picture, spans, threads)
+
+    def exposure(self, span: FrameSpan) -> FluxImage:
+        """Return the flux of some frames, merged along the motion: (H, W) or (H, W, 3), NaN where it is unknown."""
+        canvas = self.canvas
+        if self.smooth_frames is not None:
+            to_view = np.linalg.inv(smooth_view(self.motion, span.centre, self.smooth_frames))
+            canvas = replace(canvas, transform=canvas.transform @ to_view)
+        return merged(self.source, self.motion, span, canvas, self.tolerance_px, 1)
+
+    def _picture(self, span: FrameSpan, around: FluxImage | None) -> FluxImage:
+        """Return levels from 0 to 1, with those of the panorama around the frame."""
+        picture = self._levels(self.exposure(span))
+        if around is None:
+            return np.nan_to_num(picture)
+        outline = outline_on(self.canvas, self.motion, span.centre)
+        outline = outline if picture.ndim == 2 else outline[..., None]
+        return np.asarray(np.maximum(np.where(np.isnan(picture), around, picture), outline), np.float32)
+
+    def _levels(self, flux: FluxImage) -> FluxImage:
+        return linear_to_srgb(balanced(flux, self.white_balance) / self.white_flux)
+
+    def _balance(self, spans: Sequence[FrameSpan]) -> WhiteBalance:
+        chosen = sorted({round(place) for place in np.linspace(0, len(spans) - 1, _BALANCED_ON)})
+        pictures = [self.exposure(spans[place]) for place in chosen]
+        if pictures[0].ndim == 2:
+            return "none"
+        red, green, blue = np.mean([grey_world(each) for each in pictures if np.isfinite(each).any()], axis=0).tolist()
+        return red, green, blue
+
+
+def merged(
+    source: Source, motion: FrameMotion, span: FrameSpan, canvas: Canvas, tolerance_px: float, threads: int
+) -> FluxImage:
+    """Merge frames on a canvas along a motion; of a filter array, the colours: (H, W) or (H, W, 3)."""
+
+    def of_colour(each: Source) -> Panorama:
+        return MergeRenderer(threads).render(each, motion.trajectory, span, canvas, tolerance_px, lambda _: None)
+
+    return composed(in_colours(source, of_colour), source).flux
+
+
+def outline_on(canvas: Canvas, motion: FrameMotion, instant: float) -> FluxImage:
+    """Draw the outline of a frame on a canvas: (H, W) from 0 to 1."""
+    points = outline_of(motion.frame_shape)
+    if motion.camera is not None:
+        points = motion.camera.ideal(points)
+    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    rays = rays @ (canvas.plane_to_rays @ motion.trajectory.at([instant])[0]).T
+    if canvas.planar:
+        rays = rays[rays[:, 2] > 0]
+    # OpenCV draws no smooth lines on the outermost pixels.
+    image = np.zeros((canvas.height + 2 * _MARGIN_PX, canvas.width + 2 * _MARGIN_PX), np.uint8)
+    width = max(_THINNEST_PX, round(max(canvas.shape) * _LINES_PER_PX))
+    for line in _whole_lines(canvas.pixels(rays), canvas.period_px):
+        cv2.polylines(image, [np.rint(16 * (line + _MARGIN_PX)).astype(np.int32)], False, 255, width, cv2.LINE_AA, shift=4)
+    inside = slice(_MARGIN_PX, -_MARGIN_PX)
+    return np.asarray(image[inside, inside] / 255, np.float32)
+
+
+def _whole_lines(points: FloatArray, period_px: float | None) -> Iterator[FloatArray]:
+    """Yield a closed line, once for each full turn at which it may be seen, without a jump from one end to the other."""
+    closed = np.concatenate([points, points[:1]])
+    if period_px is None:
+        yield closed
+        return
+    unwrapped = np.unwrap(closed[:, 0], period=period_px)
+    for turn in (-1, 0, 1):
+        yield np.stack([unwrapped + turn * period_px, closed[:, 1]], axis=-1)
