@@ -14,11 +14,12 @@ from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.rendering import require_harmless, require_same_plane
 from photonpano.captures.picture_files import counted, require_writable, write_pictures
 from photonpano.context import Progress, Quiet
-from photonpano.errors import ExtentError, InputError
+from photonpano.errors import ExtentError, InputError, ProjectionError
 from photonpano.geometry import Canvas, canvas_of_box
+from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
-from photonpano.merging.panorama import BYTES_PER_PIXEL, box_of, plan_canvas
+from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
 from photonpano.registry import Catalog
 from photonpano.text import byte_size
@@ -183,12 +184,14 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
 
 def _canvas(opened: OpenedRun) -> Canvas:
     """Return the canvas of the panorama."""
-    plan, motion = opened.plan, opened.motion
+    render, motion = opened.plan.render, opened.motion
     shown = motion.trajectory, motion.span, motion.frame_shape
+    view = view_of(motion, opened.source, render.projection, level=render.horizon == "level")
     try:
-        return plan_canvas(*shown, plan.render.scale, int(plan.run.memory), extent=plan.render.extent)
-    except ExtentError as error:
-        raise InputError(str(plan.place("render.extent").problem(str(error)))) from error
+        return plan_canvas(*shown, render.scale, int(opened.plan.run.memory), extent=render.extent, view=view)
+    except (ExtentError, ProjectionError) as error:
+        key = "render.extent" if isinstance(error, ExtentError) else "render.projection"
+        raise InputError(str(opened.plan.place(key).problem(str(error)))) from error
 
 
 def _view_canvas(opened: OpenedRun) -> Canvas:

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 
 from photonpano.captures.picture_files import Picture
-from photonpano.geometry import Canvas, outline_of
+from photonpano.geometry import Camera, Canvas, outline_of
 from photonpano.merging.colour import composed, in_colours
 from photonpano.merging.merge_renderer import MergeRenderer
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.smooth_path import smooth_view
 from photonpano.photometry import WhiteBalance, balanced, grey_world, linear_to_srgb
-from photonpano.protocols import Source
+from photonpano.protocols import ColouredSource, Source, camera_of
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
@@ -61,7 +61,7 @@ class Film:
             threads: how many pictures are made at once; they do not depend on it.
             bits: of each pixel.
         """
-        film = replace(self, white_balance=self._balance(spans)) if self.white_balance == "grey-world" else self
+        film = self._balanced(spans) if isinstance(self.source, ColouredSource) else self
         around = None if self.panorama is None else np.nan_to_num(_DIMMED * film._levels(self.panorama))
 
         def picture(span: FrameSpan) -> Picture:
@@ -85,20 +85,21 @@ class Film:
         picture = self._levels(self.exposure(span))
         if around is None:
             return np.nan_to_num(picture)
-        outline = outline_on(self.canvas, self.motion, span.centre)
+        outline = outline_on(self.canvas, self.motion, self.motion.camera or camera_of(self.source), span.centre)
         outline = outline if picture.ndim == 2 else outline[..., None]
         return np.asarray(np.maximum(np.where(np.isnan(picture), around, picture), outline), np.float32)
 
     def _levels(self, flux: FluxImage) -> FluxImage:
         return linear_to_srgb(balanced(flux, self.white_balance) / self.white_flux)
 
-    def _balance(self, spans: Sequence[FrameSpan]) -> WhiteBalance:
+    def _balanced(self, spans: Sequence[FrameSpan]) -> Film:
+        """Return the same with one white balance for all pictures."""
+        if self.white_balance != "grey-world":
+            return self
         chosen = sorted({round(place) for place in np.linspace(0, len(spans) - 1, _BALANCED_ON)})
         pictures = [self.exposure(spans[place]) for place in chosen]
-        if pictures[0].ndim == 2:
-            return "none"
         red, green, blue = np.mean([grey_world(each) for each in pictures if np.isfinite(each).any()], axis=0).tolist()
-        return red, green, blue
+        return replace(self, white_balance=(red, green, blue))
 
 
 def merged(
@@ -112,11 +113,11 @@ def merged(
     return composed(in_colours(source, of_colour), source).flux
 
 
-def outline_on(canvas: Canvas, motion: FrameMotion, instant: float) -> FluxImage:
-    """Draw the outline of a frame on a canvas: (H, W) from 0 to 1."""
+def outline_on(canvas: Canvas, motion: FrameMotion, camera: Camera | None, instant: float) -> FluxImage:
+    """Draw the outline of a frame, through the lens of its camera, on a canvas: (H, W) from 0 to 1."""
     points = outline_of(motion.frame_shape)
-    if motion.camera is not None:
-        points = motion.camera.ideal(points)
+    if camera is not None:
+        points = camera.ideal(points)
     rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     rays = rays @ (canvas.plane_to_rays @ motion.trajectory.at([instant])[0]).T
     if canvas.planar:
