@@ -67,6 +67,9 @@ RUNS: dict[str, dict[str, Any]] = {
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}
     | {"source.with.flux": 0.5, "resample.with.group_size": 25, "graph.skips": "[1, 2]"},
+    "turn": {"source.with.n_frames": 500, "source.with.frame_shape": "[64, 96]", "source.with.path.degrees": 120}
+    | {"source.with.scene.width": 512, "source.with.scene.height": 256, "source.with.focal_length_px": 81}
+    | {"resample.with.group_size": 25, "levels": 2},
     "high-dynamic-range": SMALL_NIGHT,
     "high-speed-video": {"resample.with.group_size": 8},
     "photograph": SMALL

@@ -7,7 +7,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.context import Context
-from photonpano.geometry import translation
+from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.lighting import decision_of, find_light
 from photonpano.lighting.series import flicker_frequency
 from photonpano.merging.light import gain_image
@@ -18,6 +18,14 @@ MOTION = KnownMotion(lambda frame: translation(0.06 * float(frame), 0.01 * float
 STEADY = np.ones(N)
 DRIFT = 0.5 ** np.linspace(0, 1, N)
 FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
+
+
+class Turning(FrameTrajectory):
+    """Rotations of a camera, as homographies of all frames."""
+
+    def __init__(self, camera: Camera, homographies: np.ndarray) -> None:
+        super().__init__(homographies)
+        self.camera = camera
 
 
 def panned(
@@ -83,6 +91,22 @@ def test_lamps_of_two_phases_are_told_apart() -> None:
         found = gain_image(light, FrameSpan(frame, frame + 1), motion.at([frame])[0], shape)[16]
         inside = (np.abs(x - 60) > 8) & (x > 20) & (x < 96)
         assert float(np.sqrt(np.mean((found - expected)[inside] ** 2))) < 0.08
+
+
+def test_drift_is_measured_along_a_turn_by_200_degrees() -> None:
+    camera, rng = Camera.of(50.0, SHAPE), np.random.default_rng(0)
+    rotations = rotation_matrices(np.linspace([0, -1.75, 0], [0, 1.75, 0], N))
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    rays = camera.directions(np.stack([x, y], axis=-1))
+    frames = np.empty((N, *SHAPE), np.uint8)
+    for first in range(0, N, 4):
+        across, down, _ = np.moveaxis(rays @ rotations[first + 2].T, -1, 0)
+        flux = 0.2 + 0.1 * np.sin(20 * across) * np.cos(17 * down) + 0.05 * np.sin(9 * across)
+        frames[first : first + 4] = rng.random((4, *SHAPE)) < -np.expm1(-flux * DRIFT[first : first + 4, None, None])
+    motion = Turning(camera, camera.homographies(rotations))
+    found = find_light(MemorySource(frames), motion, Context(1))
+    assert found is not None
+    assert float(np.sqrt(np.mean((found.gain - DRIFT / DRIFT.mean()) ** 2))) < 0.02
 
 
 def test_frequency_of_noise_is_none() -> None:
