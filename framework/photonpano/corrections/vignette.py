@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.geometry import apply, corner_displacements, inverse
-from photonpano.protocols import LinearlyCorrectedSource
+from photonpano.protocols import LinearlyCorrectedSource, camera_of
 from photonpano.source_wrapper import (
     ColouredWrapper,
     LensedWrapper,
@@ -18,7 +18,7 @@ from photonpano.source_wrapper import (
     capabilities_of,
     with_capabilities,
 )
-from photonpano.values import Decision, FrameSpan
+from photonpano.values import Decision, FrameSpan, Homography
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -156,11 +156,21 @@ class _Seen:
         photons, area = _binned(lit * source.valid), _binned(source.valid)
         seen = (area == _CELL_PX**2) & (photons > 0)
         distance, (rows, columns) = _distances(source.info.frame_shape, _CELL_PX)[seen], np.nonzero(seen)
-        centres = (np.stack([columns, rows], axis=-1) + 0.5) * _CELL_PX - 0.5
-        places = apply(trajectory.at([span.centre])[0], centres)
+        centres: FloatArray = (np.stack([columns, rows], axis=-1).astype(float) + 0.5) * _CELL_PX - 0.5
+        places = _places(source, trajectory.at([span.centre])[0], centres)
         mean = np.asarray(photons[seen] / (area[seen] * len(span)), np.float32)
         flux = source.response.flux(mean, _CELL_PX**2 * len(span)).astype(float)
         return cls(flux, photons[seen], np.floor(places / _CELL_PX).astype(np.int64), distance)
+
+
+def _places(source: Source, homography: Homography, points: FloatArray) -> FloatArray:
+    """Return where (N, 2) pixels of a frame lie in the scene: (N, 2) on its plane, or around its camera if that is known."""
+    camera = camera_of(source)
+    if camera is None:
+        return apply(homography, points)
+    rays = camera.directions(points) @ (np.linalg.inv(camera.matrix) @ homography @ camera.matrix).T
+    x, y, z = rays.T
+    return camera.focal_px * np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
 
 
 def _spans(source: Source, trajectory: Trajectory) -> list[FrameSpan]:

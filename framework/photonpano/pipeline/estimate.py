@@ -23,6 +23,7 @@ from photonpano.pipeline.components import build_levels
 from photonpano.protocols import Source, Trajectory, light_of
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
+from photonpano.source_wrapper import seen_through
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Light
 
@@ -74,7 +75,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline, model=model_of(plan))
     first, later = results, levels[1:]
     known = first[0].trajectory
-    if vignette := vignette_of(plan, source, known):
+    if vignette := vignette_of(plan, _in_view(plan, source, first, context)[0], known):
         decisions.append(vignette.decision)
         source, context = divided_by(source, vignette), replace(context, checkpoints=context.checkpoints.within(vignette))
         if not later:
@@ -126,7 +127,7 @@ def _lit(
     """
     changing, known = plan.light.mode == "changing", steady[0].trajectory
     measured = measure_light if changing else find_light
-    if (light := measured(source, known, context)) is None:
+    if (light := measured(_in_view(plan, source, steady, context)[0], known, context)) is None:
         return None
     if plan.light.mode == "steady":
         logger.warning(f"light: steady, but {decision_of(light, source.info.frame_rate_hz).reason}; write light: auto")
@@ -143,8 +144,9 @@ def _lit(
 
     worse = ""
     try:
-        known = first_level(light, known)[0].trajectory
-        if (again := measured(source, known, context)) is None:
+        first = first_level(light, known)
+        known = first[0].trajectory
+        if (again := measured(_in_view(plan, source, first, context)[0], known, context)) is None:
             return None
         results = first_level(again, known)
         in_this, within = lit(again)
@@ -226,12 +228,11 @@ def _given(number: float | Literal["find"]) -> float | None:
 
 
 def _in_view(plan: Plan, source: Source, results: Sequence[LevelResult], context: Context) -> tuple[Source, Context]:
-    """Return a capture as the camera that the last level has found sees it, and the context of what is done with it."""
-    model = model_of(plan).knowing(camera_of_motion(results[-1].trajectory))
-    seen = through_lens(source, model)
-    if seen is source:
-        return source, context
-    return seen, replace(context, checkpoints=context.checkpoints.within(model.known))
+    """Return a capture with the camera that the last level has found, and the context of what is done with it."""
+    camera = camera_of_motion(results[-1].trajectory)
+    if camera is None:
+        return through_lens(source, model_of(plan)), context
+    return seen_through(source, camera), replace(context, checkpoints=context.checkpoints.within(camera))
 
 
 def _reference_frame(plan: Plan, source: Source) -> int:
