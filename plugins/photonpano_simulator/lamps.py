@@ -14,8 +14,13 @@ def brightness(lamp: Lamp, n_frames: int, frame_rate_hz: float) -> NDArray[np.fl
     return np.asarray(1 + lamp.depth * np.cos(2 * np.pi * turns + np.deg2rad(lamp.phase_deg)))
 
 
-def shares(lamps: tuple[Lamp, ...], scene_shape: tuple[int, int]) -> NDArray[np.float32]:
+def shares(lamps: tuple[Lamp, ...], scene_shape: tuple[int, int], is_round: bool = False) -> NDArray[np.float32]:
     """Return the share of each lamp in the light of each place of the scene.
+
+    Args:
+        lamps: of the scene.
+        scene_shape: (height, width).
+        is_round: whether the left and the right end of the scene meet.
 
     Returns:
         (N, Hs, Ws); where the lamps together would give more than all of the light, each gives less.
@@ -26,7 +31,10 @@ def shares(lamps: tuple[Lamp, ...], scene_shape: tuple[int, int]) -> NDArray[np.
         if lamp.at is not None:
             x, y = lamp.at[0] * width - 0.5, lamp.at[1] * height - 0.5
             std_px = lamp.radius * height
-            across = np.exp(-((np.arange(width) - x) ** 2) / (2 * std_px**2))
+            beside = np.arange(width) - x
+            if is_round:
+                beside = np.mod(beside + width / 2, width) - width / 2
+            across = np.exp(-(beside**2) / (2 * std_px**2))
             down = np.exp(-((np.arange(height) - y) ** 2) / (2 * std_px**2))
             share[:] = np.outer(down, across)
     return np.asarray(found / np.maximum(found.sum(axis=0), 1), np.float32)

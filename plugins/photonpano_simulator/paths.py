@@ -15,7 +15,7 @@ import numpy as np
 
 from photonpano import FloatArray, InputError
 from photonpano.geometry import Camera, apply, inverse, normalised, rescaling, rotation_matrices
-from photonpano.reading import read_array
+from photonpano.reading import read_array, read_arrays
 from photonpano_simulator.config import (
     FilePath,
     HandShakePath,
@@ -260,6 +260,9 @@ def _read_homographies(path: Path, n_frames: int) -> FloatArray:
     Raises:
         InputError: the file is missing, is something else, or has another number of homographies.
     """
+    arrays = read_arrays(path, "a file of homographies", ("homographies", "scene_projection"))
+    if "scene_projection" in arrays and str(arrays["scene_projection"]) == "spherical":
+        raise InputError(f"{path} is the truth of a turn, and its homographies lie on no plane; take a path of the kind turn")
     homographies = read_array(path, "a file of homographies", "homographies")
     if homographies.ndim != 3 or homographies.shape[1:] != (3, 3) or homographies.dtype.kind not in "fiu":
         raise InputError(f"{path} holds {homographies.dtype} of shape {homographies.shape}; homographies are (n_frames, 3, 3)")

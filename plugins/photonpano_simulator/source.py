@@ -48,7 +48,7 @@ class SimulatorSource(Closing):
         )
         self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
         self._light = config.drift ** np.linspace(0, 1, config.n_frames)
-        self._lamps = shares(config.lamps, (height, width))
+        self._lamps = shares(config.lamps, (height, width), is_round)
         self._lit_parts = [self._views.averaged(np.ascontiguousarray((self._scene.T * share.T).T)) for share in self._lamps]
         self._lamp_light = np.zeros((len(config.lamps), config.n_frames))
         for place, lamp in enumerate(config.lamps):

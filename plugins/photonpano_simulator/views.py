@@ -36,7 +36,9 @@ class Views:
         self._is_round = isinstance(config.path, TurnPath)
         self._points = None
         if distorts(config) or self._is_round:
-            self._points = undistorted(config, pixel_grid(config.frame_shape))
+            # (2, H, W), x and y of the pixels of a lens without distortion.
+            points = undistorted(config, pixel_grid(config.frame_shape))
+            self._points = np.ascontiguousarray(np.moveaxis(points, -1, 0))
         self._to_rays = np.linalg.inv(camera(config).matrix)
         # The side of the area of a pixel, in px of the scene. Averages over it are sampled where their middles lie.
         self._side = max(1, round(config.scene_scale * config.fill_factor**0.5))
@@ -68,8 +70,7 @@ class Views:
         if self._points is None:
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             return np.asarray(cv2.warpPerspective(averages, homography, (width, height), flags=flags, borderMode=border))
-        points = apply(homography, self._points.reshape(-1, 2)).reshape(height, width, 2)
-        x, y = np.moveaxis(points, -1, 0).astype(np.float32)
+        x, y = apply(homography, self._points.reshape(2, -1).T).T.reshape(2, height, width).astype(np.float32)
         return np.asarray(cv2.remap(averages, x, y, cv2.INTER_LINEAR, borderMode=border))
 
     def _around(self, averages: NDArray[np.float32], points: FloatArray, homography: FloatArray) -> NDArray[np.float32]:
@@ -92,7 +93,7 @@ def _look_around(
     """Write where points of a frame lie in an equirectangular panorama.
 
     Args:
-        points: (H, W, 2), pixels of the frame.
+        points: (2, H, W), x and y of pixels of the frame.
         rays: (3, 3), pixels of the frame to directions.
         width: of the panorama: 360 degrees.
         height: of the panorama, whose middle is the horizon.
@@ -102,12 +103,27 @@ def _look_around(
     """
     per_radian = width / (2 * np.pi)
     for i in range(columns.shape[0]):
-        for j in range(columns.shape[1]):
-            x, y = points[i, j, 0], points[i, j, 1]
+        xs, ys, column_of, row_of = points[0, i], points[1, i], columns[i], rows[i]
+        for j in range(len(xs)):
+            x, y = xs[j], ys[j]
             right = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
             down = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
             ahead = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
-            azimuth, pitch = np.arctan2(right, ahead), np.arctan2(down, np.sqrt(right * right + ahead * ahead))
+            azimuth, pitch = _angle(right, ahead), _angle(down, np.sqrt(right * right + ahead * ahead))
             column = per_radian * azimuth + (width - 1) / 2 - offset
-            columns[i, j] = column if column >= 0 else column + width
-            rows[i, j] = min(max(per_radian * pitch + (height - 1) / 2 - offset, 0.0), height - 1.0)
+            column_of[j] = column if column >= 0 else column + width
+            row_of[j] = min(max(per_radian * pitch + (height - 1) / 2 - offset, 0.0), height - 1.0)
+
+
+@compiled
+def _angle(y: float, x: float) -> float:
+    """Return the arc tangent of y / x, from -pi to pi, within 2e-9: a Chebyshev fit, which is vectorised."""
+    up, along = abs(y), abs(x)
+    ratio = min(up, along) / max(up, along, 1e-300)
+    s = ratio * ratio
+    angle = 0.05746355779882009 + s * (-0.030717508855215514 + s * (0.010680719419709784 - s * 0.0017437011378649602))
+    angle = -0.14261573680082928 + s * (0.1094019896411271 + s * (-0.08372063945103504 + s * angle))
+    angle = ratio * (0.9999999975460201 + s * (-0.33333282295510946 + s * (0.19998230640355844 + s * angle)))
+    angle = np.pi / 2 - angle if up > along else angle
+    angle = np.pi - angle if x < 0 else angle
+    return -angle if y < 0 else angle

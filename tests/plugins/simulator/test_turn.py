@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -168,3 +169,19 @@ def test_turn_that_cannot_be_simulated_is_refused(changes: dict[str, Any], messa
 def test_two_models_of_distortion_are_refused() -> None:
     with pytest.raises(ValidationError, match="lens and distortion both distort the image; leave out one of the two models"):
         SimulatorConfig.model_validate(settings({}, lens={"k1": 0.1}, distortion={"k1": 0.1}))
+
+
+def test_lamp_at_the_ends_of_a_scene_all_around_lights_both() -> None:
+    lamp = {"at": (0.0, 0.5), "radius": 0.1}
+    share = spad({}, lamps=[lamp]).truth()["lamps"][0]
+    np.testing.assert_allclose(share[:, :200], share[:, :-201:-1], atol=1e-6)
+    assert share[128, 0] > 0.99
+
+
+def test_truth_of_a_turn_is_no_file_of_homographies(tmp_path: Path) -> None:
+    path = tmp_path / "truth.npz"
+    np.savez(path, **spad({}).truth())
+    with pytest.raises(InputError) as caught:
+        spad({"kind": "file", "file": path})
+    message = "is the truth of a turn, and its homographies lie on no plane; take a path of the kind turn"
+    assert str(caught.value) == f"{path} {message}"
