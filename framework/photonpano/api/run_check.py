@@ -10,7 +10,7 @@ from photonpano.context import Context, Progress, Quiet
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
 from photonpano.residuals.refinement import Look, refine
-from photonpano.residuals.verdict import REPEATS, Reason, Verdict, contradictions, judge
+from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
 from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import Decision
 
@@ -57,7 +57,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
     elif (reason := contradictions(*pairs)) is not None:
         verdict = _with(verdict, reason)
     for found in (record.get("verdict") or {"reasons": ()})["reasons"]:
-        if found["what"] == REPEATS:
+        if found["what"] in (REPEATS, NO_TURN):
             verdict = _with(verdict, Reason(**found))
     return RunCheck(verdict, tuple(unknown))
 

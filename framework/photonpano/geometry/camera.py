@@ -48,6 +48,11 @@ class Camera:
         return float(self.matrix[0, 2]), float(self.matrix[1, 2])
 
     @property
+    def numbers(self) -> FloatArray:
+        """Focal length in px, k1, k2, p1 and p2: (5,)."""
+        return np.array([self.focal_px, *self.distortion])
+
+    @property
     def distorts(self) -> bool:
         """Whether the lens distorts."""
         return bool(self.distortion.any())

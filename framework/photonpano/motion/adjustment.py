@@ -45,12 +45,13 @@ class Assessment:
         information: (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its
             homography, or of a rotation vector in its own frame. NaN for a single node.
         std_px: (N,) expected error of the corners of each node, after the best alignment of the planes.
-        std_shared: (s,) expected errors of the unknowns that all nodes share.
+        std_camera: (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and
+            p2. They are 0 for what is given; () without a camera.
     """
 
     information: FloatArray
     std_px: FloatArray
-    std_shared: FloatArray
+    std_camera: FloatArray
 
 
 class Adjustment(ABC, Generic[StateT]):
@@ -127,6 +128,11 @@ class Adjustment(ABC, Generic[StateT]):
         del state
         return np.zeros(self._n_shared), np.zeros((self._n_shared, self._n_shared))
 
+    def std_camera(self, state: StateT, std_shared: FloatArray) -> FloatArray:
+        """Return what `Assessment` holds of a camera, given the expected errors of the (s,) shared unknowns."""
+        del state
+        return std_shared
+
     def relative(self, state: StateT) -> FloatArray:
         """Return the homography that a state expects of each edge: (E, 3, 3)."""
         homographies = self.homographies(state)
@@ -183,7 +189,8 @@ class Adjustment(ABC, Generic[StateT]):
         changes = np.zeros((len(free), SAMPLES))
         changes[free] = _solved(normal[free][:, free], (jacobians.T @ draws)[free], draws=True)
         std_shared = np.sqrt((changes[k * self._n_nodes :] ** 2).mean(axis=1))
-        return Assessment(self.information(state, blocks), self._corner_std_px(state, changes), std_shared)
+        std_px = self._corner_std_px(state, changes)
+        return Assessment(self.information(state, blocks), std_px, self.std_camera(state, std_shared))
 
     @property
     @abstractmethod

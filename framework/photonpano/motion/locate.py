@@ -38,7 +38,7 @@ class LocatedLevel:
             of its rotation vector for a camera that only turns; None for a single exposure.
         std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
         frame_shape: (height, width) of a frame.
-        std_shared: expected errors of the logarithm of the focal length, if that was found, of a camera that turns.
+        std_camera: (5,) expected errors of the camera, see `Assessment`.
         ambiguity: pairs that fit the scene at more than one place; None where there are none.
     """
 
@@ -49,7 +49,7 @@ class LocatedLevel:
     information: FloatArray | None
     std_px: FloatArray
     frame_shape: tuple[int, int]
-    std_shared: FloatArray
+    std_camera: FloatArray
     ambiguity: Ambiguity | None = None
 
     @property
@@ -130,7 +130,7 @@ def locate(
         assessed.information if len(assessed.std_px) > 1 else None,
         assessed.std_px,
         shape,
-        assessed.std_shared,
+        assessed.std_camera,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
 

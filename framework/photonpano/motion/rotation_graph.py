@@ -145,6 +145,13 @@ class RotationAdjustment(Adjustment[Turns]):
         end = float(np.hypot(*self._frame_shape)) / 2 / camera.focal_px
         return np.array([1.0, end**-2, end**-4, end**-1, end**-1])[list(self._unknown)]
 
+    def std_camera(self, state: Turns, std_shared: FloatArray) -> FloatArray:
+        """Return the expected errors of the focal length, in px, and of k1, k2, p1 and p2: (5,), 0 for what is given."""
+        found = np.zeros(5)
+        found[list(self._unknown)] = std_shared * self._units(state.camera)
+        found[0] *= state.camera.focal_px
+        return found
+
     def start(self, homographies: FloatArray, camera: Camera) -> Turns:
         """Return the rotations nearest to the homographies of the nodes: (N, 3, 3)."""
         return Turns(nearest_rotations(camera.rotations(homographies)), camera)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photonpano.geometry import align_planes, align_rotations, corner_displacements, inverse
+from photonpano.geometry import Camera, align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import TurningTrajectory
+from photonpano.motion.turning import TurningTrajectory, camera_of_motion
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray
 
@@ -28,9 +28,12 @@ class Uncertainty:
 
     Attributes:
         change_px: mean displacement of the corners since the previous level, px of a frame; None at the first level.
+        std_camera: (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for
+            homographies.
     """
 
     change_px: float | None
+    std_camera: FloatArray | None
 
     def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
         """Compare a level with the one before.
@@ -41,6 +44,7 @@ class Uncertainty:
             previous: the motion after the level before; None at the first level.
             timeline: of the capture. Beyond a cut, nothing is known from the other side.
         """
+        self.std_camera = _std_camera(located, camera_of_motion(previous))
         self._instants = located.instants
         self._std_px = located.std_px
         self._timeline = timeline
@@ -80,6 +84,15 @@ class Uncertainty:
             beyond = np.maximum((instants[0] - frames[here]) / first, (frames[here] - instants[-1]) / last)
             noise_px[here] = inside * (1 + 2 * np.maximum(beyond, 0))
         return np.asarray(np.hypot(noise_px, self._timeline.unknown_px(frames)))
+
+
+def _std_camera(located: LocatedLevel, before: Camera | None) -> FloatArray | None:
+    if located.solution.turns is None:
+        return None
+    if before is None:
+        return located.std_camera
+    change = located.solution.turns.camera.numbers - before.numbers
+    return np.asarray(np.hypot(located.std_camera, _REMAINING_SHARE * change))
 
 
 def _aligned(after: Trajectory, before: Trajectory, frames: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:

@@ -93,7 +93,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context), vignette)
     if cuts := find_cuts(source, found.look, context):
         found = _cut_at(cuts, plan, found)
-    decisions += found.timeline.decisions
+    decisions += [*found.timeline.decisions, *_model_decisions(plan, found.results)]
     source, context = _in_view(plan, found.source, found.results, found.context)
     return replace(found, source=source, context=context)
 
@@ -221,6 +221,19 @@ def model_of(plan: Plan) -> MotionModel:
     camera, distortion = plan.camera, plan.camera.distortion
     k1, k2, p1, p2 = (_given(each) for each in (distortion.k1, distortion.k2, distortion.p1, distortion.p2))
     return MotionModel(plan.motion.model, _given(camera.focal_px), camera.centre_px, (k1, k2, p1, p2))
+
+
+def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
+    """Return which model `auto` took, for the record."""
+    solution = results[-1].located.solution
+    if plan.motion.model != "auto":
+        return []
+    taken = "homography" if solution.turns is None else "rotation"
+    if solution.evidence is None:
+        return [Decision("motion_model", taken, "the camera turns too far for homographies to one plane")]
+    gain = solution.evidence.gain
+    reason = f"each unknown that homographies have more lowers the squared residuals {gain:.2g} times as much as noise would"
+    return [Decision("motion_model", taken, reason)]
 
 
 def _given(number: float | Literal["find"]) -> float | None:

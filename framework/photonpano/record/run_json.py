@@ -19,7 +19,6 @@ from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.graph import Evidence
-from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.loop import LevelResult
 from photonpano.record.schema import (
     CameraRecord,
@@ -196,7 +195,7 @@ def level_record(result: LevelResult) -> LevelRecord:
         "change_px": result.change_px,
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
-        "camera": _camera_record(located),
+        "camera": _camera_record(result),
         "evidence": _evidence_record(located.solution.evidence),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
@@ -208,16 +207,16 @@ def _evidence_record(evidence: Evidence | None) -> EvidenceRecord | None:
     return {"rotation": evidence.rotation, "homography": evidence.homography, "gain": evidence.gain}
 
 
-def _camera_record(located: LocatedLevel) -> CameraRecord | None:
-    if located.solution.turns is None:
+def _camera_record(result: LevelResult) -> CameraRecord | None:
+    turns, std = result.located.solution.turns, result.uncertainty.std_camera
+    if turns is None or std is None:
         return None
-    camera = located.solution.turns.camera
-    std = float(located.std_shared[0]) if len(located.std_shared) else 0.0
     return {
-        "focal_px": camera.focal_px,
-        "std_focal_px": camera.focal_px * std,
-        "centre_px": list(camera.centre_px),
-        "distortion": camera.distortion.tolist(),
+        "focal_px": turns.camera.focal_px,
+        "std_focal_px": float(std[0]),
+        "centre_px": list(turns.camera.centre_px),
+        "distortion": turns.camera.distortion.tolist(),
+        "std_distortion": std[1:].tolist(),
     }
 
 

@@ -57,13 +57,14 @@ class ClosureRecord(TypedDict):
 class CameraRecord(TypedDict):
     """A camera that turns: focal length and principal point in px of a frame, and k1, k2, p1, p2 of its lens.
 
-    `std_focal_px` is the expected error of a focal length that was found, 0 for one that was given.
+    `std_focal_px` and `std_distortion` are the expected errors of what was found, 0 for what was given.
     """
 
     focal_px: float
     std_focal_px: float
     centre_px: Sequence[float]
     distortion: Sequence[float]
+    std_distortion: Sequence[float]
 
 
 class EvidenceRecord(TypedDict):

@@ -41,7 +41,11 @@ MAX_AMBIGUOUS, _FEWEST_AMBIGUOUS = 0.05, 3
 MAX_STANDING = 0.5
 """Share of the frame that stands still while the rest moves."""
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
-"""The reason that only the loop can find: a run folder does not hold the other places."""
+"""A reason that only the loop can find: a run folder does not hold the other places."""
+NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
+"""A reason that only the loop can find: a run folder does not hold the pairs."""
+MAX_TURN_RESIDUAL = 3.0
+"""Root mean square of the residuals of the pairs of rotations, in units of their noise."""
 _SIGMAS = 6.0
 """A place stands out if it exceeds what is expected by this many standard deviations."""
 _FEWEST = 16
@@ -106,6 +110,7 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
         lambda: _deformation(residuals),
         lambda: _uncertain(motion),
         lambda: _contradictions(levels),
+        lambda: _no_turn(levels),
         lambda: _ambiguous(levels),
         lambda: _standing(decisions),
         lambda: _jump_in_the_dark(decisions),
@@ -224,7 +229,8 @@ def _lens(residuals: Residuals, motion: FrameMotion) -> Reason | None:
         abs(found.k1),
         MAX_LENS,
         f"about {found.k1:.1%} at the corners",
-        "undistort the frames before, or use their middle only (corrections: crop)",
+        "write motion: {model: rotation} and camera: {distortion: {k1: find}} for a camera that only turns; or undistort the "
+        "frames before, or use their middle only (corrections: crop)",
     )
 
 
@@ -307,6 +313,25 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
         MAX_CONTRADICTIONS,
         f"{dropped} of {pairs} pairs of the last level",
         "look at the path in the report; use a slower motion, or smaller groups",
+    )
+
+
+def _no_turn(levels: Sequence[LevelResult]) -> Reason | None:
+    """Judge rotations of one camera by what any homographies would explain."""
+    if not levels or levels[-1].located.solution.turns is None:
+        return None
+    evidence = levels[-1].located.solution.evidence
+    if evidence is None:
+        return None
+    residual, free = np.sqrt([evidence.rotation, evidence.homography]).tolist()
+    if evidence.turns_only and residual <= MAX_TURN_RESIDUAL:
+        return None
+    return Reason(
+        NO_TURN,
+        residual,
+        MAX_TURN_RESIDUAL,
+        f"residuals in units of their noise; those of any homographies are {free:.2g}",
+        "write motion: {model: homography}, or find the lens with camera: {distortion: {k1: find}}",
     )
 
 

@@ -70,7 +70,7 @@ def test_rotations_and_focal_length_are_found_at_any_angle(degrees: float) -> No
     solution = solve(60, edges_of(rotations, np.random.default_rng(0)), 30, SHAPE, model=MotionModel("rotation"))
     assert solution.turns is not None
     error_focal = solution.turns.camera.focal_px / FOCAL_PX - 1
-    std_focal = solution.assess().std_shared[0]
+    std_focal = solution.assess().std_camera[0] / FOCAL_PX
     assert abs(error_focal) < 3 * std_focal < 0.03
     assert error_deg(solution, rotations).max() < np.rad2deg(3 * NOISE_PX / FOCAL_PX)
 
@@ -89,7 +89,7 @@ def test_expected_errors_of_rotations_hold() -> None:
         errors.append(np.square(apply(away, corners(SHAPE)) - corners(SHAPE)).sum(axis=-1).mean(axis=-1))
         stds.append(assessed.std_px**2)
         focals.append(solution.turns.camera.focal_px / FOCAL_PX - 1)
-        focal_stds.append(assessed.std_shared[0])
+        focal_stds.append(assessed.std_camera[0] / FOCAL_PX)
     assert np.mean(errors) / np.mean(stds) == pytest.approx(1, abs=0.6)
     assert np.std(focals) / np.mean(focal_stds) == pytest.approx(1, abs=0.5)
 
@@ -100,7 +100,7 @@ def test_known_focal_length_is_kept() -> None:
     solution = solve(20, edges, 10, SHAPE, model=MotionModel("rotation", focal_px=FOCAL_PX))
     assert solution.turns is not None
     assert solution.turns.camera.focal_px == FOCAL_PX
-    assert solution.assess().std_shared.shape == (0,)
+    np.testing.assert_array_equal(solution.assess().std_camera, np.zeros(5))
 
 
 def test_auto_takes_rotations_of_a_camera_that_turns() -> None:
