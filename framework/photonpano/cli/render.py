@@ -12,11 +12,20 @@ def render(
     scale: Annotated[
         float | None, typer.Option("--scale", help="Pixels of the panorama per pixel of a frame.", show_default=False)
     ] = None,
+    projection: Annotated[
+        str | None,
+        typer.Option(
+            "--projection",
+            help="planar, cylindrical, spherical, or auto; other than planar for a camera that only turns.",
+            show_default=False,
+        ),
+    ] = None,
     extent: Annotated[
         str | None,
         typer.Option(
             "--extent",
-            help="panorama, reference (a stabilised image), or a box x0,y0,x1,y1 in pixels of the reference frame.",
+            help="panorama, reference (a stabilised image), or a box x0,y0,x1,y1 in pixels of the reference frame; in degrees on a "
+            "cylinder or a sphere.",
             show_default=False,
         ),
     ] = None,
@@ -48,6 +57,8 @@ def render(
     changes = list(overrides or ())
     if scale is not None:
         changes.append(f"render.scale={scale:g}")
+    if projection is not None:
+        changes.append(f"render.projection={projection}")
     if extent is not None:
         changes.append(
             f"render.extent=[{extent}]" if "," in extent and not extent.startswith("[") else f"render.extent={extent}"

@@ -33,6 +33,7 @@ from photonpano.lighting import write_light
 from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import FileContent, RunRecord
 from photonpano.values import FluxImage, Light, Panorama
@@ -68,8 +69,9 @@ class RunFolder:
         encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
         if not encoded:
             raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
+        sphere = photo_sphere(panorama.canvas, picture.shape[:2])
         with _writing(self.directory):
-            (self.staging / "panorama.png").write_bytes(png.tobytes())
+            (self.staging / "panorama.png").write_bytes(png.tobytes() if sphere is None else with_xmp(png.tobytes(), sphere))
             motion_arrays: dict[str, Any] = {
                 "homographies": motion.homographies,
                 "canvas": panorama.canvas.transform,

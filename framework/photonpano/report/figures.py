@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import apply, corners
+from photonpano.geometry import PROJECTIONS, apply, corners, outline_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
@@ -48,8 +48,7 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
     from matplotlib.ticker import LogLocator
 
     instants = _instants(len(motion.homographies))
-    centre = _centre(motion.frame_shape)
-    path = apply(motion.homographies[instants], centre)[:, 0] - centre[0]
+    path, unit = _path(motion, instants)
     with plain_figure(WIDTH_IN, 6.0) as figure:
         position, speed, error = add_axes(figure, Margins(right=0.3, top=0.55), rows=(3, 2, 2), share_x=True)
         for values, name, colour in zip(path.T, ("x", "y"), SERIES, strict=False):
@@ -58,12 +57,12 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
             position.annotate(
                 name, end, xytext=(6, 0), textcoords="offset points", va="center", color=colour, fontweight="bold"
             )
-        position.set_ylabel("frame centre (px)")
+        position.set_ylabel(f"frame centre ({unit})")
         if len(instants) > 1:
             steps = np.linalg.norm(np.diff(path, axis=0), axis=1) / np.diff(instants)
             speed.plot((instants[:-1] + instants[1:]) / 2, steps, color=SERIES[2])
         speed.set_ylim(bottom=0)
-        speed.set_ylabel("speed (px/frame)")
+        speed.set_ylabel(f"speed ({unit}/frame)")
         known = np.where(np.isfinite(motion.std_px), motion.std_px, np.nan)
         error.plot(instants, known[instants], color=INK)
         error.set_yscale("log")
@@ -84,21 +83,46 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
 def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
     """Draw the path of the frame centre over the panorama, with the outlines of the first, the reference and the last frame."""
     instants = _instants(len(motion.homographies))
-    to_canvas = panorama.thumbnail.canvas @ motion.homographies
-    path = apply(to_canvas[instants], _centre(motion.frame_shape))[:, 0]
+    path = _places(panorama, motion.homographies[instants], _centre(motion.frame_shape))[:, 0]
     height, width = panorama.picture.shape[:2]
     with map_figure(height, width) as (figure, axes):
         picture = shrunk(panorama.picture, MAP_PIXELS)
         axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent_of(height, width), alpha=0.55)
         for index, style in ((motion.reference, "-"), (0, ":"), (-1, ":")):
-            outline = apply(to_canvas[index], corners(motion.frame_shape))
-            axes.plot(*np.vstack([outline, outline[:1]]).T, color=INK, linewidth=0.9, linestyle=style)
-        axes.plot(*path.T, color=PAPER, linewidth=3.5)
-        axes.plot(*path.T, color=SERIES[1], linewidth=1.6)
+            outline = _places(panorama, motion.homographies[index, None], outline_of(motion.frame_shape))[0]
+            axes.plot(*_cut_at_seam(np.vstack([outline, outline[:1]]), width).T, color=INK, linewidth=0.9, linestyle=style)
+        drawn = _cut_at_seam(path, width)
+        axes.plot(*drawn.T, color=PAPER, linewidth=3.5)
+        axes.plot(*drawn.T, color=SERIES[1], linewidth=1.6)
         for point, name in ((path[0], "first"), (path[-1], "last")):
             axes.plot(*point, "o", color=SERIES[1], markeredgecolor=PAPER, markersize=7)
             axes.annotate(name, point, xytext=(0, 9), textcoords="offset points", ha="center", fontweight="bold")
         return svg_of(figure, "path-on-panorama")
+
+
+def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray, str]:
+    """Return the path of the frame centre relative to the reference frame, (N, 2), and its unit: degrees if the camera turns."""
+    centre = _centre(motion.frame_shape)
+    if motion.camera is None or motion.rotations is None:
+        return apply(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
+    ahead = motion.camera.directions(centre[0])
+    points = PROJECTIONS["spherical"].points(motion.rotations[instants] @ ahead) - PROJECTIONS["spherical"].points(ahead)
+    return np.degrees(np.unwrap(points, axis=0)), "degrees"
+
+
+def _places(panorama: RenderedPanorama, homographies: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Return where pixels of frames lie on the picture of a panorama: (N, P, 2)."""
+    rays = np.append(pixels, np.ones((len(pixels), 1)), axis=1) @ np.swapaxes(
+        panorama.canvas.plane_to_rays @ homographies, -1, -2
+    )
+    places = panorama.canvas.pixels(rays) if not panorama.canvas.planar else rays[..., :2] / rays[..., 2:]
+    return (places + 0.5) / panorama.reduction - 0.5
+
+
+def _cut_at_seam(path: FloatArray, width: int) -> FloatArray:
+    """Return a path, (N, 2), with a gap where it leaves the picture at one side and comes back at the other."""
+    jumps = 1 + np.flatnonzero(np.abs(np.diff(path[:, 0])) > width / 2)
+    return np.insert(path, jumps, np.nan, axis=0)
 
 
 def coverage_map(coverage: FluxImage) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from photonpano import text
-from photonpano.geometry import inverse
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import RunRecord
@@ -67,17 +66,16 @@ def render_report(
 
 def _results(record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None) -> dict[str, Any]:
     canvas = panorama.canvas
-    flicker = residual_figures.flicker_over_panorama(light, inverse(canvas.transform), canvas.shape)
+    flicker = residual_figures.flicker_over_panorama(light, canvas)
     motion = _motion(record, explained.motion, panorama)
     return motion | _unexplained(record, explained, panorama) | {"flicker_over_panorama": flicker}
 
 
 def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:
     residuals, canvas = explained.residuals, panorama.canvas
-    to_panorama = canvas.transform @ inverse(explained.panorama.canvas)
     return {
         "misfit": float(residuals.misfit.mean()),
-        "misfit_over_panorama": residual_figures.misfit_over_panorama(residuals, to_panorama, canvas.shape),
+        "misfit_over_panorama": residual_figures.misfit_over_panorama(residuals, explained.canvas, canvas),
         "over_sensor": residual_figures.over_sensor(residuals),
         "shifts_are_drawn": residual_figures.significant_shifts(residuals) is not None,
         "shifts_over_time": residual_figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
@@ -94,6 +92,8 @@ def _motion(record: RunRecord, motion: FrameMotion, panorama: RenderedPanorama) 
         "path_on_panorama": figures.path_on_panorama(motion, panorama),
         "path_over_time": figures.path_over_time(motion, record["source"]["frame_rate_hz"]),
         "coverage_map": figures.coverage_map(panorama.thumbnail.weight),
+        "turns": motion.camera is not None,
+        "projection": panorama.canvas.projection,
         "reference": motion.reference,
         "n_not_located": int((~motion.located).sum()),
         "not_located": not_located[:MAX_SPANS],

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from photonpano.geometry import apply
-from photonpano.merging.light import amplitudes
+from photonpano.geometry import Canvas, apply, inverse
+from photonpano.merging.light import amplitudes_on
 from photonpano.report.drawing import (
     BAR_IN,
     INK,
@@ -28,7 +29,7 @@ from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.unexplained import SYSTEMATIC_PX
 from photonpano.residuals.verdict import block_shifts
-from photonpano.values import FloatArray, Homography, Light
+from photonpano.values import FloatArray, Light
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
@@ -54,14 +55,17 @@ _GAIN_RANGE_PERCENT = 5.0
 """The smallest range of colours of the brightness, to both sides."""
 
 
-def misfit_over_panorama(residuals: Residuals, to_panorama: Homography, shape: tuple[int, int]) -> str:
+def misfit_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -> str:
     """Draw the misfit of each place of the panorama.
 
     Args:
         residuals: of the run.
-        to_panorama: (3, 3), pixels of the panorama of the residuals to pixels of the panorama.
-        shape: (height, width) of the panorama.
+        measured: the canvas of the panorama of the residuals, on which the misfit is drawn if the projections differ.
+        canvas: of the panorama.
     """
+    same = measured.projection == canvas.projection and measured.horizon is canvas.horizon
+    shape, onto = (canvas.shape, canvas.transform) if same else (measured.shape, measured.transform)
+    to_panorama = onto @ inverse(measured.transform)
     misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
     rows, columns = misfit.shape
     (left, top), (right, bottom) = apply(to_panorama, [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]])
@@ -134,19 +138,20 @@ def light_over_time(residuals: Residuals) -> str | None:
         return svg_of(figure, "light")
 
 
-def flicker_over_panorama(light: Light | None, to_plane: Homography, shape: tuple[int, int]) -> str | None:
+def flicker_over_panorama(light: Light | None, canvas: Canvas) -> str | None:
     """Draw how deep each place flickers, and at which phase; None if all of the scene has the same light.
 
     Args:
         light: of the capture; None if it is steady.
-        to_plane: (3, 3), pixels of the panorama to pixels of the reference plane.
-        shape: (height, width) of the panorama.
+        canvas: of the panorama.
     """
     if light is None or not light.has_lamps:
         return None
+    shape = canvas.shape
     step = max(1, max(shape) // _FLICKER_PIXELS)
     small = -(-shape[0] // step), -(-shape[1] // step)
-    cosine, sine = amplitudes(light, to_plane @ np.diag([step, step, 1.0]), small)
+    to_small = np.diag([1 / step, 1 / step, 1.0])
+    cosine, sine = amplitudes_on(light, replace(canvas, height=small[0], width=small[1], transform=to_small @ canvas.transform))
     extent = -0.5, small[1] * step - 0.5, small[0] * step - 0.5, -0.5
     depth = np.hypot(cosine, sine)
     with maps_figure(*shape, 2) as (figure, (left, right)):

@@ -9,14 +9,17 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from photonpano.geometry import Canvas
 from photonpano.report import residual_figures
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX
 from photonpano.values import Light
 
+CANVAS = Canvas(300, 1240, np.eye(3))
+
 
 def test_figures_use_colour_variables_of_page(residuals):
     for svg in (
-        residual_figures.misfit_over_panorama(residuals, np.eye(3), (300, 1240)),
+        residual_figures.misfit_over_panorama(residuals, CANVAS, CANVAS),
         residual_figures.over_sensor(residuals),
         residual_figures.shifts_over_time(residuals, None),
     ):
@@ -36,10 +39,10 @@ def test_light_is_drawn_only_if_it_changes(residuals):
 
 def test_flicker_is_drawn_only_where_places_have_their_own():
     gain = np.ones(100)
-    assert residual_figures.flicker_over_panorama(None, np.eye(3), (60, 90)) is None
-    assert residual_figures.flicker_over_panorama(Light.of_frames(gain), np.eye(3), (60, 90)) is None
+    assert residual_figures.flicker_over_panorama(None, Canvas(60, 90, np.eye(3))) is None
+    assert residual_figures.flicker_over_panorama(Light.of_frames(gain), Canvas(60, 90, np.eye(3))) is None
     waves, maps = np.zeros((2, 100)), np.stack([np.linspace(0, 0.8, 90 * 60).reshape(60, 90)] * 2).astype(np.float32)
-    svg = residual_figures.flicker_over_panorama(Light(gain, waves, maps, np.eye(3), 0.1, gain), np.eye(3), (60, 90))
+    svg = residual_figures.flicker_over_panorama(Light(gain, waves, maps, np.eye(3), 0.1, gain), Canvas(60, 90, np.eye(3)))
     ElementTree.fromstring(svg)
     assert "flicker / mean light" in svg
     assert "phase (degrees)" in svg
@@ -94,7 +97,7 @@ def test_figures_draw_residuals_of_a_single_span_that_saw_nothing(residuals):
         cell_count=0 * residuals.cell_count,
     )
     for svg in (
-        residual_figures.misfit_over_panorama(nothing, np.eye(3), (300, 1240)),
+        residual_figures.misfit_over_panorama(nothing, CANVAS, CANVAS),
         residual_figures.over_sensor(nothing),
         residual_figures.shifts_over_time(nothing, 100.0),
     ):
