@@ -24,8 +24,8 @@ def render(
         str | None,
         typer.Option(
             "--extent",
-            help="panorama, reference (a stabilised image), or a box x0,y0,x1,y1 in pixels of the reference frame; in degrees on a "
-            "cylinder or a sphere.",
+            help="panorama, reference (a stabilised image), or a box x0,y0,x1,y1: in pixels of the reference frame, but in "
+            "degrees on a cylinder or a sphere.",
             show_default=False,
         ),
     ] = None,

@@ -101,7 +101,7 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
 
 
 def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray, str]:
-    """Return the path of the frame centre relative to the reference frame, (N, 2), and its unit: degrees if the camera turns."""
+    """Return the path of the frame centre from that of the reference frame, (N, 2), and its unit: degrees of a turn."""
     centre = _centre(motion.frame_shape)
     if motion.camera is None or motion.rotations is None:
         return apply(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
