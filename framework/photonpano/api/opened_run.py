@@ -15,12 +15,15 @@ from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.geometry import FrameTrajectory
 from photonpano.lighting import in_light_of
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import through_lens
 from photonpano.pipeline.components import open_source
+from photonpano.pipeline.estimate import model_of
 from photonpano.protocols import Source
 from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
+from photonpano.source_wrapper import seen_through
 from photonpano.specs import Plan, parse_spec
 from photonpano.values import FrameSpan, StreamInfo
 
@@ -34,7 +37,7 @@ class OpenedRun:
         record: its run.json.
         plan: of its spec.
         capture: the capture, as its source and the corrections of the spec give it.
-        source: the same, divided by the vignette that the run found, and in the light that it found.
+        source: the same, divided by the vignette that the run found, in the light that it found, and through its lens.
         vignette: by which it is divided.
         motion: of every frame; where the run did not record `std_px`, it is 0.
         has_std_px: whether the run recorded `std_px`.
@@ -77,7 +80,8 @@ def opened_run(
         _require_same_capture(folder, run, capture.info)
         require_same_frames(folder, record, capture)
         vignette = read_vignette(folder, capture)
-        source = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
+        lit = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
+        source = through_lens(lit, model_of(plan)) if run.camera is None else seen_through(lit, run.camera)
         yield OpenedRun(folder, record, plan, capture, source, vignette, _motion(run), not np.isnan(run.std_px).any())
 
 

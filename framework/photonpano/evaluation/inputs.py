@@ -136,7 +136,6 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
         raise InputError(f"{path}: the projection {projection} is not known, or lacks its camera_matrix")
     if "camera_matrix" in arrays:
         camera = Camera(arrays["camera_matrix"].astype(np.float64), arrays["distortion"].astype(np.float64))
-        homographies = camera.homographies(camera.rotations(homographies))
     return RunTrajectory(
         homographies,
         canvas.astype(np.float64),

@@ -34,6 +34,25 @@ def test_rendering_is_that_of_a_whole_run(small_run: RunResult, tmp_path: Path, 
     assert json.loads((tmp_path / "again" / "run.json").read_text()) == again.record
 
 
+def test_turn_through_a_lens_is_rendered_again_on_a_sphere(tmp_path: Path, without_report: None) -> None:
+    path = {"kind": "turn", "degrees": 60, "pitch_wobble_deg": 2, "wobbles": 1}
+    scene = {"kind": "street", "width": 512, "height": 256}
+    camera = {"scene": scene, "path": path, "n_frames": 240, "frame_shape": [64, 96], "flux": 0.5, "seed": 0}
+    spec = {
+        "version": 1,
+        "source": {"use": "simulator", "with": camera | {"focal_length_px": 81, "distortion": {"k1": -0.1}}},
+        "motion": {"model": "rotation"},
+        "camera": {"focal_px": 81, "distortion": {"k1": -0.1}},
+        "resample": {"use": "midpoint", "with": {"group_size": 20}},
+        "levels": 1,
+        "render": {"projection": "spherical"},
+    }
+    first = run(parse_spec(spec, output=tmp_path / "first"))
+    again = render(first.directory, tmp_path / "again")
+    names = "panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz"
+    assert [again.record["files"][name] for name in names] == [first.record["files"][name] for name in names]
+
+
 def test_rendering_of_a_rendering_is_the_same(small_run: RunResult, tmp_path: Path) -> None:
     first = render(small_run.directory, tmp_path / "first", ["render.scale=0.5"])
     second = render(first.directory, tmp_path / "second", ["render.scale=1"])
