@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,24 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.geometry import Camera, corner_displacements, rotation_vectors
+from photonpano_simulator import scenes
 from photonpano_simulator.config import CameraSimulatorConfig, SimulatorConfig
 from photonpano_simulator.source import SimulatorSource
+from photonpano_simulator.street import street
 
 SHAPE = (64, 96)
 FOCAL = 80.0
 SCENE: dict[str, Any] = {"kind": "street", "width": 512, "height": 256}
 DISTORTION = {"k1": -0.1, "k2": 0.03, "p1": 0.002, "p2": -0.003}
+
+
+drawn_once = cache(street)
+
+
+@pytest.fixture(autouse=True)
+def quick_street(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw each street once for all tests."""
+    monkeypatch.setattr(scenes, "street", drawn_once)
 
 
 def settings(path: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -144,9 +156,9 @@ def test_pixels_have_an_area_before_a_finer_scene_all_around() -> None:
     ("changes", "message"),
     [
         (
-            {"scene": SCENE | {"height": 64}, "focal_length_px": 60},
-            "the frames reach 27.7 degrees above or below the horizon, but the scene of 512x64 px, which is 360 degrees wide, "
-            "only 22.5; take a higher scene, or a smaller wobble",
+            {"scene": SCENE | {"height": 200}, "focal_length_px": 60, "path": {"kind": "turn", "pitch_wobble_deg": 45}},
+            "the frames reach 72.7 degrees above or below the horizon, but the scene of 512x200 px, which is 360 degrees wide, "
+            "only 70.3; take a higher scene, or a smaller wobble",
         ),
         (
             {"focal_length_px": 400},
