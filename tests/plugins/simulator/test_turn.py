@@ -156,7 +156,7 @@ def test_pixels_have_an_area_before_a_finer_scene_all_around() -> None:
     ("changes", "message"),
     [
         (
-            {"scene": SCENE | {"height": 200}, "focal_length_px": 60, "path": {"kind": "turn", "pitch_wobble_deg": 45}},
+            {"scene": SCENE | {"height": 200}, "focal_length_px": 60},
             "the frames reach 72.7 degrees above or below the horizon, but the scene of 512x200 px, which is 360 degrees wide, "
             "only 70.3; take a higher scene, or a smaller wobble",
         ),
@@ -174,7 +174,7 @@ def test_pixels_have_an_area_before_a_finer_scene_all_around() -> None:
 )
 def test_turn_that_cannot_be_simulated_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as caught:
-        spad({}, **changes)
+        spad({"pitch_wobble_deg": 45}, **changes)
     assert str(caught.value) == message
 
 
