@@ -19,6 +19,8 @@ from photonpano.values import FloatArray, FluxImage, Homography
 
 _NEAR_POLE = np.radians(75)
 """A frame that comes this near to a pole may touch any column."""
+_WIDEST = 100.0
+"""Largest radius, in focal lengths, that a lens images."""
 _PADDING = 1, 2
 """Zeros before and after the rows and columns of an image that is warped, so that it is interpolated at its border as well."""
 
@@ -29,7 +31,8 @@ Rays: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 class Lens(NamedTuple):
     """From homogeneous ideal coordinates to pixels of an image: OpenCV's distortion, then a scale and a shift.
 
-    Ideal points whose squared radius exceeds `limit` are not imaged.
+    Ideal points whose squared radius exceeds `limit` are not imaged. Where it is infinite, coordinates are pixels already, and
+    the rest is ignored.
     """
 
     k1: float
@@ -133,7 +136,7 @@ class BentGrid:
         matrix = rescaling(1 / shrink) @ self.camera.matrix
         ideal = self.camera.ideal(outline_of(frame_shape, 2.0 * shrink))
         radius = np.linalg.norm((ideal - self.camera.centre_px) / self.camera.focal_px, axis=-1)
-        limit = float(np.nanmax(radius)) if np.isfinite(radius).all() else np.inf
+        limit = float(np.nanmax(radius)) if np.isfinite(radius).all() else _WIDEST
         k1, k2, p1, p2 = self.camera.distortion.tolist()
         return Lens(k1, k2, p1, p2, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], min(limit**2, _fold(k1, k2)))
 
@@ -310,6 +313,14 @@ def image_row(
     m20, m21, m22 = matrix[2, 0] * r, matrix[2, 1] * q, matrix[2, 2] * r
     k1, k2, p1, p2, limit = lens.k1, lens.k2, lens.p1, lens.p2, lens.limit
     focal_x, focal_y, x0, y0 = lens.focal_x, lens.focal_y, lens.x, lens.y
+    if limit == np.inf:
+        for t in range(len(u)):
+            depth = m20 * p[t] + m21 + m22 * s[t]
+            nearer = 1 / depth
+            x, y = (m00 * p[t] + m01 + m02 * s[t]) * nearer, (m10 * p[t] + m11 + m12 * s[t]) * nearer
+            u[t] = np.float32(x if depth > 1e-9 else -9.0)
+            v[t] = np.float32(y if depth > 1e-9 else -9.0)
+        return
     for t in range(len(u)):
         depth = m20 * p[t] + m21 + m22 * s[t]
         nearer = 1 / depth
@@ -342,7 +353,7 @@ def _add(
     one, zero = np.float32(1), np.float32(0)
     pixels, shares = counts.reshape(-1), seen.reshape(-1)
     u, v = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    share, place = np.empty(columns, np.float32), np.empty(columns, np.uint64)
+    share, place = np.empty(columns, np.float32), np.empty(columns, np.int32)
     for y in range(rows):
         image_row(matrix, lens, p, s, q[y], r[y], u, v)
         for t in range(columns):
@@ -350,18 +361,18 @@ def _add(
             a, b = min(max(u[t] + one, zero), width + one), min(max(v[t] + one, zero), height + one)
             along, across = min(min(a, width + one - a), one), min(min(b, height + one - b), one)
             share[t] = along * across
-            left, top = np.int32(a), np.int32(b)
-            u[t], v[t] = a - np.float32(left), b - np.float32(top)
-            place[t] = np.uint64(top) * stride + np.uint64(left)
+            left, top = np.floor(a), np.floor(b)
+            u[t], v[t] = a - left, b - top
+            place[t] = np.int32(np.float64(top) * counts.shape[1] + left)
         row = total[y]
         for t in range(columns):
-            at = place[t]
+            at = np.uint64(np.uint32(place[t]))
             upper = pixels[at] + u[t] * (pixels[at + np.uint64(1)] - pixels[at])
             lower = pixels[at + stride] + u[t] * (pixels[at + stride + np.uint64(1)] - pixels[at + stride])
             row[t] += upper + v[t] * (lower - upper)
         if weighted:
             for t in range(columns):
-                at = place[t]
+                at = np.uint64(np.uint32(place[t]))
                 upper = shares[at] + u[t] * (shares[at + np.uint64(1)] - shares[at])
                 lower = shares[at + stride] + u[t] * (shares[at + stride + np.uint64(1)] - shares[at + stride])
                 share[t] = upper + v[t] * (lower - upper)
