@@ -386,8 +386,10 @@ class Renderer(Protocol):
         pixel shows should not depend on the tile that it lies in.
 
         Convention:
-            Points are (x, y), integers are pixel centres. On the canvas, a pixel p of frame t lies at
-            `canvas.transform @ trajectory.at(t) @ p`.
+            Points are (x, y), integers are pixel centres. A pixel p of frame t is at `canvas.transform @ trajectory.at(t) @ p`
+            on a planar canvas, and on others at `canvas.pixels(canvas.plane_to_rays @ trajectory.at(t) @ p)`.
+            p is an ideal pixel where the lens is known. A contribution without `renders_on_any_canvas` gets planar canvases,
+            and no lens.
 
         Args:
             source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected.

@@ -10,6 +10,7 @@ import numpy as np
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas
 from photonpano.merging import MergeRenderer
+from photonpano.merging.bent import BentGrid
 from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.protocols import Renderer, Source, Trajectory, camera_of
 from photonpano.values import FrameSpan, Panorama
@@ -51,11 +52,12 @@ class AttributedRenderer:
             InputError: it renders no such canvas, or not through a lens.
             PluginError: the renderer failed, or broke its contract.
         """
-        self._require_renderable(source, canvas)
+        self._require_renderable(source, trajectory, span, canvas)
         with attributing(self.origin, "the panorama"):
             return require_panorama(self.component.render(source, trajectory, span, canvas, tolerance_px, advance), canvas)
 
-    def _require_renderable(self, source: Source, canvas: Canvas) -> None:
+    def _require_renderable(self, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> None:
+        """Refuse what only a renderer on any canvas renders."""
         if self.any_canvas:
             return
         if not canvas.planar:
@@ -63,8 +65,12 @@ class AttributedRenderer:
                 f"{self.origin} renders on a plane only, and this panorama is {canvas.projection}; write render.use: merge, or "
                 "render.projection: planar"
             )
-        if (camera := camera_of(source)) is not None and camera.distorts:
+        camera = camera_of(source)
+        if camera is not None and camera.distorts:
             raise InputError(f"{self.origin} does not render through a lens that distorts; write render.use: merge")
+        homographies = trajectory.at(np.arange(span.start, span.stop))
+        if BentGrid.of(canvas, camera, homographies, source.info.frame_shape) is not None:
+            raise InputError(f"{self.origin} does not leave out frames that reach behind the plane; write render.use: merge")
 
     def require_seen(self, coverage_share: float) -> None:
         """Refuse a panorama of which nothing was seen, although frames were located.
