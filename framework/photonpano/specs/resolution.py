@@ -149,6 +149,8 @@ class _Resolver:
         }
         if isinstance(settings["motion"], MotionSettings) and isinstance(settings["camera"], CameraSettings):
             self.check_camera(settings["motion"], settings["camera"])
+        if isinstance(settings["motion"], MotionSettings) and isinstance(settings["render"], RenderSettings):
+            self.check_projection(settings["motion"], settings["render"])
         if source is None or renderer is None or spec.problems:
             return None
         until_converged = root.get("levels") == UNTIL_CONVERGED
@@ -192,6 +194,12 @@ class _Resolver:
         if camera.focal_px == "find" and any(distortion.values()):
             message = "distortion is in units of the focal length: give camera.focal_px, or take motion.model: rotation"
             self.spec.wrong_key("camera.distortion", message)
+
+    def check_projection(self, motion: MotionSettings, render: RenderSettings) -> None:
+        """Refuse a cylinder or a sphere of homographies, which have no directions."""
+        if motion.model == "homography" and render.projection not in ("auto", "planar"):
+            message = f"a {render.projection} panorama needs motion.model: rotation or auto; one of homographies is planar"
+            self.spec.wrong("render.projection", message)
 
     def spell_out_light(self, root: dict[str, Any]) -> None:
         """Replace a word in the section `light` by the mapping that it stands for."""
