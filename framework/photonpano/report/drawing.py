@@ -27,8 +27,8 @@ MIN_MAP_IN = 0.8
 BAR_IN = 1.0
 """Room for a colour bar to the right of a map, with its numbers and its label."""
 MAP_PIXELS = 1000
-_X_LABEL_IN, _Y_LABEL_IN = 0.25, 0.55
-"""Distance of the labels of axes from the axes."""
+_X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45
+"""Distance of the labels of axes, and of colour bars, from these."""
 
 # matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
 INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
@@ -198,7 +198,7 @@ def add_colour_bar(axes: Axes, image: Any, label: str, numbers: str) -> Colorbar
     bar: Colorbar = figure.colorbar(image, cax=place, format=numbers)
     bar.outline.set_visible(False)
     bar.set_label(label)
-    bar.ax.yaxis.set_label_coords(1, 0.5, bar.ax.transAxes + ScaledTranslation(_Y_LABEL_IN, 0, inches))
+    bar.ax.yaxis.set_label_coords(1, 0.5, bar.ax.transAxes + ScaledTranslation(_BAR_LABEL_IN, 0, inches))
     return bar
 
 
