@@ -151,7 +151,7 @@ def require_in_front(
         lost = [_frames(run) for run in runs[:_SHOWN]]
         raise LocationError(
             f"level {level}: {listed(lost)} reach the horizon of the plane that all exposures are located in: pairs are wrong "
-            "(try other groups or another locator), or the camera turns too far for one plane"
+            "(try other groups or another locator), or the camera turns too far for one plane (write motion: {model: rotation})"
         ) from cause
 
 

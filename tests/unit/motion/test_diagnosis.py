@@ -186,7 +186,7 @@ def test_exposures_beyond_the_horizon_are_named() -> None:
         require_in_front(2, groups, solution, (40, 60), ValueError("no root"))
     assert str(caught.value) == (
         "level 2: frames 30 to 49 reach the horizon of the plane that all exposures are located in: pairs are wrong (try other "
-        "groups or another locator), or the camera turns too far for one plane"
+        "groups or another locator), or the camera turns too far for one plane (write motion: {model: rotation})"
     )
     homographies[3:5] = np.eye(3)
     require_in_front(2, groups, solution, (40, 60), ValueError("no root"))
