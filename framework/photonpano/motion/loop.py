@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from photonpano.context import Context
 from photonpano.motion.attribution import AttributedTrajectory
@@ -129,39 +130,28 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
         LocationError: the interpolator failed because exposures reach the horizon of the plane.
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
-    turns = located.solution.turns
+    turns, shape = located.solution.turns, located.frame_shape
 
-    def kept(found: Trajectory, times: FloatArray, homographies: FloatArray, std_px: FloatArray) -> Trajectory:
+    def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:
         free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
-        require_knots_kept(free, times, homographies, std_px, located.frame_shape)
+        require_knots_kept(free, times, homographies, located.std_px[knots], shape)
         return free
 
-    def turned(knots: slice, times: FloatArray) -> Trajectory:
-        assert turns is not None
-        information = None if located.information is None else located.information[knots].copy()
-        return fit_turns(
-            level.interpolator,
-            times,
-            turns.rotations[knots],
-            information,
-            turns.camera,
-            lambda found, homographies: kept(found, times, homographies, located.std_px[knots]),
-        )
-
     def fitted(knots: slice, times: FloatArray) -> Trajectory:
-        homographies = located.homographies[knots]
         information = None if located.information is None else located.information[knots].copy()
+        if turns is not None:
+            return fit_turns(level.interpolator, times, turns.of(knots), information, partial(kept, knots=knots, times=times))
+        homographies = located.homographies[knots]
         try:
             found = level.interpolator.fit(times, homographies, information)
         except Exception as error:
-            require_in_front(level.number, located.groups, located.solution, located.frame_shape, error)
+            require_in_front(level.number, located.groups, located.solution, shape, error)
             raise
-        return kept(found, times, homographies, located.std_px[knots])
+        return kept(found, knots, times, homographies)
 
     with clock("interpolate"), level.attributing("interpolator"):
-        if turns is not None:
-            return TurningTrajectory(timeline.fit(turned, located.instants), turns.camera, reference)
-        return ReferencedTrajectory(timeline.fit(fitted, located.instants), reference)
+        free = timeline.fit(fitted, located.instants)
+        return ReferencedTrajectory(free, reference) if turns is None else TurningTrajectory(free, turns.camera, reference)
 
 
 def _summary(result: LevelResult) -> str:

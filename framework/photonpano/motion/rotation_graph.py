@@ -41,6 +41,10 @@ class Turns:
     rotations: FloatArray
     camera: Camera
 
+    def of(self, nodes: slice) -> Turns:
+        """Return the rotations of some nodes."""
+        return Turns(self.rotations[nodes], self.camera)
+
 
 class RotationAdjustment(Adjustment[Turns]):
     """The least-squares problem of a graph whose nodes are rotations of one camera.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from photonpano.geometry import Camera, inverse, nearest_rotations, rotation_matrices, rotation_vectors, scaled_ahead
+from photonpano.motion.rotation_graph import Turns
 from photonpano.protocols import InterpolatesTurns, Interpolator, Trajectory
 from photonpano.values import FloatArray
 
@@ -70,10 +71,9 @@ class ReferencedTrajectory:
 def fit_turns(
     interpolator: Interpolator,
     instants: FloatArray,
-    rotations: FloatArray,
+    knots: Turns,
     information: FloatArray | None,
-    camera: Camera,
-    checked: Callable[[Trajectory, FloatArray], Trajectory],
+    checked: Callable[..., Trajectory],
 ) -> Trajectory:
     """Interpolate rotations by any angle.
 
@@ -83,19 +83,18 @@ def fit_turns(
     Args:
         interpolator: of the level.
         instants: (N,) increasing, in frames.
-        rotations: (N, 3, 3) of the knots.
+        knots: N rotations of the camera.
         information: (N, 3, 3) inverse covariances of their rotation vectors, each in its own frame; None if unknown.
-        camera: of all frames.
-        checked: wraps what the interpolator fitted, given the (N, 3, 3) homographies of the knots.
+        checked: wraps what the interpolator fitted, given the (N, 3, 3) `homographies` of the knots.
     """
-    path = CoarsePath(instants, rotations)
-    turns = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ rotations)
-    knots = scaled_ahead(camera.homographies(rotation_matrices(turns)))
+    path, camera = CoarsePath(instants, knots.rotations), knots.camera
+    turns = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ knots.rotations)
+    homographies = scaled_ahead(camera.homographies(rotation_matrices(turns)))
     if isinstance(interpolator, InterpolatesTurns):
         fitted: Trajectory = _Turns(interpolator.fit_turns(instants, turns, information), camera)
     else:
-        fitted = interpolator.fit(instants, knots, None)
-    return _Along(path, checked(fitted, knots), camera)
+        fitted = interpolator.fit(instants, homographies, None)
+    return _Along(path, checked(fitted, homographies=homographies), camera)
 
 
 class CoarsePath:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import Camera, rotation_matrices, rotation_vectors
+from photonpano.motion.rotation_graph import Turns
 from photonpano.motion.turning import TurningTrajectory, fit_turns
 from photonpano.protocols import Interpolator
 from photonpano.values import FloatArray
@@ -35,7 +36,7 @@ def rotations_at(instants: FloatArray, degrees: float) -> FloatArray:
 
 def fitted(interpolator: Interpolator, instants: FloatArray, rotations: FloatArray, std_rad: float | None) -> TurningTrajectory:
     information = None if std_rad is None else np.broadcast_to(np.eye(3) / std_rad**2, (len(instants), 3, 3))
-    free = fit_turns(interpolator, instants, rotations, information, CAMERA, lambda found, _: found)
+    free = fit_turns(interpolator, instants, Turns(rotations, CAMERA), information, lambda found, **_: found)
     return TurningTrajectory(free, CAMERA, 500)
 
 

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonpano.motion.graph import Evidence
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.verdict import Reason, contradictions, judge
+from photonpano.residuals.verdict import NO_TURN, Reason, contradictions, judge
 from photonpano.values import Ambiguity
 
 
@@ -32,6 +33,20 @@ def only_reason(explained: Explained) -> Reason:
 def test_photon_noise_is_trusted(explained: Explained) -> None:
     verdict = judge(explained, ())
     assert (verdict.status, verdict.reasons, verdict.residual_ratio) == ("trusted", (), 1.05)
+
+
+@pytest.mark.parametrize(("rotation", "gain", "doubtful"), [(1.2, 1.1, False), (25.0, 3.0, True), (4.0, 40.0, True)])
+def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
+    explained: Explained, rotation: float, gain: float, doubtful: bool
+) -> None:
+    """Either the residuals are large, or those of homographies are much smaller."""
+    evidence = Evidence(rotation, 1.0, gain)
+    solution = SimpleNamespace(turns=object(), evidence=evidence, outliers=())
+    level = SimpleNamespace(located=SimpleNamespace(solution=solution, edges=(), ambiguity=None))
+    reasons = judge(explained, [level]).reasons
+    assert [reason.what for reason in reasons] == [NO_TURN] * doubtful
+    if doubtful:
+        assert reasons[0].figure == np.sqrt(rotation)
 
 
 def test_unknown_ratio_is_trusted_and_none(explained: Explained) -> None:
@@ -164,7 +179,9 @@ def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
 @pytest.mark.parametrize(("n_pairs", "status"), [(2, "trusted"), (3, "doubtful")])
 def test_level_is_ambiguous_from_three_pairs_on(explained: Explained, n_pairs: int, status: str) -> None:
     pairs = tuple((index + 1, index) for index in range(n_pairs))
-    located = SimpleNamespace(ambiguity=Ambiguity(1, pairs, 40.0), edges=(None,) * 30, solution=SimpleNamespace(outliers=()))
+    located = SimpleNamespace(
+        ambiguity=Ambiguity(1, pairs, 40.0), edges=(None,) * 30, solution=SimpleNamespace(turns=None, outliers=())
+    )
     levels: Any = [SimpleNamespace(level=SimpleNamespace(number=1), located=located)]
     assert judge(explained, levels).status == status
 

@@ -1,0 +1,91 @@
+"""Runs of cameras that turn: what is written, how exact it is, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonpano import InputError, parse_spec, run, simulate
+from photonpano.geometry import align_rotations, rotation_vectors
+from photonpano.pipeline.run import RunResult
+
+FOCAL_PX = 163.0
+SIMULATED: dict[str, Any] = {
+    "scene": {"kind": "street", "width": 1024, "height": 512},
+    "path": {"kind": "turn", "degrees": 100, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
+    "frame_shape": [96, 160],
+    "focal_length_px": FOCAL_PX,
+    "flux": 0.5,
+    "n_frames": 1200,
+    "distortion": {"k1": -0.08},
+}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A turn by 100 degrees, through a lens that distorts."""
+    path = tmp_path_factory.mktemp("turn") / "turn.npy"
+    simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": SIMULATED}}), path)
+    return path
+
+
+def spec_of(capture: Path, **sections: Any) -> dict[str, Any]:
+    source = {"use": "packed-npy", "with": {"path": str(capture), "frame_rate_hz": 96800}}
+    return {
+        "version": 1,
+        "source": source,
+        "resample": {"use": "midpoint", "with": {"group_size": 50}},
+        "refine": [],
+        **sections,
+    }
+
+
+@pytest.fixture(scope="module")
+def result(capture: Path) -> RunResult:
+    """A run that knows neither the focal length nor the lens."""
+    sections = {"motion": {"model": "auto"}, "camera": {"distortion": {"k1": "find"}}}
+    return run(parse_spec(spec_of(capture, **sections), output=capture.parent / "run"))
+
+
+def test_rotations_focal_length_and_lens_are_found(result: RunResult, capture: Path) -> None:
+    with np.load(result.directory / "trajectory.npz") as found, np.load(capture.with_suffix(".truth.npz")) as truth:
+        aligned = align_rotations(found["rotations"], truth["rotations"]) @ found["rotations"]
+        away = rotation_vectors(np.swapaxes(truth["rotations"], -1, -2) @ aligned)
+        k1 = found["distortion"][0]
+    camera = result.record["levels"][-1]["camera"]
+    assert np.rad2deg(np.linalg.norm(away, axis=1)).mean() < 0.12
+    assert abs(camera["focal_px"] / FOCAL_PX - 1) < 0.005
+    assert abs(camera["focal_px"] - FOCAL_PX) < 3 * camera["std_focal_px"]
+    assert k1 == pytest.approx(-0.08, rel=0.05)
+    assert abs(k1 + 0.08) < 3 * camera["std_distortion"][0]
+    assert result.verdict.status == "trusted", [str(each) for each in result.verdict.reasons]
+
+
+def test_trajectory_holds_the_camera_and_homographies_of_determinant_1(result: RunResult) -> None:
+    with np.load(result.directory / "trajectory.npz") as found:
+        assert str(found["model"]) == "rotation"
+        matrix, reference = found["camera_matrix"], int(found["reference"])
+        np.testing.assert_allclose(found["homographies"], matrix @ found["rotations"] @ np.linalg.inv(matrix), atol=1e-9)
+        np.testing.assert_allclose(np.linalg.det(found["homographies"]), 1)
+        np.testing.assert_allclose(found["rotations"][reference], np.eye(3), atol=1e-12)
+        assert found["distortion"].shape == (4,)
+
+
+def test_auto_records_which_model_it_took_and_why(result: RunResult) -> None:
+    [decision] = [each for each in result.record["decisions"] if each["what"] == "motion_model"]
+    assert decision["value"] == "rotation"
+    assert decision["reason"].startswith("each unknown that homographies have more lowers the squared residuals")
+
+
+def test_principal_point_outside_the_frames_is_refused(capture: Path, tmp_path: Path) -> None:
+    sections = {"motion": {"model": "rotation"}, "camera": {"centre_px": [247.5, 126.5]}}
+    with pytest.raises(InputError) as caught:
+        run(parse_spec(spec_of(capture, **sections), output=tmp_path / "run"))
+    assert str(caught.value) == (
+        "camera.centre_px: (247.5, 126.5) does not lie in the frames of 96x160 px; a camera that was calibrated with other "
+        "frames has another principal point and focal length here: scale and shift both"
+    )
+    assert not (tmp_path / "run").exists()
