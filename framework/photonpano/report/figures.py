@@ -107,7 +107,9 @@ def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray,
         return apply(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
     ahead = motion.camera.directions(centre[0])
     points = PROJECTIONS["spherical"].points(motion.rotations[instants] @ ahead) - PROJECTIONS["spherical"].points(ahead)
-    return np.degrees(np.unwrap(points, axis=0)), "degrees"
+    path = np.degrees(np.unwrap(points, axis=0))
+    reference = min(int(np.searchsorted(instants, motion.reference)), len(path) - 1)
+    return path - 360 * np.round(path[reference] / 360), "degrees"
 
 
 def _places(panorama: RenderedPanorama, homographies: FloatArray, pixels: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from photonpano.geometry import translation
+from photonpano.geometry import Camera, rotation_matrices, translation
 from photonpano.report import figures
 
 
@@ -100,3 +100,20 @@ def test_stage_times_bars_match_seconds(record):
     located = bars["var(--series-3)"][:3]
     np.testing.assert_allclose(np.array(located) / located[0], np.array([40, 79, 157]) / 40, rtol=1e-4)
     assert bars["var(--series-5)"][0] / located[0] == pytest.approx(4.18 / 9.3, rel=1e-4)
+
+
+def test_path_of_full_turn_is_in_degrees_from_the_reference_frame(motion):
+    yaws = np.radians(np.linspace(-200, 200, len(motion.homographies)))
+    camera = Camera.of(330.0, motion.frame_shape)
+    turns = rotation_matrices(np.stack([0 * yaws, yaws, 0 * yaws], axis=-1))
+    turning = replace(motion, camera=camera, homographies=camera.homographies(turns), reference=len(yaws) // 2)
+    path, unit = figures._path(turning, np.arange(len(yaws)))
+    assert unit == "degrees"
+    np.testing.assert_allclose(path[:, 0], np.degrees(yaws), atol=1e-6)
+
+
+def test_path_is_cut_where_it_crosses_the_seam():
+    path = np.array([[80.0, 5], [95, 5], [3, 5], [10, 5]])
+    cut = figures._cut_at_seam(path, 100)
+    assert np.isnan(cut[2]).all()
+    np.testing.assert_array_equal(np.delete(cut, 2, axis=0), path)
