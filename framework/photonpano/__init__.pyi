@@ -70,7 +70,6 @@ from .protocols import Resampler as Resampler
 from .protocols import Source as Source
 from .protocols import Trajectory as Trajectory
 from .protocols import WeightedSource as WeightedSource
-from .protocols import camera_of as camera_of
 from .registry import Catalog as Catalog
 from .registry import discover as discover
 from .specs import Plan as Plan

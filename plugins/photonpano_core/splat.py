@@ -10,12 +10,12 @@ from photonpano import (
     FrameSpan,
     Group,
     InputError,
+    LensedSource,
     LinearlyCorrectedSource,
     LitSource,
     Source,
     Trajectory,
     VirtualExposure,
-    camera_of,
 )
 from photonpano.geometry import apply, corners, inverse
 from photonpano.merging import PhotonSum, gain_image
@@ -48,7 +48,7 @@ class SplatMerger:
                 "merge.use: splat warps photons one by one, so that it cannot subtract dark counts, interpolate pixels or "
                 "compare colours; use photon-mle, or only corrections that move or mask pixels"
             )
-        if (camera := camera_of(source)) is not None and camera.distorts:
+        if isinstance(source, LensedSource) and source.camera.distorts:
             raise InputError("merge.use: splat does not warp through a lens that distorts; use photon-mle")
         if trajectory is None:
             photons = unwarped_sum(source, group, scale)
