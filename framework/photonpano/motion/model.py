@@ -37,6 +37,11 @@ class MotionModel:
         """Which numbers of the camera are to be found: 0 for the focal length, 1 to 4 for k1, k2, p1, p2."""
         return tuple(index for index, number in enumerate((self.focal_px, *self.distortion)) if number is None)
 
+    @property
+    def finds_lens(self) -> bool:
+        """Whether the distortion of the lens is to be found."""
+        return any(index > 0 for index in self.unknown)
+
     def camera(self, frame_shape: tuple[int, int]) -> Camera:
         """Return what is known of the camera so far; what is not begins at 3 sides of a frame, and without distortion."""
         if self.known is not None:

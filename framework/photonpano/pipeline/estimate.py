@@ -74,6 +74,12 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     levels = build_levels(plan, source, decisions)
     timeline = timeline_of(source, context)
     results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline, model=model_of(plan))
+    if model_of(plan).finds_lens and camera_of_motion(results[0].trajectory) is not None:
+        # Through a lens that nobody knew, pairs are located with errors of pixels: once more, through the one that was found.
+        known = results[0].trajectory
+        results = estimate_motion(
+            source, levels[:1], plan.graph, reference, context, previous=known, timeline=timeline, model=model_of(plan)
+        )
     first, later = results, levels[1:]
     known = first[0].trajectory
     if vignette := vignette_of(plan, _in_view(plan, source, first, context)[0], known):
