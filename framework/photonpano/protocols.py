@@ -236,6 +236,11 @@ class TurningMotion(Trajectory, Protocol):
         ...
 
 
+def camera_of_motion(trajectory: Trajectory | None) -> Camera | None:
+    """Return the camera of a motion that only turns; None for any other, or where no motion is known."""
+    return trajectory.camera if isinstance(trajectory, TurningMotion) else None
+
+
 class Merger(Protocol):
     """Merges a group into a virtual exposure along the current motion (paper, section 4, "Merge")."""
 

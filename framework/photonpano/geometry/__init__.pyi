@@ -35,8 +35,8 @@ from .shapes import violation as violation
 from .steps import generators as generators
 from .steps import slopes as slopes
 from .steps import unit_coordinates as unit_coordinates
-from .turning import Covered as Covered
-from .turning import canvas_around as canvas_around
-from .turning import covered_by as covered_by
-from .turning import level_horizon as level_horizon
-from .turning import outline_of as outline_of
+from .wide_canvas import Covered as Covered
+from .wide_canvas import canvas_around as canvas_around
+from .wide_canvas import covered_by as covered_by
+from .wide_canvas import level_horizon as level_horizon
+from .wide_canvas import outline_of as outline_of

@@ -13,7 +13,7 @@ from photonpano.context import Context
 from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
-from photonpano.protocols import Source, Trajectory, TurningMotion
+from photonpano.protocols import Source, Trajectory, camera_of_motion
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FrameSpan, Homography
 
@@ -153,10 +153,11 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
 
 def _canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
     """Return a canvas that holds all frames: a sphere if the camera turns far."""
-    if isinstance(trajectory, TurningMotion):
-        covered = covered_by(trajectory.camera.rotations(motions), trajectory.camera, frame_shape)
+    camera = camera_of_motion(trajectory)
+    if camera is not None:
+        covered = covered_by(camera.rotations(motions), camera, frame_shape)
         if covered.field_of_view > _WIDEST:
-            return canvas_around(covered, trajectory.camera, scale, "spherical")
+            return canvas_around(covered, camera, scale, "spherical")
     return canvas_of(motions, frame_shape, scale)
 
 

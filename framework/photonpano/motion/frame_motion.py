@@ -10,8 +10,7 @@ import numpy as np
 from photonpano.geometry import Camera, FrameTrajectory, nearest_rotations
 from photonpano.merging.canvas_plan import View
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.turning import camera_of_motion
-from photonpano.protocols import Source, Trajectory, camera_of
+from photonpano.protocols import Source, Trajectory, camera_of, camera_of_motion
 from photonpano.values import BoolArray, FloatArray, FrameSpan, StreamInfo
 
 

@@ -16,9 +16,9 @@ from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import merge
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, camera_of_motion, fit_turns
+from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, fit_turns
 from photonpano.motion.uncertainty import Uncertainty
-from photonpano.protocols import Source, Trajectory
+from photonpano.protocols import Source, Trajectory, camera_of_motion
 from photonpano.source_wrapper import seen_through
 from photonpano.threads import Stopwatch
 from photonpano.values import FloatArray, Group

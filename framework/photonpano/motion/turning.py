@@ -47,11 +47,6 @@ class TurningTrajectory:
         return nearest_rotations(self.camera.rotations(self._free.at(frame_indices)))
 
 
-def camera_of_motion(trajectory: Trajectory | None) -> Camera | None:
-    """Return the camera of a trajectory of rotations; None for any other, or where no motion is known."""
-    return trajectory.camera if isinstance(trajectory, TurningTrajectory) else None
-
-
 class ReferencedTrajectory:
     """A trajectory whose homography at the reference frame is the identity.
 

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from photonpano.geometry import Camera, align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import TurningTrajectory, camera_of_motion
-from photonpano.protocols import Trajectory
+from photonpano.motion.turning import TurningTrajectory
+from photonpano.protocols import Trajectory, camera_of_motion
 from photonpano.values import FloatArray
 
 _COMPARED = 1000

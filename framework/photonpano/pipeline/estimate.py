@@ -18,9 +18,8 @@ from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
-from photonpano.motion.turning import camera_of_motion
 from photonpano.pipeline.components import build_levels
-from photonpano.protocols import Source, Trajectory, light_of
+from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
 from photonpano.source_wrapper import seen_through
