@@ -9,14 +9,14 @@ import numpy as np
 
 from photonpano.captures.part import part_of
 from photonpano.context import Context
-from photonpano.geometry import canvas_of_box
-from photonpano.merging.canvas_plan import box_of, plan_canvas
+from photonpano.geometry import Canvas, canvas_of_box
+from photonpano.merging.canvas_plan import View, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import render
 from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels, build_renderer
 from photonpano.pipeline.estimate import model_of
-from photonpano.protocols import Source
+from photonpano.protocols import Source, camera_of_motion
 from photonpano.record.run_json import peak_memory_bytes
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
@@ -67,25 +67,31 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     start = time.perf_counter()
     renderer, trajectory, scale = build_renderer(plan, part, []), results[-1].trajectory, plan.render.scale
     bytes_per_pixel = renderer.bytes_per_pixel * channels_of(part)
-    canvas = plan_canvas(trajectory, part.info.span, part.info.frame_shape, scale, int(plan.run.memory), bytes_per_pixel)
+    camera = camera_of_motion(trajectory)
+    view = View(plan.render.projection, plan.render.horizon == "level", camera, turns=camera is not None)
+    memory = int(plan.run.memory)
+    canvas = plan_canvas(trajectory, part.info.span, part.info.frame_shape, scale, memory, bytes_per_pixel, view=view)
     with one_thread_inside():
         render(part, trajectory, part.info.span, canvas, plan.render.tolerance_px, Context(threads), renderer)
     seconds["panorama"] = (time.perf_counter() - start) * more
-    height, width = _expected_shape(plan, part.info.frame_shape, canvas.shape, more)
-    rendering = min(bytes_per_pixel * height * width, int(plan.run.memory))
-    memory = (peak_memory_bytes() or 0) + n_frames * BYTES_PER_FRAME + rendering
-    return Forecast(span, threads, seconds, memory, (height, width))
+    height, width = _expected_shape(plan, part.info.frame_shape, canvas, more)
+    rendering = min(bytes_per_pixel * height * width, memory)
+    memory_bytes = (peak_memory_bytes() or 0) + n_frames * BYTES_PER_FRAME + rendering
+    return Forecast(span, threads, seconds, memory_bytes, (height, width))
 
 
-def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: tuple[int, int], more: float) -> tuple[int, int]:
-    """Return the (height, width) of the panorama, from that of the trial, which has `1 / more` of the frames."""
+def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: Canvas, more: float) -> tuple[int, int]:
+    """Return the (height, width) of the panorama, from that of the trial, which has `1 / more` of the frames.
+
+    On a cylinder or a sphere it is the whole panorama, up to a full turn.
+    """
     scale, extent = plan.render.scale, plan.render.extent
-    if extent != "panorama":
+    if extent != "panorama" and tried.planar:
         return canvas_of_box(box_of(extent, frame_shape), scale).shape
     height, width = (
-        round(side * scale + (whole - side * scale) * more) for side, whole in zip(frame_shape, tried, strict=True)
+        round(side * scale + (whole - side * scale) * more) for side, whole in zip(frame_shape, tried.shape, strict=True)
     )
-    return height, width
+    return height, width if tried.period_px is None else min(width, round(tried.period_px))
 
 
 def _tried(plan: Plan, part: Source, threads: int) -> list[LevelResult]:

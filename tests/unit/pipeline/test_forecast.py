@@ -30,3 +30,23 @@ def test_forecast_of_a_part_has_the_size_of_the_part(small_spec: dict[str, Any],
     plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 10}}, "levels": 1, "render": render})
     with build_source(plan) as source:
         assert forecast(plan, source).canvas == shape
+
+
+def test_forecast_of_a_turn_knows_that_a_sphere_ends() -> None:
+    """The trial turns by 90 degrees of 500; all around are 377 px, and a box of degrees is left out of account."""
+    scene = {"kind": "street", "width": 400, "height": 200}
+    turn = {"scene": scene, "path": {"kind": "turn", "degrees": 500}, "frame_shape": [48, 80], "focal_length_px": 60}
+    spec = {
+        "version": 1,
+        "source": {"use": "simulator", "with": turn | {"n_frames": 1000, "flux": 2.0}},
+        "motion": {"model": "rotation"},
+        "camera": {"focal_px": 60},
+        "resample": {"with": {"group_size": 15}},
+        "levels": 1,
+        "render": {"projection": "spherical", "extent": [0, -10, 20, 10]},
+    }
+    plan = parse_spec(spec)
+    with build_source(plan) as source:
+        height, width = forecast(plan, source).canvas
+    assert width == 377
+    assert 48 <= height < 100
