@@ -74,6 +74,8 @@ def test_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str, np.
     assert {name: array.shape for name, array in trajectory.items()} == {
         "homographies": (N_FRAMES, 3, 3),
         "canvas": (3, 3),
+        "projection": (),
+        "horizon": (3, 3),
         "frame_shape": (2,),
         "reference": (),
         "located": (N_FRAMES,),
@@ -163,6 +165,8 @@ def test_report_refers_to_no_other_file(folder: Path) -> None:
 def mismatches(value: Any, expected: Any, where: str = "run.json") -> list[str]:
     """Return where plain data differs from a TypedDict, a sequence, a mapping, a union, or a plain type."""
     if is_typeddict(expected):
+        if not isinstance(value, Mapping):
+            return [f"{where}: {value!r} is no {expected.__name__}"]
         hints = get_type_hints(expected)
         if set(value) != set(hints):
             return [f"{where}: {sorted(set(value) ^ set(hints))}"]

@@ -47,7 +47,7 @@ def test_figures_of_trajectory_with_known_errors(trust: ModuleType) -> None:
         "located": np.ones(N, bool),
         "frame_shape": np.array(SHAPE),
     }
-    figures = trust.figures_of(estimated, Truth(true, SHAPE, None))
+    figures = trust.figures_of(estimated, Truth(true, SHAPE, None, true))
     assert figures["mean_px"] == pytest.approx(0.3, rel=0.01)
     assert figures["rms_px"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2) / 2), rel=0.01)
     assert figures["max_px"] == pytest.approx(0.5, rel=0.02)
@@ -62,13 +62,14 @@ def test_frames_that_are_not_located_are_not_scored(trust: ModuleType) -> None:
     wrong[180:] = np.eye(3)
     located = np.arange(N) < 180
     estimated = {"homographies": wrong, "std_px": np.full(N, 0.1), "located": located, "frame_shape": np.array(SHAPE)}
-    figures = trust.figures_of(estimated, Truth(true, SHAPE, None))
+    figures = trust.figures_of(estimated, Truth(true, SHAPE, None, true))
     assert figures["max_px"] < 1e-6
     assert figures["located"] == 0.75
 
 
 def test_trajectory_of_other_frames_has_no_figures(trust: ModuleType) -> None:
-    truth = Truth(np.tile(np.eye(3), (5, 1, 1)), SHAPE, None)
+    still = np.tile(np.eye(3), (5, 1, 1))
+    truth = Truth(still, SHAPE, None, still)
     for frames, shape in ((4, SHAPE), (5, (60, 720))):
         estimated = {"homographies": np.tile(np.eye(3), (frames, 1, 1)), "frame_shape": np.array(shape)}
         assert trust.figures_of(estimated, truth) == {}

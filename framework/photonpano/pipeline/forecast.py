@@ -83,7 +83,7 @@ def forecast(plan: Plan, source: Source) -> Forecast:
 def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: Canvas, more: float) -> tuple[int, int]:
     """Return the (height, width) of the panorama, from that of the trial, which has `1 / more` of the frames.
 
-    On a cylinder or a sphere it is the whole panorama, up to a full turn.
+    On a cylinder or a sphere it is the whole panorama, up to a full turn, and as high as that of the trial.
     """
     scale, extent = plan.render.scale, plan.render.extent
     if extent != "panorama" and tried.planar:
@@ -91,7 +91,7 @@ def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: Canvas, mor
     height, width = (
         round(side * scale + (whole - side * scale) * more) for side, whole in zip(frame_shape, tried.shape, strict=True)
     )
-    return height, width if tried.period_px is None else min(width, round(tried.period_px))
+    return (height, width) if tried.period_px is None else (tried.height, min(width, round(tried.period_px)))
 
 
 def _tried(plan: Plan, part: Source, threads: int) -> list[LevelResult]:

@@ -25,9 +25,8 @@ def planned(
 @pytest.mark.parametrize(
     ("degrees", "pitch", "projection"), [(20, 0, "planar"), (90, 0, "cylindrical"), (200, 60, "spherical")]
 )
-def test_auto_projection_follows_field_of_view(degrees: float, pitch: float, name: str) -> None:
-    canvas = planned(degrees, pitch=pitch)
-    assert canvas.projection == name
+def test_auto_projection_follows_field_of_view(degrees: float, pitch: float, projection: str) -> None:
+    assert planned(degrees, pitch=pitch).projection == projection
 
 
 def test_auto_shows_reference_frame_on_a_plane() -> None:
