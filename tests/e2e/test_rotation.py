@@ -15,18 +15,18 @@ from photonpano.pipeline.run import RunResult
 FOCAL_PX = 163.0
 SIMULATED: dict[str, Any] = {
     "scene": {"kind": "street", "width": 1024, "height": 512},
-    "path": {"kind": "turn", "degrees": 100, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
+    "path": {"kind": "turn", "degrees": 80, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
     "frame_shape": [96, 160],
     "focal_length_px": FOCAL_PX,
     "flux": 0.5,
-    "n_frames": 1200,
+    "n_frames": 900,
     "distortion": {"k1": -0.08},
 }
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A turn by 100 degrees, through a lens that distorts."""
+    """A turn by 80 degrees, through a lens that distorts."""
     path = tmp_path_factory.mktemp("turn") / "turn.npy"
     simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": SIMULATED}}), path)
     return path

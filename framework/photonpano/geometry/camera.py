@@ -66,15 +66,18 @@ class Camera:
         seen = self._in_focal_lengths(points)
         if not self.distorts:
             return self._in_px(seen)
-        found = seen.copy()
-        for _ in range(_ITERATIONS):
-            step = np.linalg.solve(self._slopes(found), (seen - self._distorted(found))[..., None])[..., 0]
-            found = found + step
-            if np.abs(step).max(initial=0) < _EXACT:
-                break
+        found = seen
+        with np.errstate(all="ignore"):
+            for _ in range(_ITERATIONS):
+                (a, b), (_, d) = self._slopes(found)
+                x, y = np.moveaxis(seen - self._distorted(found), -1, 0)
+                step = np.stack([d * x - b * y, a * y - b * x], axis=-1) / (a * d - b * b)[..., None]
+                found = found + step
+                if not (np.abs(step) >= _EXACT).any():
+                    break
+            away = np.abs(self._distorted(found) - seen).max(axis=-1)
         # Beyond the radius at which the image folds over, the iteration ends anywhere.
-        wrong = np.abs(self._distorted(found) - seen).max(axis=-1) > 1e-6
-        return self._in_px(np.where(wrong[..., None], np.nan, found))
+        return self._in_px(np.where((away <= 1e-6)[..., None], found, np.nan))
 
     def directions(self, points: ArrayLike) -> FloatArray:
         """Return the unit vectors in which (..., 2) pixels of a frame look: (..., 3)."""
@@ -111,18 +114,17 @@ class Camera:
             axis=-1,
         )
 
-    def _slopes(self, points: FloatArray) -> FloatArray:
-        """Return the derivatives of the distorted points by (..., 2) ideal ones: (..., 2, 2)."""
+    def _slopes(self, points: FloatArray) -> list[list[FloatArray]]:
+        """Return the derivatives of the distorted points by (..., 2) ideal ones: two rows of two arrays (...)."""
         k1, k2, p1, p2 = self.distortion
         x, y = np.moveaxis(points, -1, 0)
         square = x**2 + y**2
         radial, growth = 1 + square * (k1 + k2 * square), 2 * (k1 + 2 * k2 * square)
         mixed = x * y * growth + 2 * p1 * x + 2 * p2 * y
-        rows = [
+        return [
             [radial + x**2 * growth + 2 * p1 * y + 6 * p2 * x, mixed],
             [mixed, radial + y**2 * growth + 6 * p1 * y + 2 * p2 * x],
         ]
-        return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def camera_matrix(focal_px: float, centre_px: tuple[float, float]) -> FloatArray:
