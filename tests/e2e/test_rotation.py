@@ -56,7 +56,7 @@ def test_rotations_focal_length_and_lens_are_found(result: RunResult, capture: P
         away = rotation_vectors(np.swapaxes(truth["rotations"], -1, -2) @ aligned)
         k1 = found["distortion"][0]
     camera = result.record["levels"][-1]["camera"]
-    assert np.rad2deg(np.linalg.norm(away, axis=1)).mean() < 0.12
+    assert np.rad2deg(np.linalg.norm(away, axis=1)).mean() < 0.2
     assert abs(camera["focal_px"] / FOCAL_PX - 1) < 0.005
     assert abs(camera["focal_px"] - FOCAL_PX) < 3 * camera["std_focal_px"]
     assert k1 == pytest.approx(-0.08, rel=0.05)

@@ -58,7 +58,8 @@ class GraphSolution:
         residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
         assess: returns how well the L located nodes are determined. It takes about as long as to solve the graph.
         turns: the rotations of the L located nodes, and the camera; None for homographies.
-        evidence: how well a camera that only turns explains the edges; None where one of the two models was not fitted.
+        compare: returns how well a camera that only turns explains the edges; None where one of the two models is not fitted. For
+            rotations it takes about as long as to solve the graph.
     """
 
     homographies: FloatArray
@@ -67,7 +68,7 @@ class GraphSolution:
     residual_px: float
     assess: Callable[[], Assessment]
     turns: Turns | None = None
-    evidence: Evidence | None = None
+    compare: Callable[[], Evidence | None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,13 +135,21 @@ def solve(
     if model.kind == "homography":
         return tied.solution(_homographies(tied, start))
     turned = _turns(tied, start, model)
+    if model.kind == "rotation":
+        return tied.solution(turned, lambda: _compared(tied, start, turned)[1])
+    free, evidence = _compared(tied, start, turned)
+    chosen = turned if free is None or evidence is None or evidence.turns_only else free
+    return tied.solution(chosen, lambda: evidence)
+
+
+def _compared(tied: _Tied, start: FloatArray | None, turned: _Fit) -> tuple[_Fit | None, Evidence | None]:
+    """Fit homographies, and compare rotations with them; None for both where no plane holds all frames."""
     try:
         with np.errstate(all="ignore"):
             free = _homographies(tied, start)
-        evidence = Evidence.of(free, turned)
-    except (ValueError, np.linalg.LinAlgError):  # no plane holds all frames
-        return tied.solution(turned)
-    return tied.solution(turned if evidence.turns_only or model.kind == "rotation" else free, evidence)
+            return free, Evidence.of(free, turned)
+    except (ValueError, np.linalg.LinAlgError):
+        return None, None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,7 +245,7 @@ class _Tied:
             found, norms = adjustment.minimise(found, kept)
         return _Fit(adjustment, found, norms, kept)
 
-    def solution(self, fit: _Fit, evidence: Evidence | None = None) -> GraphSolution:
+    def solution(self, fit: _Fit, compare: Callable[[], Evidence | None] = lambda: None) -> GraphSolution:
         """Return a fit as the solution of the graph."""
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)
@@ -245,7 +254,7 @@ class _Tied:
         outliers = tuple(int(position) for position in self.positions[~fit.kept])
         assess = partial(adjustment.assess, found, fit.norms, fit.kept)
         turns = found if isinstance(found, Turns) else None
-        return GraphSolution(homographies, self.located, outliers, residual_px, assess, turns, evidence)
+        return GraphSolution(homographies, self.located, outliers, residual_px, assess, turns, compare)
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""

@@ -14,7 +14,7 @@ from photonpano.motion.checks import require_motion
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.fallbacks import checked_fallbacks
-from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
+from photonpano.motion.graph import Evidence, GraphOptions, GraphSolution, components, solve
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
@@ -39,6 +39,7 @@ class LocatedLevel:
         std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
         frame_shape: (height, width) of a frame.
         std_camera: (5,) expected errors of the camera, see `Assessment`.
+        evidence: how well a camera that only turns explains the pairs, compared with homographies; None where one was not fitted.
         ambiguity: pairs that fit the scene at more than one place; None where there are none.
     """
 
@@ -50,6 +51,7 @@ class LocatedLevel:
     std_px: FloatArray
     frame_shape: tuple[int, int]
     std_camera: FloatArray
+    evidence: Evidence | None
     ambiguity: Ambiguity | None = None
 
     @property
@@ -121,7 +123,7 @@ def locate(
             fair = _not_outvoting(closures, edges, alone, solution)
             if fair != closures:
                 closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, start, model)
-        assessed = solution.assess()
+        assessed, evidence = solution.assess(), solution.compare()
     return LocatedLevel(
         groups,
         edges + closures,
@@ -131,6 +133,7 @@ def locate(
         assessed.std_px,
         shape,
         assessed.std_camera,
+        evidence,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
 

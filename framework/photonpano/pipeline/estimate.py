@@ -247,13 +247,13 @@ def _require_camera_of(plan: Plan, source: Source) -> None:
 
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
     """Return which model `auto` took, for the record."""
-    solution = results[-1].located.solution
+    located = results[-1].located
     if plan.motion.model != "auto":
         return []
-    taken = "homography" if solution.turns is None else "rotation"
-    if solution.evidence is None:
+    taken = "homography" if located.solution.turns is None else "rotation"
+    if located.evidence is None:
         return [Decision("motion_model", taken, "the camera turns too far for homographies to one plane")]
-    gain = solution.evidence.gain
+    gain = located.evidence.gain
     reason = f"each unknown that homographies have more lowers the squared residuals {gain:.2g} times as much as noise would"
     return [Decision("motion_model", taken, reason)]
 

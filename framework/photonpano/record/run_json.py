@@ -196,7 +196,7 @@ def level_record(result: LevelResult) -> LevelRecord:
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
         "camera": _camera_record(result),
-        "evidence": _evidence_record(located.solution.evidence),
+        "evidence": _evidence_record(located.evidence),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
 

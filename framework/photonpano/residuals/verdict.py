@@ -320,7 +320,7 @@ def _no_turn(levels: Sequence[LevelResult]) -> Reason | None:
     """Judge rotations of one camera by what any homographies would explain."""
     if not levels or levels[-1].located.solution.turns is None:
         return None
-    evidence = levels[-1].located.solution.evidence
+    evidence = levels[-1].located.evidence
     if evidence is None:
         return None
     residual, free = np.sqrt([evidence.rotation, evidence.homography]).tolist()

@@ -41,8 +41,8 @@ def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
 ) -> None:
     """Either the residuals are large, or those of homographies are much smaller."""
     evidence = Evidence(rotation, 1.0, gain)
-    solution = SimpleNamespace(turns=object(), evidence=evidence, outliers=())
-    level = SimpleNamespace(located=SimpleNamespace(solution=solution, edges=(), ambiguity=None))
+    solution = SimpleNamespace(turns=object(), outliers=())
+    level = SimpleNamespace(located=SimpleNamespace(solution=solution, evidence=evidence, edges=(), ambiguity=None))
     reasons = judge(explained, [level]).reasons
     assert [reason.what for reason in reasons] == [NO_TURN] * doubtful
     if doubtful:
