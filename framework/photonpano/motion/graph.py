@@ -58,8 +58,8 @@ class GraphSolution:
         residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
         assess: returns how well the L located nodes are determined. It takes about as long as to solve the graph.
         turns: the rotations of the L located nodes, and the camera; None for homographies.
-        compare: returns how well a camera that only turns explains the edges; None where one of the two models is not fitted. For
-            rotations it takes about as long as to solve the graph.
+        compare: returns how well a camera that only turns explains the edges; None where one of the two models is not fitted.
+            For rotations it takes about as long as to solve the graph.
     """
 
     homographies: FloatArray

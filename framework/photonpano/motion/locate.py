@@ -39,7 +39,7 @@ class LocatedLevel:
         std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
         frame_shape: (height, width) of a frame.
         std_camera: (5,) expected errors of the camera, see `Assessment`.
-        evidence: how well a camera that only turns explains the pairs, compared with homographies; None where one was not fitted.
+        evidence: how well a camera that only turns explains the pairs, compared with homographies; None where they are not.
         ambiguity: pairs that fit the scene at more than one place; None where there are none.
     """
 
