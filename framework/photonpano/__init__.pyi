@@ -60,6 +60,7 @@ from .protocols import KnowsTruth as KnowsTruth
 from .protocols import LensedSource as LensedSource
 from .protocols import LinearlyCorrectedSource as LinearlyCorrectedSource
 from .protocols import LitSource as LitSource
+from .protocols import LocatesTurns as LocatesTurns
 from .protocols import Locator as Locator
 from .protocols import Merger as Merger
 from .protocols import PackedSource as PackedSource

@@ -303,6 +303,24 @@ class KeepsHypotheses(Locator, Protocol):
         ...
 
 
+@runtime_checkable
+class LocatesTurns(Locator, Protocol):
+    """A locator that can use what is known of a camera that only turns: a pair then has three unknowns, and not eight."""
+
+    def turning(self, camera_matrix: FloatArray) -> Locator:
+        """Return this locator for exposures of a camera that only turns.
+
+        The framework asks once a level for the model `rotation`, if the focal length is given, or found by the level before.
+        Where a pair of exposures determines eight parameters, the locator should return what it returns without the camera,
+        since the focal length is found from such pairs. Elsewhere it may return the motion K R K^-1, with information on the
+        three unknowns of the rotation only, as `photonpano.locating.information_on_turn` gives it.
+
+        Args:
+            camera_matrix: (3, 3) K, in px of the exposures, which are free of lens distortion.
+        """
+        ...
+
+
 class Interpolator(Protocol):
     """Turns located instants into a trajectory (paper, section 4, "Interpolate")."""
 

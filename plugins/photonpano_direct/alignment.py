@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano import FloatArray, Homography, NotLocated
 from photonpano.geometry import corners, generators, slopes, unit_coordinates, why_implausible
-from photonpano.locating import ALL_PARAMETERS, NO_TEXTURE, PRIOR_STD
+from photonpano.locating import NO_TEXTURE, PRIOR_STD, information_on_turn
 from photonpano_direct import descent
 from photonpano_direct.curvature import information_of
 from photonpano_direct.layers import Layer
@@ -64,8 +64,12 @@ class Aligned:
         """Fraction of the template that both see."""
         return self.pixels / self.template.image.size
 
-    def quality(self) -> Quality:
-        """Return how well the images agree. Overwrites the buffers, so it can be called once."""
+    def quality(self, camera_matrix: FloatArray | None) -> Quality:
+        """Return how well the images agree. Overwrites the buffers, so it can be called once.
+
+        Args:
+            camera_matrix: (3, 3) K, in px of the layer, if only a turn was estimated; else None.
+        """
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
@@ -78,8 +82,10 @@ class Aligned:
             noise_ratio,
             _PRIOR,
             np.array(generators(shape)),
-            _to_corners(shape, ALL_PARAMETERS),
+            _to_corners(shape),
         )
+        if camera_matrix is not None and np.isfinite(std_px):
+            information, std_px = information_on_turn(information, self.homography, camera_matrix, shape)
         return Quality(information=information, noise_ratio=noise_ratio, overlap=self.overlap, std_px=std_px)
 
 
@@ -88,7 +94,7 @@ def align(
     fixed: Layer,
     homography: Homography,
     prior_mean: Homography,
-    free: tuple[int, ...],
+    basis: FloatArray,
     tolerance_px: float,
     max_steps: int,
 ) -> Aligned | NotLocated:
@@ -99,7 +105,7 @@ def align(
         fixed: the other layer, of the same shape.
         homography: (3, 3) initial map, pixels of the template to pixels of the fixed layer.
         prior_mean: (3, 3) prior mean of the homography.
-        free: indices of the parameters p1..p8 to estimate.
+        basis: (8, K) small changes of p1..p8 in unit coordinates that are estimated.
         tolerance_px: converged when a step moves no corner further.
         max_steps: step limit.
     """
@@ -112,8 +118,8 @@ def align(
         prior_mean,
         _PRIOR,
         np.array(unit_coordinates(shape)),
-        np.array(free),
-        _to_corners(shape, free),
+        basis,
+        _to_corners(shape),
         tolerance_px,
         max_steps,
         buffers,
@@ -128,10 +134,10 @@ def align(
 
 
 @cache
-def _to_corners(shape: tuple[int, int], free: tuple[int, ...]) -> FloatArray:
-    """Return the derivatives of the corners of an image with respect to some of p1..p8: (8, len(free))."""
+def _to_corners(shape: tuple[int, int]) -> FloatArray:
+    """Return the derivatives of the corners of an image with respect to p1..p8: (8, 8)."""
     homogeneous = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
-    return np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous)[:, list(free)])
+    return np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous))
 
 
 _of_thread = local()

@@ -111,24 +111,21 @@ def _hessian(first: NDArray[np.float32], second: NDArray[np.float32], weight: ND
 
 
 @compiled
-def expected_px(information: FloatArray, free: NDArray[np.int64], to_corners: FloatArray) -> float:
-    """Return the expected error of a corner in px if noise is white; 0 if the information is singular."""
-    n_free = len(free)
-    normal, root, moves = np.empty((n_free, n_free)), np.zeros((n_free, n_free)), np.empty((n_free, 8))
-    for i in range(n_free):
-        for j in range(n_free):
-            normal[i, j] = information[free[i], free[j]]
-        for row in range(8):
-            moves[i, row] = to_corners[row, i]
-    if not cholesky(normal, root):
+def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArray) -> float:
+    """Return the expected error of a corner in px if noise is white; 0 if the information is singular.
+
+    Args:
+        information: (8, 8) inverse covariance of p1..p8.
+        basis: (8, K) changes of p1..p8 that are estimated.
+        to_corners: (8, 8) derivatives of the corners with respect to p1..p8, in px.
+    """
+    of_basis, n = transposed(basis), basis.shape[1]
+    root, moves = np.zeros((n, n)), transposed(product(to_corners, basis))
+    if not cholesky(product(of_basis, product(information, basis)), root):
         return 0.0
     # The trace of J (R R^T)^-1 J^T is the sum of the squares of R^-1 J^T.
     solve_lower(root, moves)
-    total = 0.0
-    for i in range(n_free):
-        for row in range(8):
-            total += moves[i, row] ** 2
-    return float(np.sqrt(total / 4))
+    return float(np.sqrt((moves**2).sum() / 4))
 
 
 @compiled
@@ -176,7 +173,7 @@ def information_of(
     for i in range(8):
         for j in range(8):
             information[i, j] = information[i, j] / max(1.0, noise_ratio) + prior[i, j]
-    std_px = expected_px(information, np.arange(8), to_corners)
+    std_px = expected_px(information, np.eye(8), to_corners)
     # From steps in unit coordinates of the template to p1..p8 of the homography, with h33 = 1.
     to_parameters = np.empty((8, 8))
     for k in range(8):

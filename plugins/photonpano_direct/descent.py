@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
@@ -11,7 +10,7 @@ from photonpano.geometry import violation
 from photonpano_direct.curvature import MOMENTS_X, MOMENTS_Y, chance_level, curvatures, expected_px
 from photonpano_direct.layers import Layer
 from photonpano_direct.moments import Buffers, residuals_and_moments
-from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve
+from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
 CONVERGED, NO_TEXTURE, MAX_STEPS, DIVERGED = 0, 1, 2, 3
 """Exit status: converged, no common texture, step limit reached, diverged to an impossible homography."""
@@ -34,7 +33,7 @@ def descend(
     prior_mean: Homography,
     prior: FloatArray,
     unit: Homography,
-    free: NDArray[np.int64],
+    basis: FloatArray,
     to_corners: FloatArray,
     tolerance_px: float,
     max_steps: int,
@@ -49,8 +48,8 @@ def descend(
         prior_mean: (3, 3) prior mean of the homography.
         prior: (8, 8) inverse covariance of the prior, for small changes in unit coordinates of the template.
         unit: (3, 3), pixels to unit coordinates.
-        free: indices of the parameters p1..p8 to estimate.
-        to_corners: (8, len(free)) derivatives of the corners of the template with respect to these parameters, in px.
+        basis: (8, K) small changes in unit coordinates of the template that are estimated.
+        to_corners: (8, 8) derivatives of the corners of the template with respect to p1..p8, in px.
         tolerance_px: converged when the next step is expected to move no corner further.
         max_steps: step limit.
         buffers: filled by `residuals_and_moments` at the start of the last step.
@@ -63,8 +62,7 @@ def descend(
     from_unit, to_prior_mean = inverse_homography(unit), product(unit, inverse_homography(prior_mean))
     moments_x, moments_y = np.empty((3, 3)), np.empty((3, 3))
     own, hessian = np.zeros((8, 8)), np.zeros((8, 8))
-    n_free = len(free)
-    normal, gradient = np.empty((n_free, n_free)), np.empty((n_free, 1))
+    of_basis, gradient = transposed(basis), np.empty((8, 1))
     std_px, hessian_is_current = 0.0, False
     damping, previous, least_cost, last_px = 0.0, homography, np.inf, 0.0
     pixels, squares, weights = 0, 0.0, 0.0
@@ -78,21 +76,17 @@ def descend(
             for i in range(8):
                 for j in range(8):
                     hessian[i, j] += prior[i, j]
-            std_px, hessian_is_current = expected_px(hessian, free, to_corners), True
+            std_px, hessian_is_current = expected_px(hessian, basis, to_corners), True
         deviation = _parameters(product(product(to_prior_mean, homography), from_unit))
         prior_gradient = applied(prior, deviation)
         cost = (squares + dot(deviation, prior_gradient)) / pixels
-        for i in range(n_free):
-            k = free[i]
+        for k in range(8):
             image_gradient = dot(MOMENTS_X[k], moments_x.reshape(-1)) + dot(MOMENTS_Y[k], moments_y.reshape(-1))
-            gradient[i, 0] = half * image_gradient + prior_gradient[k]
-            for j in range(n_free):
-                normal[i, j] = hessian[free[i], free[j]] + damping * own[free[i], free[j]]
-        if not solve(normal, gradient):
+            gradient[k, 0] = half * image_gradient + prior_gradient[k]
+        unknowns = product(of_basis, gradient)
+        if not solve(product(of_basis, product(hessian + damping * own, basis)), unknowns):
             return NO_TEXTURE, homography, pixels, squares, weights
-        p = np.zeros(8)
-        for i in range(n_free):
-            p[free[i]] = gradient[i, 0]
+        p = product(basis, unknowns)[:, 0]
         step = product(product(from_unit, _from_parameters(p)), unit)
         step_px = _corner_px(step, height, width)
         if step_px > _HESSIAN_PX:

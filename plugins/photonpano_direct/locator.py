@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from photonpano import Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import translation
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
+from photonpano.geometry import Camera, nearest_rotations, scaled_ahead, translation, unit_coordinates
 from photonpano.locating import (
     ALL_PARAMETERS,
     NOTHING_SEEN,
@@ -16,6 +16,7 @@ from photonpano.locating import (
     correlation_peaks,
     correlation_surface,
     free_parameters,
+    turn_slopes,
 )
 from photonpano.photometry import Similarity, tapered
 from photonpano_direct.alignment import Aligned, Quality, align
@@ -38,6 +39,9 @@ _RESTRICTED = 2
 """A motion that is tried is aligned twice, each time where the last one fits."""
 _TRUST = 3.0
 """The part that follows the motion known so far counts three times: many pairs have gone into that motion."""
+_DETERMINED_PX = 1.0
+"""A pair whose corners are less certain than this does not determine eight parameters; of a camera that turns, it is aligned
+again with three."""
 _BLUR_DIFFERENCE = 0.1
 """Largest residual that different motion blur explains, as a fraction of the contrast. In much light this is many times the
 photon noise."""
@@ -63,8 +67,19 @@ class DirectLocator:
     Where a part of the image follows another motion than most of it, such as an object, that part is left out.
     """
 
-    def __init__(self, config: DirectConfig) -> None:
+    def __init__(self, config: DirectConfig, camera_matrix: FloatArray | None = None) -> None:
+        """Prepare to align.
+
+        Args:
+            config: of the locator.
+            camera_matrix: (3, 3) K, in px of the exposures, of a camera that only turns; None for any other.
+        """
         self._config = config
+        self._camera_matrix = camera_matrix
+
+    def turning(self, camera_matrix: FloatArray) -> DirectLocator:
+        """Return the locator for a camera that only turns: see `photonpano.LocatesTurns`."""
+        return DirectLocator(self._config, camera_matrix)
 
     def describe(self, exposure: VirtualExposure) -> Pyramid:
         """Return the pyramid of the exposure on the scale on which photon noise is uniform."""
@@ -86,11 +101,35 @@ class DirectLocator:
         """
         if not (moving.layers[-1].weight.any() and fixed.layers[-1].weight.any()):
             return NotLocated(NOTHING_SEEN)
-        n_layers = len(moving.layers)
         searches = initial is None
         if initial is None:
             initial = next(iter(self.hypotheses(moving, fixed)), np.eye(3))
         start = np.array(initial, dtype=np.float64)
+        outcome = _Alignment(self._config, None).aligned(moving, fixed, start, searches)
+        if self._camera_matrix is None or _determined(outcome):
+            return outcome
+        turned = _Alignment(self._config, self._camera_matrix).aligned(moving, fixed, start, searches)
+        return outcome if isinstance(turned, NotLocated) else turned
+
+
+def _determined(outcome: Located | NotLocated) -> bool:
+    """Return whether a pair determines all eight parameters of a homography."""
+    return isinstance(outcome, Located) and outcome.residual_px is not None and outcome.residual_px <= _DETERMINED_PX
+
+
+class _Alignment:
+    """Estimates of the parameters of a homography, or of a turn."""
+
+    def __init__(self, config: DirectConfig, camera_matrix: FloatArray | None) -> None:
+        """Estimate all eight parameters without `camera_matrix`, and three with it."""
+        self._config = config
+        self._camera = None if camera_matrix is None else Camera(camera_matrix)
+
+    def aligned(self, moving: Pyramid, fixed: Pyramid, start: Homography, searches: bool) -> Located | NotLocated:
+        """Align from a start; `searches` tells whether other motions are tried where the image has several."""
+        n_layers = len(moving.layers)
+        if self._camera is not None:
+            start = scaled_ahead(self._camera.homographies(nearest_rotations(self._camera.rotations(start))))
         judged = min(JUDGED, n_layers - 1)
         coarse = self._descend(moving, fixed, start, start, range(judged, n_layers))
         moving, coarse = self._of_majority(moving, fixed, coarse, start, judged, searches)
@@ -99,7 +138,7 @@ class DirectLocator:
         # The failure of a coarse layer does not count: the next one starts where it started.
         if not found:
             return fine.failure or coarse.failure or NotLocated(NOTHING_SEEN)
-        scale, homography, quality = _best(found)
+        scale, homography, quality = self._best(found)
         similarity = similarity_under(rescaled(homography, 0.5**moving.compared), moving.details, fixed.details)
         # The variance of noise, in pixels of a layer, falls with their area.
         contrast = moving.details.contrast * (0.5**moving.compared / scale) ** 2
@@ -109,16 +148,17 @@ class DirectLocator:
         self, moving: Pyramid, fixed: Pyramid, homography: Homography, prior_mean: Homography, depths: range
     ) -> _Descent:
         """Align some layers, the coarsest first; a layer that fails is skipped."""
-        n_layers, failure = len(moving.layers), None
+        failure = None
         found: list[tuple[float, Aligned]] = []
         for depth in reversed(depths):
-            free, scale = free_parameters(depth, n_layers), 0.5**depth
+            scale = 0.5**depth
+            basis, complete = self._basis(depth, moving)
             aligned = align(
                 moving.layers[depth],
                 fixed.layers[depth],
                 rescaled(homography, scale),
                 rescaled(prior_mean, scale),
-                free,
+                basis,
                 self._config.converged_px * (1 if depth == 0 else _COARSE_TOLERANCE),
                 self._config.max_iterations,
             )
@@ -131,9 +171,18 @@ class DirectLocator:
                 failure = aligned
                 continue
             homography = rescaled(aligned.homography, 1 / scale)
-            if free == ALL_PARAMETERS:
+            if complete:
                 found.append((scale, aligned))
         return _Descent(homography, found, failure)
+
+    def _basis(self, depth: int, pyramid: Pyramid) -> tuple[FloatArray, bool]:
+        """Return the changes of p1..p8 that are estimated on a layer, (8, K), and whether these are all that are unknown."""
+        if self._camera is None:
+            free = free_parameters(depth, len(pyramid.layers))
+            return np.ascontiguousarray(np.eye(8)[:, list(free)]), free == ALL_PARAMETERS
+        height, width = pyramid.layers[depth].image.shape
+        matrix = unit_coordinates((height, width)) @ self._camera.scaled(0.5**depth).matrix
+        return np.ascontiguousarray(turn_slopes(np.eye(3), matrix)), True
 
     def _of_majority(
         self, moving: Pyramid, fixed: Pyramid, first: _Descent, start: Homography, judged: int, searches: bool
@@ -180,6 +229,24 @@ class DirectLocator:
             part = part_of(motion)
         return restricted, found
 
+    def _best(self, found: Sequence[tuple[float, Aligned]]) -> tuple[float, Homography, Quality]:
+        """Return the scale, the homography in pixels of the finest layer, and the quality of the layer with the least error.
+
+        Motion blur removes the details of a fine layer but not its noise, which a coarse layer averages out.
+
+        Args:
+            found: scales of layers and their alignments, coarsest first.
+        """
+        best: tuple[float, Homography, Quality] | None = None
+        for scale, aligned in reversed(found):
+            quality = aligned.quality(None if self._camera is None else self._camera.scaled(scale).matrix)
+            if best is None or quality.std_px / scale < best[2].std_px / best[0]:
+                best = scale, rescaled(aligned.homography, 1 / scale), quality
+            if best[2].std_px / best[0] < _EXACT_PX:
+                break
+        assert best is not None
+        return best
+
     def _judged(
         self, homography: Homography, quality: Quality, scale: float, similarity: Similarity, contrast: float
     ) -> Located | NotLocated:
@@ -206,25 +273,6 @@ class DirectLocator:
             units = np.array([1, 1, 1, 1, scale, scale, 1 / scale, 1 / scale])
             return Located(homography, quality.information * np.outer(units, units), std_px, evidence)
         return NotLocated(reason, evidence)
-
-
-def _best(found: Sequence[tuple[float, Aligned]]) -> tuple[float, Homography, Quality]:
-    """Return the scale, the homography in pixels of the finest layer, and the quality of the layer with the least error.
-
-    Motion blur removes the details of a fine layer but not its noise, which a coarse layer averages out.
-
-    Args:
-        found: scales of layers and their alignments, coarsest first.
-    """
-    best: tuple[float, Homography, Quality] | None = None
-    for scale, aligned in reversed(found):
-        quality = aligned.quality()
-        if best is None or quality.std_px / scale < best[2].std_px / best[0]:
-            best = scale, rescaled(aligned.homography, 1 / scale), quality
-        if best[2].std_px / best[0] < _EXACT_PX:
-            break
-    assert best is not None
-    return best
 
 
 def _hypotheses(moving: Layer, fixed: Layer, n_layers: int) -> list[Homography]:

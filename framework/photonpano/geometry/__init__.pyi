@@ -24,6 +24,7 @@ from .plausibility import why_implausible as why_implausible
 from .projections import PROJECTIONS as PROJECTIONS
 from .projections import Projection as Projection
 from .projections import ProjectionName as ProjectionName
+from .rotations import ROTATION_AXES as ROTATION_AXES
 from .rotations import nearest_rotations as nearest_rotations
 from .rotations import rotation_matrices as rotation_matrices
 from .rotations import rotation_vectors as rotation_vectors

@@ -12,6 +12,12 @@ from numpy.typing import ArrayLike
 
 from photonpano.values import FloatArray
 
+ROTATION_AXES = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
+)
+"""Derivatives of a small rotation by its rotation vector: (3, 3, 3)."""
+ROTATION_AXES.flags.writeable = False
+
 
 def rotation_matrices(vectors: ArrayLike) -> FloatArray:
     """Return the rotations of rotation vectors: (..., 3) to (..., 3, 3)."""

@@ -29,6 +29,9 @@ from .points import Matches as Matches
 from .points import consensus_of as consensus_of
 from .points import motion_from_points as motion_from_points
 from .points import too_few_matches as too_few_matches
+from .turns import TurnInformation as TurnInformation
+from .turns import information_on_turn as information_on_turn
+from .turns import turn_slopes as turn_slopes
 from .viewing import View as View
 from .viewing import blur_against_noise as blur_against_noise
 from .viewing import stabilised_8_bit as stabilised_8_bit

@@ -9,9 +9,9 @@ from typing import NewType
 
 import numpy as np
 
-from photonpano.geometry import rescaled
+from photonpano.geometry import Camera, rescaled
 from photonpano.motion.attribution import attributing
-from photonpano.protocols import Interpolator, Locator, Merger, Resampler
+from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler
 from photonpano.values import FloatArray, Located
 
 FrameHomography = NewType("FrameHomography", FloatArray)
@@ -62,6 +62,18 @@ class Level:
         """
         origin = self.origins[component] if isinstance(component, str) else component.origin
         return attributing(origin, f"level {self.number}")
+
+    def turning(self, camera: Camera | None) -> Level:
+        """Return the level for a camera that only turns, which locators use if they can; None if it is not known."""
+        if camera is None:
+            return self
+        matrix, locators = camera.scaled(self.scale).matrix, []
+        for locator in self.locators:
+            if isinstance(locator.component, LocatesTurns):
+                with self.attributing(locator):
+                    locator = replace(locator, component=locator.component.turning(matrix))
+            locators.append(locator)
+        return replace(self, locators=tuple(locators))
 
     def in_exposure_px(self, homography: FrameHomography) -> ExposureHomography:
         """Convert a homography from pixels of frames to pixels of the level's exposures."""

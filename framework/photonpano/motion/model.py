@@ -57,6 +57,12 @@ class MotionModel:
             return Camera(camera.matrix)
         return camera
 
+    def turning_camera(self, frame_shape: tuple[int, int]) -> Camera | None:
+        """Return the camera that locators may use: one that only turns, of a focal length that is given or was found."""
+        if self.kind != "rotation" or (self.known is None and self.focal_px is None):
+            return None
+        return self.camera(frame_shape)
+
     def knowing(self, camera: Camera | None) -> MotionModel:
         """Return the model after a level that has found the camera, or None."""
         return self if camera is None else replace(self, known=camera)

@@ -8,15 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import Camera, apply, camera_matrix, nearest_rotations, rotation_matrices, slopes
+from photonpano.geometry import ROTATION_AXES, Camera, apply, camera_matrix, nearest_rotations, rotation_matrices, slopes
 from photonpano.motion.adjustment import Adjustment
 from photonpano.motion.lens_shift import LensShift
 from photonpano.values import FloatArray, Located
 
-_AXES = np.array(
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
-)
-"""Derivatives of a small rotation by its rotation vector: (3, 3, 3)."""
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)
 """Focal lengths that are tried first, in sides of a frame."""
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
@@ -111,7 +107,7 @@ class RotationAdjustment(Adjustment[Turns]):
 
     def generators(self, state: Turns) -> FloatArray:
         """Return the derivatives by rotations that move the middle of the frame by about half its side: (3, 3, 3)."""
-        return state.camera.homographies(_AXES) * (self._half / state.camera.focal_px)
+        return state.camera.homographies(ROTATION_AXES) * (self._half / state.camera.focal_px)
 
     def information(self, state: Turns, blocks: FloatArray) -> FloatArray:
         """Convert to information on rotation vectors, in radians: (N, 3, 3)."""
@@ -172,7 +168,7 @@ class RotationAdjustment(Adjustment[Turns]):
         rays = [_rays(camera, points) for points in (here, targets)]
         # Of the rotations that bring four directions to four others, the one of least squares (Kabsch 1976); then one step.
         rotations = nearest_rotations(np.swapaxes(rays[1], -1, -2) @ rays[0])
-        moves = camera.homographies(_AXES)
+        moves = camera.homographies(ROTATION_AXES)
         for _ in range(2):
             mapped = camera.homographies(rotations)
             by_turn = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))

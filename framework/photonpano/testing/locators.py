@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from photonpano.contributions import LocatorContribution
-from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.geometry import Camera, apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano.motion.checks import require_valid
+from photonpano.protocols import LocatesTurns
 from photonpano.testing.captures import photographed, read_only
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
@@ -232,6 +233,27 @@ class LocatorConformance(StageConformance):
             assert not wrong, f"evidence must be finite numbers by name; got {wrong}"
             residual = getattr(found, "residual_px", None)
             assert residual is None or 0 <= residual < np.inf, f"residual_px must be a finite number or None, got {residual}"
+
+    def test_turning_locates_turns_and_nothing_else(self) -> None:
+        """A shift is a turn before a camera of long focal length."""
+        locator = self.built_for_exposures()
+        if not isinstance(locator, LocatesTurns):
+            pytest.skip("the locator does not use the camera")
+        turning = locator.turning(Camera.of(100 * max(self.shape), self.shape).matrix)
+        different = [photographed(Scene(seed).view(STILL, self.shape), seed=seed) for seed in (21, 22)]
+        for exposures, fits in ((pair("shift", self.shape), True), (different, False)):
+            initial = self._start("shift") if fits else None
+            found = must_not_raise("register() of a turn", turning.register, *map(turning.describe, exposures), initial)
+            if not fits:
+                assert isinstance(found, NotLocated), (
+                    f"images of different places must not be located as a turn: {found!r:.300}"
+                )
+                continue
+            assert isinstance(found, Located), f"a turn must be located; not located: {found.reason}"
+            with passing("the answer for a turn"):
+                require_valid(found)
+            error = self._error(found.homography, MOTIONS["shift"])
+            assert error <= self.tolerance_px, f"a turn is {error:.2f} px off (tolerance_px = {self.tolerance_px:g})"
 
     def test_description_does_not_hold_exposure(self) -> None:
         """Descriptions of many exposures are kept at once."""

@@ -9,7 +9,18 @@ import pytest
 
 from photonpano import FrameSpan, Group, Located, NotLocated, VirtualExposure
 from photonpano.evaluation import pair_bound_px
-from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.geometry import (
+    Camera,
+    apply,
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    jacobian,
+    rotation_matrices,
+    scaled_ahead,
+    translation,
+)
 from photonpano.locating import NO_TEXTURE, NOTHING_SEEN
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_direct.configs import DirectConfig
@@ -208,3 +219,35 @@ def test_image_that_moves_as_a_whole_is_aligned_as_a_whole(seen_from: Callable) 
     part = part_following(moving.layers[JUDGED], fixed.layers[JUDGED], rescaled(translation(9, 4), 0.5**JUDGED))
     assert not part.suspect
     assert part.part.mean() > 0.99
+
+
+CAMERA = Camera.of(400.0, SHAPE)
+
+
+def turned(*degrees: float) -> np.ndarray:
+    return scaled_ahead(CAMERA.homographies(rotation_matrices(np.deg2rad(degrees))))
+
+
+def test_blurred_pair_of_a_camera_that_turns_is_aligned_with_three_parameters(street: np.ndarray, photograph: Callable) -> None:
+    true, locator = turned(0.4, -1.0, 1.5), LOCATOR.turning(CAMERA.matrix)
+    blurred = cv2.GaussianBlur(street, (0, 0), 12)
+    errors: dict[str, list[float]] = {"eight": [], "three": []}
+    for seed in range(6):
+        views = [cv2.warpPerspective(blurred, inverse(translation(400, 280) @ motion), SHAPE[::-1]) for motion in (true, STILL)]
+        images = [photograph(0.1 * view, 2 * seed + k) for k, view in enumerate(views)]
+        for name, each in (("eight", LOCATOR), ("three", locator)):
+            found = each.register(*map(each.describe, images), STILL)
+            assert isinstance(found, Located), found
+            errors[name].append(corner_displacements(found.homography, true, SHAPE).mean())
+    assert np.mean(errors["three"]) < 0.6 * np.mean(errors["eight"]), errors
+
+
+def test_sharp_pair_of_a_camera_that_turns_keeps_eight_parameters(seen_from: Callable) -> None:
+    # They tell the focal length.
+    images = seen_from(turned(0.4, -1.0, 1.5), seed=1), seen_from(STILL, seed=2)
+    locator = LOCATOR.turning(Camera.of(900.0, SHAPE).matrix)
+    found, without = locator.register(*map(locator.describe, images), STILL), register(*images, STILL)
+    assert isinstance(found, Located)
+    assert isinstance(without, Located)
+    np.testing.assert_array_equal(found.homography, without.homography)
+    np.testing.assert_array_equal(found.information, without.information)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from photonpano.geometry import Camera, rotation_matrices, rotation_vectors
+from photonpano.motion.model import MotionModel
 from photonpano.motion.rotation_graph import Turns
 from photonpano.motion.turning import TurningTrajectory, fit_turns
 from photonpano.protocols import Interpolator
-from photonpano.values import FloatArray
+from photonpano.values import FloatArray, NotLocated
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.geodesic import GeodesicInterpolator
 from photonpano_core.lie import LieInterpolator
@@ -79,3 +82,30 @@ def test_smoothing_spline_lowers_the_noise_of_turns_with_information() -> None:
 def test_single_knot_stands_still() -> None:
     trajectory = fitted(INTERPOLATORS["smoothing-spline"], np.array([500.0]), rotations_at(np.array([500.0]), 300.0), None)
     np.testing.assert_allclose(trajectory.rotations([0, 999]), [np.eye(3)] * 2, atol=1e-12)
+
+
+class _Turning:
+    """A locator that keeps the camera that it is given."""
+
+    matrix: np.ndarray | None = None
+
+    def describe(self, exposure: object) -> object:
+        return exposure
+
+    def register(self, moving: object, fixed: object, initial: object) -> NotLocated:
+        return NotLocated("toy")
+
+    def turning(self, camera_matrix: np.ndarray) -> _Turning:
+        other = _Turning()
+        other.matrix = camera_matrix
+        return other
+
+
+def test_locators_get_the_camera_in_px_of_exposures_once_its_focal_length_is_known(make_level: Callable) -> None:
+    shape, known = (128, 160), Camera.of(400.0, (128, 160))
+    level = make_level(motion=None, locator=_Turning(), fallbacks={"plain": object()}, scale=0.5)
+    found = level.turning(MotionModel("rotation", known=known).turning_camera(shape))
+    np.testing.assert_allclose(found.locators[0].component.matrix, [[200, 0, 39.5], [0, 200, 31.5], [0, 0, 1]])
+    assert found.locators[1] is level.locators[1]
+    for unknown in (MotionModel("rotation"), MotionModel("auto", known=known), MotionModel("homography", focal_px=400.0)):
+        assert level.turning(unknown.turning_camera(shape)) is level
