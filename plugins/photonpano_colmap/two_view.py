@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,14 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised
-from photonpano.locating import blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
+from photonpano.locating import (
+    Matches,
+    PointLocator,
+    blur_against_noise,
+    motion_from_points,
+    stabilised_8_bit,
+    too_few_matches,
+)
 from photonpano_colmap.configs import PycolmapTwoViewConfig
 
 CENTRE_OF_FIRST_PIXEL = 0.5
@@ -40,7 +48,7 @@ class Features:
     shape: tuple[int, int]
 
 
-class TwoViewLocator:
+class TwoViewLocator(PointLocator):
     """Extracts features once, matches them near the current motion or in the whole image, and fits all inliers.
 
     The library's own threads are off. It holds the GIL while it extracts and matches, so that pairs are not processed in
@@ -48,7 +56,7 @@ class TwoViewLocator:
     """
 
     def __init__(self, config: PycolmapTwoViewConfig, seed: int) -> None:
-        self._config = config
+        self._config: PycolmapTwoViewConfig = config
         self._seed = seed % _SEEDS
         # It would log every extractor and matcher on stderr.
         pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, int(pycolmap.logging.WARNING))
@@ -84,19 +92,18 @@ class TwoViewLocator:
             shape=(image.shape[0], image.shape[1]),
         )
 
-    def register(self, moving: Features, fixed: Features, initial: Homography | None) -> Located | NotLocated:
-        """Match and fit; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when too few keypoints match or agree, when they leave the corners of the
-            frame uncertain, or when no camera moves like that.
-        """
-        if initial is not None:
-            motion = self._motion(moving, fixed, self._matched_nearby(moving, fixed, initial))
+    def _homography(self, moving: Features, fixed: Features, initial: Homography | None) -> Located | NotLocated:
+        # The second attempt is for level 1, or where the current motion is wrong by more than the search radius.
+        for matches in self._matches(moving, fixed, initial):
+            motion = self._motion(moving, fixed, matches)
             if isinstance(motion, Located):
-                return motion
-        # At level 1, or where the current motion is wrong by more than the search radius.
-        return self._motion(moving, fixed, self._matched_everywhere(moving, fixed))
+                break
+        return motion
+
+    def _matches(self, moving: Features, fixed: Features, initial: Homography | None) -> Iterator[Matches]:
+        if initial is not None:
+            yield _matches_of(moving, fixed, self._matched_nearby(moving, fixed, initial), guided=True)
+        yield _matches_of(moving, fixed, self._matched_everywhere(moving, fixed), guided=False)
 
     def _matcher(self) -> pycolmap.FeatureMatcher:
         options = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
@@ -123,17 +130,20 @@ class TwoViewLocator:
         self._matcher().match_guided(self._config.search_px, *first, *second, geometry)
         return np.asarray(geometry.inlier_matches, np.intp).reshape(-1, 2)
 
-    def _motion(self, moving: Features, fixed: Features, pairs: NDArray[np.intp]) -> Located | NotLocated:
-        """Find the homography that most pairs agree on, and fit it to these."""
-        config = self._config
-        counts = {"keypoints_moving": len(moving.points), "keypoints_fixed": len(fixed.points), "matches": len(pairs)}
+    def _motion(self, moving: Features, fixed: Features, matches: Matches) -> Located | NotLocated:
+        """Find the homography that most matches agree on, and fit it to these."""
+        config, here, there = self._config, matches.moving, matches.fixed
+        counts = {"keypoints_moving": len(moving.points), "keypoints_fixed": len(fixed.points), "matches": len(here)}
         evidence = {name: float(count) for name, count in counts.items()}
-        if len(pairs) < config.min_inliers:
-            return too_few_matches(len(pairs), config, evidence)
-        here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
+        if len(here) < config.min_inliers:
+            return too_few_matches(len(here), config, evidence)
         options = pycolmap.RANSACOptions(max_error=config.threshold_px, max_num_trials=MAX_TRIALS, random_seed=self._seed)
         consensus = pycolmap.estimate_homography_matrix(here, there, options)
         if consensus is None or not consensus["H"][2, 2]:
-            return NotLocated(f"no motion agrees with any of {len(pairs)} matches", evidence)
-        start, sizes = normalised(consensus["H"]), moving.sizes[pairs[:, 0]]
-        return motion_from_points(here, there, start, moving.shape, config, sizes=sizes, evidence=evidence)
+            return NotLocated(f"no motion agrees with any of {len(here)} matches", evidence)
+        start = normalised(consensus["H"])
+        return motion_from_points(here, there, start, moving.shape, config, sizes=matches.sizes, evidence=evidence)
+
+
+def _matches_of(moving: Features, fixed: Features, pairs: NDArray[np.intp], guided: bool) -> Matches:
+    return Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided, moving.sizes[pairs[:, 0]])

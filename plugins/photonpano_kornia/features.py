@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply
-from photonpano.locating import Matches, blur_against_noise, stabilised_8_bit
+from photonpano.locating import Matches, PointLocator, blur_against_noise, stabilised_8_bit
 from photonpano_kornia.configs import KorniaFeaturesConfig
 from photonpano_kornia.consensus import motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
@@ -47,11 +47,11 @@ class SiftFeatures:
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.frames[:, :, :2].astype(np.float64)))))
 
 
-class FeatureLocator:
+class FeatureLocator(PointLocator):
     """Detects keypoints once, matches them, finds a consensus, and fits all inliers."""
 
     def __init__(self, config: KorniaFeaturesConfig, seed: int) -> None:
-        self._config = config
+        self._config: KorniaFeaturesConfig = config
         self._seed = seed
         self._device = device_of(config.device)
 
@@ -73,21 +73,15 @@ class FeatureLocator:
                 frames[0, filled].cpu().numpy(), descriptors[0, filled].half().cpu().numpy(), (mask.shape[0], mask.shape[1])
             )
 
-    def register(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Located | NotLocated:
-        """Match and fit; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when too few keypoints match or agree, when they leave the corners of the
-            frame uncertain, or when no camera moves like that.
-        """
+    def _homography(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Located | NotLocated:
         evidence = {"keypoints_moving": float(len(moving.frames)), "keypoints_fixed": float(len(fixed.frames))}
         with one_thread(), torch.inference_mode():
-            return motion_of(self._attempts(moving, fixed, initial), moving.shape, self._config, self._seed, evidence)
+            return motion_of(self._matches(moving, fixed, initial), moving.shape, self._config, self._seed, evidence)
 
-    def _attempts(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Iterator[Matches]:
-        """Match near the positions that the current motion predicts, then in the whole image."""
+    def _matches(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Iterator[Matches]:
         for guide in [initial, None] if initial is not None else [None]:
-            pairs = self._matched(moving, fixed, guide)
+            with one_thread(), torch.inference_mode():
+                pairs = self._matched(moving, fixed, guide)
             here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
             yield Matches(here, there, guide is not None, moving.sizes[pairs[:, 0]])
 

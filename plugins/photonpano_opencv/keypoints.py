@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonpano import Homography, Located, NotLocated
 from photonpano.geometry import apply, why_implausible
-from photonpano.locating import KeypointConfig, Matches, consensus_of, motion_from_points
+from photonpano.locating import KeypointConfig, Matches, PointLocator, consensus_of, motion_from_points
 from photonpano_opencv.matching import match_everywhere, match_nearby
 
 GUIDED_RADII = (1.5, 1.0)
@@ -59,7 +59,7 @@ def detected(
     )
 
 
-class KeypointMatcher:
+class KeypointMatcher(PointLocator):
     """Matches keypoints with the ratio test, finds a consensus, and fits all inliers."""
 
     def __init__(
@@ -79,38 +79,32 @@ class KeypointMatcher:
             ratio: Lowe's ratio for the distances of these vectors.
             rounding_px: standard deviation of an error common to all matches.
         """
-        self._config = config
+        self._config: KeypointConfig = config
         self._seed = seed
         self._as_unit_vectors = as_unit_vectors
         self._ratio = ratio
         self._rounding_px = rounding_px
 
-    def register(self, moving: Keypoints, fixed: Keypoints, initial: Homography | None) -> Located | NotLocated:
-        """Match and fit; see `photonpano.Locator`.
+    def _matches(self, moving: Keypoints, fixed: Keypoints, initial: Homography | None) -> Iterator[Matches]:
+        descriptors = self._descriptors(moving, fixed)
+        if initial is not None:
+            predicted = apply(initial, moving.points)
+            pairs = match_nearby(*descriptors, predicted, fixed.points, self._config.search_px, self._ratio)
+            yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=True)
+        pairs = match_everywhere(*descriptors, self._ratio)
+        yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=False)
 
-        Returns:
-            `NotLocated` with the numbers that decided when too few keypoints match or agree, when they leave the corners of the
-            frame uncertain, or when no camera moves like that.
-        """
+    def _homography(self, moving: Keypoints, fixed: Keypoints, initial: Homography | None) -> Located | NotLocated:
         config = self._config
         evidence = {"keypoints_moving": float(len(moving.points)), "keypoints_fixed": float(len(fixed.points))}
-        descriptors = self._as_unit_vectors(moving.descriptors), self._as_unit_vectors(fixed.descriptors)
-
-        def attempts() -> Iterator[Matches]:
-            if initial is not None:
-                predicted = apply(initial, moving.points)
-                pairs = match_nearby(*descriptors, predicted, fixed.points, config.search_px, self._ratio)
-                yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=True)
-            pairs = match_everywhere(*descriptors, self._ratio)
-            yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=False)
-
-        consensus = consensus_of(attempts(), self._estimate, config, evidence)
+        consensus = consensus_of(self._matches(moving, fixed, initial), self._estimate, config, evidence)
         if isinstance(consensus, NotLocated):
             return consensus
         matches, homography, evidence = consensus
         if reason := why_implausible(homography, moving.shape):
             return NotLocated(f"{reason}, from {len(matches.moving)} matches", evidence)
         motion: Located | NotLocated
+        descriptors = self._descriptors(moving, fixed)
         for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
             limits = config.model_copy(update={"threshold_px": radius * config.threshold_px, "max_std_px": max_std_px})
             predicted = apply(homography, moving.points)
@@ -132,6 +126,9 @@ class KeypointMatcher:
                 break
             homography = motion.homography
         return motion
+
+    def _descriptors(self, moving: Keypoints, fixed: Keypoints) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self._as_unit_vectors(moving.descriptors), self._as_unit_vectors(fixed.descriptors)
 
     def _estimate(self, moving: NDArray[np.floating], fixed: NDArray[np.floating]) -> Homography | None:
         """Return the homography that most matches agree on (MAGSAC++)."""

@@ -21,10 +21,12 @@ from .fitting import fit_homography as fit_homography
 from .following import Follows as Follows
 from .following import follows as follows
 from .images import motion_from_images as motion_from_images
+from .matched_turns import turn_of as turn_of
 from .phase import correlation_peaks as correlation_peaks
 from .phase import correlation_surface as correlation_surface
 from .phase import shift_between as shift_between
 from .phase import shift_by_phase as shift_by_phase
+from .point_locator import PointLocator as PointLocator
 from .points import Matches as Matches
 from .points import consensus_of as consensus_of
 from .points import motion_from_points as motion_from_points

@@ -48,7 +48,12 @@ class PointLimits(Config):
     threshold_px: float = Field(
         2.0, gt=0, le=50, description="a match is an inlier if it lies within this distance of the motion"
     )
-    min_inliers: int = Field(12, ge=5, description="a pair with fewer inliers is rejected")
+    min_inliers: int = Field(
+        12,
+        ge=5,
+        description="a pair with fewer inliers is rejected; for the rotation of a camera that turns, three eighths of them "
+        "suffice",
+    )
     max_std_px: float = Field(
         10.0,
         gt=0,

@@ -1,0 +1,192 @@
+"""From matched points to the rotation of a camera that only turns: three numbers, where matches do not determine eight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonpano.geometry import Camera, apply, jacobian, normalised, rotation_matrices, why_implausible
+from photonpano.locating.agreement import agreeing_by_chance, distinct, rotation_of_most
+from photonpano.locating.configs import MatchingConfig
+from photonpano.locating.fitting import MIN_NOISE_PX
+from photonpano.locating.points import Matches
+from photonpano.locating.turns import information_on_turn, turn_slopes
+from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated
+
+_SCATTER = 2.0
+"""Keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`."""
+_LEAST_SHARE = 0.2
+_LEAST_SPREAD = 0.1
+"""Objects that look alike match and agree with each other in different scenes as well. So this share of the matches must agree,
+and they must be spread: in all directions, their standard deviation is at least this share of the shorter side of the image."""
+_ITERATIONS = 10
+"""Steps of reweighted least squares; the last ones change the rotation by far less than its error."""
+
+
+def turn_of(
+    attempts: Iterable[Matches],
+    shape: tuple[int, int],
+    limits: MatchingConfig,
+    camera_matrix: FloatArray,
+    evidence: Mapping[str, float] | None = None,
+    rounding_px: float = 0.0,
+) -> Located | NotLocated:
+    """Return the rotation on which the first matches agree beyond chance, fitted to them. Raises nothing.
+
+    Convention:
+        The map takes pixels of the moving image to pixels of the fixed one; points are (x, y), integers are pixel centres.
+
+    Args:
+        attempts: at least one set of matches; a later one is computed only if those before it fail.
+        shape: (height, width) of both images.
+        limits: thresholds of acceptance. A rotation needs three eighths of `min_inliers`, which a homography needs.
+        camera_matrix: (3, 3) K, in px of the images; the lens does not distort.
+        evidence: counts of the backend, for the record.
+        rounding_px: standard deviation of an error common to all matches, as where keypoints lie on whole pixels.
+
+    Returns:
+        `Located` with K R K^-1 of the rotation R, information on its three unknowns alone, and the evidence
+        `degrees_of_freedom` 3; `NotLocated` with the reason why the last matches fail if all of them do.
+    """
+    for matches in attempts:
+        motion = _turn(matches, shape, limits, Camera(camera_matrix), dict(evidence or {}), rounding_px)
+        if isinstance(motion, Located):
+            break
+    return motion
+
+
+def _turn(
+    matches: Matches,
+    shape: tuple[int, int],
+    limits: MatchingConfig,
+    camera: Camera,
+    found: dict[str, float],
+    rounding_px: float,
+) -> Located | NotLocated:
+    """Return the rotation on which some matches agree; see `turn_of`. The evidence is added to `found`."""
+    threshold_px = _SCATTER * limits.threshold_px
+    moving, fixed = (np.asarray(each, np.float64) for each in (matches.moving, matches.fixed))
+    kept = distinct(moving, fixed, threshold_px)
+    moving, fixed, count = moving[kept], fixed[kept], int(kept.sum())
+    found |= {"matches": float(count), "degrees_of_freedom": 3.0}
+    least = max(5, math.ceil(limits.min_inliers * 3 / 8))
+    if count < least:
+        return NotLocated(f"{count} matches, and a rotation needs {least}", found)
+    start = rotation_of_most(moving, fixed, camera, threshold_px)
+    if start is None:
+        return NotLocated(f"no rotation agrees with any of {count} matches", found)
+    if reason := why_implausible(start, shape):
+        return NotLocated(f"{reason}, from {count} matches", found)
+    fit = _fit(moving, fixed, normalised(start), camera, threshold_px)
+    inliers = int(np.count_nonzero(fit.agrees))
+    found["inliers"] = float(inliers)
+    search_px = limits.search_px if matches.guided else np.inf
+    by_chance = agreeing_by_chance(moving, fixed, fit.homography, threshold_px, search_px)
+    by_chance = max(by_chance, math.floor(_LEAST_SHARE * count), least - 1)
+    if inliers <= by_chance:
+        return NotLocated(f"{inliers} of {count} matches agree, which may be chance (more than {by_chance} must)", found)
+    spread_px = math.sqrt(max(0.0, float(np.linalg.eigvalsh(np.cov(moving[fit.agrees].T))[0])))
+    if spread_px < _LEAST_SPREAD * min(shape):
+        return NotLocated(
+            f"{inliers} matches agree, but lie in a spot or strip of {spread_px:.0f} px "
+            f"(at least {_LEAST_SPREAD * min(shape):.0f} px are needed)",
+            found,
+        )
+    try:
+        information, std_px = information_on_turn(fit.information, fit.homography, camera.matrix, shape)
+    except np.linalg.LinAlgError:
+        information, std_px = fit.information, np.inf
+    if not std_px <= limits.max_std_px:
+        return NotLocated(
+            f"{inliers} matches leave the corners of the frame uncertain by {std_px:.1f} px, "
+            f"more than max_std_px = {limits.max_std_px:g}",
+            found,
+        )
+    if reason := why_implausible(fit.homography, shape):
+        return NotLocated(f"{reason}, from {inliers} matches", found)
+    # (information^-1 + shifts)^-1: a common error of all matches shifts the motion.
+    shifts = np.diag([0, 0, 0, 0, rounding_px**2, rounding_px**2, 0, 0])
+    information = information @ np.linalg.inv(np.eye(8) + shifts @ information)
+    return Located(fit.homography, information, fit.residual_px, found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """A rotation fitted to matches.
+
+    Attributes:
+        homography: (3, 3), moving to fixed.
+        agrees: (N,) which matches agree.
+        residual_px: standard deviation of a coordinate of their residuals, in px.
+        information: (8, 8) inverse covariance of p1..p8, as if all were estimated.
+    """
+
+    homography: Homography
+    agrees: BoolArray
+    residual_px: float
+    information: FloatArray
+
+
+def _fit(moving: FloatArray, fixed: FloatArray, start: Homography, camera: Camera, threshold_px: float) -> _Fit:
+    """Fit a rotation to the matches that agree with it, by least squares with the soft L1 loss.
+
+    Args:
+        moving: (N, 2) points of the moving image.
+        fixed: (N, 2) their partners.
+        start: (3, 3) of the initial rotation.
+        camera: without distortion.
+        threshold_px: distance within which a match agrees.
+    """
+    homography = start
+    for _ in range(_ITERATIONS):
+        agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
+        root = np.sqrt(_weights(residuals, scale))[:, None]
+        slopes = jacobian(homography, moving[agrees]) @ turn_slopes(homography, camera.matrix)
+        step = np.linalg.lstsq((slopes * root[..., None]).reshape(-1, 3), -(residuals * root).ravel(), rcond=None)[0]
+        homography = normalised(homography @ camera.homographies(rotation_matrices(step)))
+    agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
+    slopes = jacobian(homography, moving[agrees]).reshape(-1, 8)
+    residual_px = float(np.sqrt((residuals**2).sum() / max(1, residuals.size - 3)))
+    each = _information(np.linalg.norm(apply(homography, moving) - fixed, axis=1), scale, threshold_px)
+    return _Fit(homography, agrees, residual_px, slopes.T @ slopes * each)
+
+
+def _residuals(
+    moving: FloatArray, fixed: FloatArray, homography: Homography, threshold_px: float
+) -> tuple[BoolArray, FloatArray, float]:
+    """Return which matches agree, their (M, 2) residuals, and the robust standard deviation of these."""
+    residuals = apply(homography, moving) - fixed
+    agrees = np.linalg.norm(residuals, axis=1) < threshold_px
+    residuals = residuals[agrees]
+    spread = 1.4826 * float(np.median(np.abs(residuals))) if residuals.size else 0.0
+    return agrees, residuals, max(spread, MIN_NOISE_PX)
+
+
+def _weights(residuals: FloatArray, scale: float) -> FloatArray:
+    """Return the weights of the soft L1 loss of (..., 2) residuals: (...)."""
+    return np.asarray(1 / np.sqrt(1 + (residuals**2).sum(axis=-1) / scale**2))
+
+
+def _information(lengths: FloatArray, scale: float, threshold_px: float) -> float:
+    """Return the information of a match on each coordinate of its position, in px^-2: that of an M-estimator (Huber 1981).
+
+    A match beyond the threshold has no influence. So a shift of the fit gains matches on one side and loses them on the other,
+    which cancels what the others say where matches are spread evenly, as chance spreads them.
+
+    Args:
+        lengths: (N,) of the residuals of all matches, the same in all directions.
+        scale: of the loss, in px.
+        threshold_px: distance within which a match agrees.
+    """
+    inner = lengths[lengths < threshold_px]
+    if not len(inner):
+        return 0.0
+    # The ring has the area of the circle within the threshold. One match more keeps few matches from seeming exact.
+    ring = 1 + np.count_nonzero((lengths > threshold_px * np.sqrt(0.5)) & (lengths < threshold_px * np.sqrt(1.5)))
+    weights = 1 / np.sqrt(1 + (inner / scale) ** 2)
+    slope = (weights - weights**3 * (inner / scale) ** 2 / 2).sum() - ring / np.sqrt(1 + (threshold_px / scale) ** 2)
+    square = ((weights * inner) ** 2 + MIN_NOISE_PX**2).sum() / max(1, 2 * len(inner) - 3)
+    return float(max(slope, 0.0) / len(inner)) ** 2 / float(square)

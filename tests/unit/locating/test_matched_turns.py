@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binom
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import Camera, apply, corner_displacements, parameters, rotation_matrices, scaled_ahead
+from photonpano.locating import Matches, MatchingConfig, turn_of
+from photonpano.locating.agreement import agreeing_by_chance, distinct, rotation_of_most
+
+SHAPE = (160, 240)
+CAMERA = Camera.of(300.0, SHAPE)
+TRUE = scaled_ahead(CAMERA.homographies(rotation_matrices([0.03, -0.1, 0.05])))
+LIMITS = MatchingConfig()
+
+
+def matches(right: int, wrong: int = 0, std_px: float = 0.5, seed: int = 0, guided: bool = False) -> Matches:
+    """Right matches that turn by TRUE, then wrong ones: within `search_px` of it if guided, else anywhere."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((0, 0), (239, 159), (right + wrong, 2))
+    moved = apply(TRUE, points) + rng.normal(0, std_px, points.shape)
+    if guided:
+        angles, radii = rng.uniform(0, 2 * np.pi, wrong), LIMITS.search_px * np.sqrt(rng.uniform(0, 1, wrong))
+        moved[right:] = apply(TRUE, points[right:]) + (radii * [np.cos(angles), np.sin(angles)]).T
+    else:
+        moved[right:] = rng.uniform((0, 0), (239, 159), (wrong, 2))
+    return Matches(points, moved, guided)
+
+
+def turn(*attempts: Matches, focal_px: float = 300.0) -> Located | NotLocated:
+    return turn_of(attempts, SHAPE, LIMITS, Camera.of(focal_px, SHAPE).matrix)
+
+
+def located(motion: Located | NotLocated) -> Located:
+    assert isinstance(motion, Located), motion
+    return motion
+
+
+def reason(motion: Located | NotLocated) -> str:
+    assert isinstance(motion, NotLocated)
+    return motion.reason
+
+
+def error_px(motion: Located | NotLocated) -> float:
+    return float(corner_displacements(located(motion).homography, TRUE, SHAPE).max())
+
+
+def chi_squared(motion: Located | NotLocated) -> float:
+    error = parameters(located(motion).homography) - parameters(TRUE)
+    return float(error @ located(motion).information @ error)
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_rotation_is_found_among_wrong_matches(guided: bool) -> None:
+    """A homography needs more than 10 of 20 matches in the whole image, and more than 15 of 26 near a prediction."""
+    motion = located(turn(matches(14, 12, guided=True) if guided else matches(9, 11)))
+    assert error_px(motion) < 3
+    assert motion.homography[2, 2] == 1
+    assert motion.evidence["degrees_of_freedom"] == 3
+    assert motion.evidence["inliers"] >= (14 if guided else 9)
+    turned = CAMERA.rotations(motion.homography)
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("focal_px", [300.0, 315.0], ids=["right", "5 % too long"])
+@pytest.mark.parametrize(
+    ("right", "wrong", "std_px", "guided"), [(12, 5, 0.5, False), (60, 0, 1.0, False), (40, 80, 1.5, True)], ids=str
+)
+def test_information_predicts_scatter(right: int, wrong: int, std_px: float, guided: bool, focal_px: float) -> None:
+    """Over 24 fits chi squared of three unknowns has the mean 3, also if a wrong focal length bends the motion by some px."""
+    found = [chi_squared(turn(matches(right, wrong, std_px, seed, guided), focal_px=focal_px)) for seed in range(24)]
+    assert 1.5 < np.mean(found) < 4.5
+
+
+def test_information_is_that_of_three_unknowns() -> None:
+    values = np.linalg.eigvalsh(located(turn(matches(30))).information)
+    assert np.linalg.matrix_rank(located(turn(matches(30))).information, tol=1e-3 * values[-1], hermitian=True) <= 3
+    assert values[0] > 0
+
+
+def test_more_wrong_matches_nearby_tell_less() -> None:
+    alone, among = (located(turn(matches(40, wrong, 1.5, guided=True))) for wrong in (0, 160))
+    basis = np.linalg.eigh(alone.information)[1][:, -1]
+    assert basis @ among.information @ basis < 0.9 * (basis @ alone.information @ basis)
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_wrong_matches_alone_are_rejected(guided: bool) -> None:
+    for seed in range(40):
+        motion = turn(matches(0, [6, 12, 40, 150][seed % 4], seed=seed, guided=guided))
+        assert isinstance(motion, NotLocated), (seed, motion)
+
+
+def test_number_of_matches_that_may_be_chance_is_in_reason() -> None:
+    found = turn(matches(0, 40, seed=1))
+    agreeing = found.evidence["inliers"]
+    assert reason(found) == f"{agreeing:.0f} of 40 matches agree, which may be chance (more than 8 must)"
+
+
+def test_too_few_matches_are_rejected() -> None:
+    assert reason(turn(matches(4))) == "4 matches, and a rotation needs 5"
+
+
+def test_one_structure_that_matches_often_counts_once() -> None:
+    once = matches(4)
+    jitter = np.random.default_rng(0).normal(0, 0.5, (20, 1, 2))
+    often = Matches((once.moving + jitter).reshape(-1, 2), (once.fixed + jitter).reshape(-1, 2), guided=False)
+    assert reason(turn(often)) == "4 matches, and a rotation needs 5"
+
+
+def test_matches_in_a_spot_or_strip_are_rejected() -> None:
+    """As those of an object that looks like another one; a strip is as good as no second direction."""
+    every = matches(400)
+    strip = np.abs(every.moving[:, 1] - 80) < 20
+    found = turn(Matches(every.moving[strip], every.fixed[strip], guided=False))
+    assert reason(found).endswith("matches agree, but lie in a spot or strip of 12 px (at least 16 px are needed)")
+
+
+def test_implausible_rotation_is_rejected() -> None:
+    points = np.random.default_rng(0).uniform((150, 0), (239, 159), (40, 2))
+    far = scaled_ahead(CAMERA.homographies(rotation_matrices([0.0, -0.6, 0.0])))
+    found = reason(turn(Matches(points, apply(far, points), guided=False)))
+    assert found == "the homography changes the area of the image by a factor of 2.1 (at most 2 is plausible), from 39 matches"
+
+
+def test_second_attempt_counts_if_first_fails() -> None:
+    assert error_px(turn(matches(0, 30, guided=True), matches(20))) < 2
+    assert reason(turn(matches(0, 30, guided=True), matches(3))) == "3 matches, and a rotation needs 5"
+
+
+@settings(deadline=None, max_examples=50)
+@given(right=st.integers(0, 20), wrong=st.integers(0, 20), seed=st.integers(0, 2**32 - 1), spot=st.booleans())
+def test_turn_of_never_raises(right: int, wrong: int, seed: int, spot: bool) -> None:
+    found = matches(right, wrong, seed=seed)
+    if spot:
+        found.moving[:] = found.moving[:1]
+    motion = turn(found)
+    if isinstance(motion, Located):
+        np.linalg.cholesky(motion.information)
+    assert not (spot and isinstance(motion, Located))
+
+
+def test_rotation_of_most_is_exact_without_errors() -> None:
+    every = matches(200, 200, std_px=0.0)
+    found = rotation_of_most(every.moving, every.fixed, CAMERA, 4.0)
+    assert found is not None
+    np.testing.assert_allclose(scaled_ahead(found), TRUE, atol=1e-6)
+
+
+def test_no_two_close_matches_determine_a_rotation() -> None:
+    assert rotation_of_most(np.eye(2), np.eye(2), CAMERA, 4.0) is None
+
+
+def test_agreeing_by_chance_bounds_expected_number_of_rotations() -> None:
+    """Among 40 matches, within 4 px of a search of 12 px: a ninth of the other 38 agree with each of 780 rotations."""
+    every = matches(0, 40, guided=True)
+    most = agreeing_by_chance(every.moving, every.fixed, TRUE, 4.0, 12.0)
+    number, share = 40 * 39 / 2, 1 / 9
+    assert number * binom.sf(most - 2, 38, share) < 1e-4 <= number * binom.sf(most - 3, 38, share)
+
+
+def test_more_agree_by_chance_where_keypoints_cluster() -> None:
+    every = matches(40)
+    clustered = Matches(100 + every.moving / 10, 100 + every.fixed / 10, guided=False)
+    wide, narrow = (agreeing_by_chance(each.moving, each.fixed, np.eye(3), 4.0, np.inf) for each in (every, clustered))
+    assert wide < 8 < narrow
+
+
+def test_distinct_keeps_first_of_those_that_are_near_in_both_images() -> None:
+    moving, fixed = np.array([[0, 0], [1, 0], [1, 0], [50, 0]], float), np.array([[0, 0], [0, 1], [90, 0], [50, 0]], float)
+    assert distinct(moving, fixed, 4.0).tolist() == [True, False, True, True]
+    assert distinct(np.zeros((0, 2)), np.zeros((0, 2)), 4.0).tolist() == []
