@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 from photonpano import InputError, SourceContribution, hookimpl
 from photonpano.reading import missing_file
 from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig
+from photonpano_simulator.travel.config import TravelConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from photonpano import SourceContext
     from photonpano_simulator.source import SimulatorSource
+    from photonpano_simulator.travel.source import TravelSource
 
 _CHECKED_FRAMES = 5000
 """Frames of a path that are checked before a run, to find out whether it leaves the scene."""
@@ -38,7 +40,7 @@ def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
         files.append(config.path.file)
     problems = [missing_file(file) for file in files if file is not None and not file.is_file()]
     try:
-        delivered(config)
+        delivered(config.n_frames, config.drops, config.repeats)
     except InputError as error:
         problems.append(str(error))
     if not isinstance(config.scene, PhotoScene) and not isinstance(config.path, FilePath):
@@ -52,6 +54,23 @@ def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
         except InputError as error:
             problems.append(str(error))
     return problems
+
+
+def _build_travel(config: TravelConfig, context: SourceContext) -> TravelSource:
+    from photonpano_simulator.travel.source import TravelSource
+
+    return TravelSource(config, context)
+
+
+def _check_travel(config: TravelConfig) -> Sequence[str]:
+    """Look for missing files; then for wrong ranges of frames, and for a path that leaves the scene or runs into something."""
+    files = [config.sensor.dark_rates, config.sensor.hot_pixels, config.scene.photo]
+    problems = [missing_file(file) for file in files if file is not None and not file.is_file()]
+    if problems:
+        return problems
+    from photonpano_simulator.travel.source import problems_of
+
+    return problems_of(config)
 
 
 @hookimpl
@@ -70,4 +89,11 @@ def photonpano_sources() -> Iterator[SourceContribution]:
         config=CameraSimulatorConfig,
         build=_build,
         check=_check,
+    )
+    yield SourceContribution(
+        name="travel-simulator",
+        summary="A simulated single-photon camera that travels through a scene with depth",
+        config=TravelConfig,
+        build=_build_travel,
+        check=_check_travel,
     )

@@ -34,7 +34,7 @@ class DrawnObject:
         middle = np.array(config.at) * (width, height) - 0.5
         centres = middle + elapsed * config.moves_px + config.follows * (scene_motion - scene_motion[begin])
         self._corners = centres - self._size / 2
-        self._texture = _texture(self._size, config.seed) * np.float32(flux * config.flux)
+        self._texture = texture_of(self._size, config.seed) * np.float32(flux * config.flux)
 
     def draw(self, view: NDArray[np.float32], frame: int) -> None:
         """Replace the flux of the pixels, or of the parts of pixels, that it covers in a frame; `view` is (H, W)."""
@@ -55,8 +55,8 @@ def _covered(start: float, length: float, n_pixels: int) -> FloatArray:
     return np.asarray(np.clip(np.minimum(pixels + 0.5, start + length) - np.maximum(pixels - 0.5, start), 0, 1))
 
 
-def _texture(size: FloatArray, seed: int) -> NDArray[np.float32]:
-    """Return an image of mean 1 with detail from fine to coarse."""
+def texture_of(size: FloatArray, seed: int) -> NDArray[np.float32]:
+    """Return an image of mean 1 with detail from fine to coarse; `size` is (width, height) in px."""
     width, height = np.maximum(1, np.ceil(size)).astype(int)
     noise = generator(seed, Draw.TEXTURE).standard_normal((height, width), np.float32)
     layers = [sigma * cv2.GaussianBlur(noise, (0, 0), sigma) for sigma in _DETAIL_PX]

@@ -38,7 +38,7 @@ def scene_flux(
         InputError: the photograph cannot be used.
     """
     if isinstance(scene, PhotoScene):
-        linear = _photo(scene.file, scene.width, in_colour)
+        linear = photograph(scene.file, scene.width, in_colour)
     else:
         overlap = max(2, scene.width // _OVERLAP) if is_round else 0
         linear = _drawing(scene, (scene.height, scene.width + overlap), in_colour)
@@ -68,8 +68,17 @@ def _joined(linear: NDArray[np.float32], overlap: int) -> NDArray[np.float32]:
     return joined
 
 
-def _photo(path: Path, width: int | None, in_colour: bool) -> NDArray[np.float32]:
-    """Return the linear luminance of a photograph, from 0 to 1; or its linear red, green and blue, (H, W, 3)."""
+def photograph(path: Path, width: int | None = None, in_colour: bool = False) -> NDArray[np.float32]:
+    """Return the linear luminance of a photograph, from 0 to 1; or its linear red, green and blue, (H, W, 3).
+
+    Args:
+        path: the image file.
+        width: to which it is resized, in px; None keeps it.
+        in_colour: whether to return red, green and blue.
+
+    Raises:
+        InputError: the file is no image of 8 or 16 bits, or it is too large.
+    """
     otherwise = "is not an image that OpenCV reads; save it as PNG or JPEG"
     look_first(path, "cv2:imread")
     image = read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)

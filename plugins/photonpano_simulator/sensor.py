@@ -28,6 +28,8 @@ class Draw(IntEnum):
     GAINS = 4
     DIRT = 5
     TEXTURE = 6
+    SCENE = 7
+    GAZE = 8
 
 
 def generator(seed: int, draw: Draw, index: int = 0) -> np.random.Generator:

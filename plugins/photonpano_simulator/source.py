@@ -40,7 +40,7 @@ class SimulatorSource(Closing):
         self._homographies = camera_path(config, (height, width), self._seed)
         self._config, self._views = config, Views(config)
         self._averages = self._views.averaged(self._scene)
-        self._taken = delivered(config)
+        self._taken = delivered(config.n_frames, config.drops, config.repeats)
         motion = (
             scene_motion(self._homographies, config.frame_shape, config.path)
             if config.objects

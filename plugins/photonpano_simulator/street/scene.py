@@ -30,21 +30,30 @@ def street(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     sky(p)
     skyline(p)
     shops = p.rng.permutation(len(SHOPS))
-    x, index = -p.between(10, 120), 0
+    left = -p.between(10, 120)
     pavement(p)
-    corners = []
-    while x < p.width:
-        width = p.between(300, 430)
-        house(p, x, width, SHOPS[shops[index % len(SHOPS)]])
-        x, index = x + width, index + 1
-        corners.append(x)
-    for corner in corners:
+    for corner in houses(p, shops, left):
         lamp(p, corner)
     bunting(p)
     everything = (0.0, 0.0, p.width, p.height)
     p.grain(everything, 0.03, 220)
     p.grain(everything, 0.025, 2)
     return p.finished()
+
+
+def houses(p: Painter, shops: NDArray[np.int64], left: float) -> list[float]:
+    """Draw a row of houses with these shops, from `left` on.
+
+    Returns:
+        Where each house ends.
+    """
+    x, corners = left, list[float]()
+    while x < p.width:
+        width = p.between(300, 430)
+        house(p, x, width, SHOPS[shops[len(corners) % len(SHOPS)]])
+        x += width
+        corners.append(x)
+    return corners
 
 
 def sky(p: Painter) -> None:

@@ -47,3 +47,24 @@ class TestConventionalCamera(SourceConformance):
 
 class TestConventionalCameraOf12Bits(TestConventionalCamera):
     config = {**TestConventionalCamera.config, "sensor": {"bits": 12}}
+
+
+class TestTravelSimulator(SourceConformance):
+    contribution = CATALOG.find("source", "travel-simulator").contribution
+    config = {
+        "scene": {"kind": "planes"},
+        "path": {"kind": "travel", "length_m": 0.3, "tremor": {"rms_px": 1}},
+        "objects": [{"shape": "disc", "moves_px": [0.2, 0]}],
+        "n_frames": 60,
+        "frame_shape": [40, 52],
+        "focal_px": 40,
+        "drops": [{"at": 20, "frames": 5}],
+        "sensor": {"hot_fraction": 0.01, "mask_hot_pixels": True},
+    }
+    wrong = (
+        {"scene": {"kind": "room", "photo": "there-is-no-such-file.png"}},
+        {"path": {"kind": "travel", "length_m": 40}},
+        {"path": {"kind": "turn-only", "degrees": 200}},
+        {"drops": [{"at": 50, "frames": 20}]},
+        {"sensor": {"hot_pixels": "there-is-no-such-file.npy"}},
+    )

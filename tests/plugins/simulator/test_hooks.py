@@ -12,7 +12,7 @@ from photonpano import FrameSpan, SourceContext
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 
-SIMULATOR, CAMERA = photonpano_sources()
+SIMULATOR, CAMERA, _ = photonpano_sources()
 
 
 def problems(**settings: Any) -> list[str]:

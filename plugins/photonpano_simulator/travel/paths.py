@@ -1,0 +1,165 @@
+"""Paths of a camera with six degrees of freedom.
+
+Convention:
+    Points of the world are (x, y, z) in m: x right, y down, z ahead. A pose (3, 4) maps them to points of the camera,
+    X_c = R X_w + t, with the same axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from photonpano import FloatArray, InputError
+from photonpano.geometry import Camera, camera_matrix, rotation_matrices
+from photonpano_simulator.paths import sums_of_sines
+from photonpano_simulator.sensor import Draw, generator
+from photonpano_simulator.travel.config import TravelConfig, TravelPath
+from photonpano_simulator.travel.planes import Planes, trace
+
+_DENSE = 20_000
+"""Points of a path from which its length is measured."""
+_CHECKED = 2000
+"""Frames at which a path is checked, at most."""
+_LOOKED = 60
+"""Frames of which it is checked that they see the scene everywhere, at most."""
+_GRID = 9
+"""Points along each side of such a frame."""
+_REACH = (1.0, 0.45, 0.6)
+"""How far a random path reaches along x, y and z, relative to each other."""
+
+
+def matrix_of(config: TravelConfig) -> FloatArray:
+    """Return K, (3, 3)."""
+    if config.centre_px is None:
+        return Camera.of(config.focal_px, config.frame_shape).matrix
+    return camera_matrix(config.focal_px, config.centre_px)
+
+
+def poses_of(config: TravelConfig, middle: FloatArray, seed: int) -> FloatArray:
+    """Return the poses of all frames: (T, 3, 4).
+
+    Args:
+        config: of the simulation.
+        middle: (3,), where the camera looks by default, in m.
+        seed: of the tremor.
+
+    Raises:
+        InputError: the camera is to look at the point where it is, or straight up or down.
+    """
+    path, n_frames = config.path, config.n_frames
+    target = middle if path.look_at is None else np.array(path.look_at)
+    progress = np.linspace(0, 1, n_frames)
+    if isinstance(path, TravelPath):
+        positions, turns = _travel(path, progress)
+        rotations = rotation_matrices(turns) @ _looking(positions, target)
+    else:
+        positions = np.broadcast_to(np.array(path.centre), (n_frames, 3))
+        yaw = np.deg2rad(path.degrees) * (progress - 0.5)
+        about_the_vertical = rotation_matrices(np.stack([0 * yaw, -yaw, 0 * yaw], axis=1))
+        rotations = _looking(positions[:1], target) @ about_the_vertical
+    if path.tremor is not None:
+        tremor = path.tremor
+        sines = sums_of_sines(6, tremor.frequencies_hz, n_frames, config.frame_rate_hz, generator(seed, Draw.SHAKE)).T
+        small = np.array([*2 * [tremor.rms_px / config.focal_px], np.deg2rad(tremor.roll_rms_deg)])
+        rotations = rotation_matrices(small * sines[:, :3]) @ rotations
+        positions = positions + tremor.rms_mm / 1000 * sines[:, 3:]
+    return np.concatenate([rotations, -rotations @ positions[:, :, None]], axis=2)
+
+
+def centres(poses: FloatArray) -> FloatArray:
+    """Return where the camera is: (T, 3) in m."""
+    return np.asarray(-np.swapaxes(poses[:, :, :3], 1, 2) @ poses[:, :, 3:])[:, :, 0]
+
+
+def require_free(poses: FloatArray, matrix: FloatArray, frame_shape: tuple[int, int], planes: Planes, room: FloatArray) -> None:
+    """Require that the camera stays in the scene, passes through no surface, and sees nothing but the scene.
+
+    Args:
+        poses: (T, 3, 4).
+        matrix: (3, 3), K.
+        frame_shape: (height, width).
+        planes: of the scene, without those that move.
+        room: (2, 3), the smallest and the largest coordinates that the camera may have, in m.
+
+    Raises:
+        InputError: it does not.
+    """
+    last = len(poses) - 1
+    frames = np.unique(np.linspace(0, last, min(len(poses), _CHECKED)).astype(int))
+    at = centres(poses[frames])
+    outside = np.flatnonzero(((at < room[0]) | (at > room[1])).any(axis=1))
+    if outside.size:
+        low, high = (", ".join(f"{each:g}" for each in corner) for corner in room)
+        raise InputError(
+            f"the camera leaves the scene: it is at {_point(at[outside[0]])} in frame {frames[outside[0]]}, and may be between "
+            f"({low}) and ({high}) m; move path.centre, or shorten the path"
+        )
+    crossed = _first_crossing(at, planes)
+    if crossed is not None:
+        place, point = crossed
+        raise InputError(
+            f"the path of the camera passes through a surface of the scene at {_point(point)}, "
+            f"{place / max(1, len(at) - 1):.0%} of the way along; move path.centre, or shorten path.length_m"
+        )
+    height, width = frame_shape
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID)), axis=-1).reshape(-1, 2)
+    owner, inverse_depth = np.empty(len(grid), np.int32), np.empty(len(grid))
+    for frame in np.unique(np.linspace(0, last, min(len(poses), _LOOKED)).astype(int)):
+        trace(grid, planes.maps(poses[frame], matrix, 0.0), planes.radii, owner, inverse_depth)
+        if (owner < 0).any():
+            x, y = grid[owner < 0][0]
+            raise InputError(
+                f"frame {frame} sees past the end of the scene: there is nothing at its pixel ({x:.0f}, {y:.0f}); move "
+                "path.look_at to the middle of the scene, or turn by less"
+            )
+
+
+def _point(point: FloatArray) -> str:
+    return f"({', '.join(f'{each:.2f}' for each in point)}) m"
+
+
+def _first_crossing(at: FloatArray, planes: Planes) -> tuple[int, FloatArray] | None:
+    """Return the first step of a way (N, 3) that passes through a plane, and where; None if no step does."""
+    found: tuple[int, FloatArray] | None = None
+    start, way = at[:-1], np.diff(at, axis=0)
+    for corner, along, down in zip(planes.corner, planes.along, planes.down, strict=True):
+        to_plane = np.linalg.inv(np.stack([along, down, np.cross(along, down)], axis=1))
+        begin, step = (start - corner) @ to_plane.T, way @ to_plane.T
+        crosses = (begin[:, 2] > 0) != (begin[:, 2] + step[:, 2] > 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(crosses, -begin[:, 2] / step[:, 2], 0.0)
+        places = begin[:, :2] + share[:, None] * step[:, :2]
+        hits = np.flatnonzero(crosses & (places >= 0).all(axis=1) & (places <= 1).all(axis=1))
+        if hits.size and (found is None or hits[0] < found[0]):
+            found = int(hits[0]), start[hits[0]] + share[hits[0]] * way[hits[0]]
+    return found
+
+
+def _travel(path: TravelPath, progress: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return positions, (T, 3) in m, and rotation vectors of the wandering gaze, (T, 3)."""
+    from scipy.interpolate import CubicSpline
+
+    times = np.linspace(0, 1, path.knots)
+    dense = np.linspace(0, 1, _DENSE)
+    places = CubicSpline(times, generator(path.seed, Draw.PATH).uniform(-1, 1, (path.knots, 3)) * _REACH, bc_type="natural")
+    way = places(dense)
+    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+    middle = (way.min(axis=0) + way.max(axis=0)) / 2
+    gaze = CubicSpline(times, generator(path.seed, Draw.GAZE).uniform(-1, 1, (path.knots, 3)), bc_type="natural")
+    turns = np.deg2rad(path.wander_deg) * gaze(progress)
+    return np.array(path.centre) + (places(progress) - middle) * (path.length_m / length), turns
+
+
+def _looking(positions: FloatArray, target: FloatArray) -> FloatArray:
+    """Return rotations of the world to cameras that look at a point, level: (T, 3, 3)."""
+    ahead = target - positions
+    distance = np.linalg.norm(ahead, axis=1, keepdims=True)
+    right = np.stack([ahead[:, 2], np.zeros(len(ahead)), -ahead[:, 0]], axis=1)
+    level = np.linalg.norm(right, axis=1, keepdims=True)
+    if (level <= 1e-6 * np.maximum(distance, 1.0)).any():
+        raise InputError(
+            f"the camera cannot look at {_point(target)}: on its path that is where it is, or straight above or below it; "
+            "move path.look_at"
+        )
+    ahead, right = ahead / distance, right / level
+    return np.stack([right, np.cross(ahead, right), ahead], axis=1)

@@ -1,0 +1,121 @@
+"""Source `travel-simulator`: frames of a scene with depth are rendered when they are read."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import FrameSpan, InputError, SourceContext, StreamInfo
+from photonpano.reading import Closing
+from photonpano_simulator.delivery import delivered
+from photonpano_simulator.sensor import Draw, SpadSensor, generator
+from photonpano_simulator.travel.config import TravelConfig
+from photonpano_simulator.travel.paths import matrix_of, poses_of, require_free
+from photonpano_simulator.travel.rendering import View, atlas_of
+from photonpano_simulator.travel.scenes import Stage, with_objects
+from photonpano_simulator.travel.truth import TravelTruth, sharp_view
+
+_METERED = 9
+"""Frames along the path over which the mean flux is taken."""
+
+
+class TravelSource(Closing):
+    """A single-photon camera that travels through a scene with depth.
+
+    A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread.
+
+    Raises:
+        InputError: a file cannot be used, the camera leaves the scene or passes through something, or frames are dropped that
+            do not exist.
+    """
+
+    def __init__(self, config: TravelConfig, context: SourceContext) -> None:
+        self._seed = context.seed if config.seed is None else config.seed
+        taken = delivered(config.n_frames, config.drops, config.repeats)
+        stage, matrix = Stage(config), matrix_of(config)
+        poses = poses_of(config, stage.middle, self._seed)
+        require_free(poses, matrix, config.frame_shape, stage.planes, stage.room)
+        scene = stage.drawn(context.threads)
+        metered = View(scene.planes, atlas_of(scene.textures), matrix, config.frame_shape)
+        frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
+        mean = float(np.mean([metered.flux(poses[frame], frame) for frame in frames]))
+        light = config.drift ** np.linspace(0, 1, config.n_frames)
+        self._truth = TravelTruth(
+            poses[taken],
+            matrix,
+            config.frame_shape,
+            taken,
+            light[taken],
+            with_objects(scene, config.objects, poses[0], matrix, config.frame_shape, mean),
+            config.flux * config.sensor.quantum_efficiency / mean,
+        )
+        # Rendered from the first thread on, it is made once.
+        _ = self._truth.view
+        self._sensor = SpadSensor(config.sensor, config.frame_shape, self._seed)
+        self.info = StreamInfo(len(taken), *config.frame_shape, config.frame_rate_hz, self._sensor.kind, self._sensor.bits)
+        self.response = self._sensor.response
+        self.valid: NDArray[np.bool_] = self._sensor.valid
+        self.valid.flags.writeable = False
+
+    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        for index in range(span.start, span.stop):
+            counts += self._frame(index)
+        return counts
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span: (n, H, W) of zeros and ones."""
+        self.info.require(span)
+        frames = np.empty((len(span), *self.info.frame_shape), np.uint8)
+        for place, index in enumerate(range(span.start, span.stop)):
+            frames[place] = self._frame(index)
+        return frames
+
+    def truth(self) -> dict[str, NDArray[np.generic]]:
+        """Return the ground truth of the frames.
+
+        Convention:
+            Points of the world are (x, y, z) in m: x right, y down, z ahead. `camera_from_world` maps them to points of the
+            camera, X_c = R X_w + t, with the same axes; pixels are K X_c, integers are pixel centres.
+
+        Returns:
+            `camera_from_world` (T, 3, 4), `camera_matrix` (3, 3), `frame_shape` (2,), `frame_rate_hz` (), `seed` (); `taken`
+            (T,), the index of each frame before drops and repeats; `light` (T,), relative to the first of these. The scene, as
+            P rectangles: `plane_corners`, `plane_along`, `plane_down` (P, 3), top left corner and edges in frame 0 in m;
+            `plane_velocities` (P, 3) in m per frame; `plane_is_disc` (P,); `textures` (N,) float16, one after the other, of
+            the shapes `texture_shapes` (P, 2), and the flux of a texel that is 1, `texture_flux` (), photons per pixel per
+            frame that are detected. `dark_rates` (H, W) float32 and `hot_pixels` (H, W) bool; of pixels that differ also
+            `gains` (H, W) float32.
+        """
+        gains = {"gains": self._sensor.gains} if (self._sensor.gains != 1).any() else {}
+        return {
+            **self._truth.arrays(),
+            "frame_rate_hz": np.array(self.info.frame_rate_hz),
+            "seed": np.array(self._seed),
+            **self._sensor.truth(),
+            **gains,
+        }
+
+    def _frame(self, index: int) -> NDArray[np.bool_]:
+        flux = sharp_view(self._truth, index) * self._sensor.gains
+        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, int(self._truth.taken[index])))
+
+
+def problems_of(config: TravelConfig) -> list[str]:
+    """Return what is wrong with drops, repeats, or the path, without its tremor, which depends on the seed of the run."""
+    problems = []
+    try:
+        delivered(config.n_frames, config.drops, config.repeats)
+    except InputError as error:
+        problems.append(str(error))
+    still = config.model_copy(
+        update={"path": config.path.model_copy(update={"tremor": None}), "n_frames": min(config.n_frames, 5000)}
+    )
+    try:
+        stage = Stage(still)
+        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.room)
+    except InputError as error:
+        problems.append(str(error))
+    return problems
