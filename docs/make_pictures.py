@@ -56,6 +56,7 @@ from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux
+from photonpano_simulator.travel.truth import depth, sharp_view, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -190,6 +191,7 @@ def main() -> None:
     save("video.png", video_pictures(in_folder(folder, "tremor with"), folder))
 
     save("night.png", night())
+    save("depth.png", depths())
 
     fine = written(parse_spec(FINE), folder / "fine.npy")
     finish(parse_spec(fine_spec(fine, "super-resolution"), output=in_folder(folder, "fine")), "super-resolution", fine)
@@ -498,6 +500,34 @@ def night() -> Picture:
     shown = [labelled(picture_of(flux, white, tone, 0.5 if tone == "local" else 0.0), tone) for tone in get_args(Tone)]
     shown.append(np.full_like(shown[0], 255))
     return stacked([beside(shown[first : first + 2]) for first in range(0, len(shown), 2)])
+
+
+def depths() -> Picture:
+    """Show the scenes of `travel-simulator`: a frame without noise, 500 binary frames of it, and its depth."""
+    rows = []
+    for kind in ("room", "facade", "planes"):
+        camera = {"scene": {"kind": kind}, "path": {"kind": "turn-only", "degrees": 0}, "n_frames": 500}
+        with open_source(parse_spec({"version": 1, "source": {"use": "travel-simulator", "with": camera}})) as source:
+            truth, info = truth_of(source.truth()), source.info
+            sharp, photons = (
+                sharp_view(truth, 0),
+                source.response.flux(source.counts(info.span) / np.float32(info.n_frames), 500),
+            )
+        white = float(np.quantile(sharp, 0.995))
+        near = 1 / depth(truth, 0)
+        far, nearest = np.quantile(near, (0.0, 1.0))
+        levels = (40 + 200 * (near - far) / (nearest - far)).astype(np.uint8)
+        labels = (kind, "500 frames, 0.3 photons a frame", f"depth: {1 / nearest:.1f} m (light) to {1 / far:.1f} m (dark)")
+        shown = (picture(sharp, white), picture(photons, white), levels)
+        rows.append(
+            beside(
+                [
+                    labelled(cv2.resize(each, (330, 169), interpolation=cv2.INTER_AREA), label)
+                    for each, label in zip(shown, labels, strict=True)
+                ]
+            )
+        )
+    return stacked(rows)
 
 
 def picture(flux: NDArray[np.float32], white: float) -> Picture:

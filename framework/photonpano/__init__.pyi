@@ -56,6 +56,7 @@ from .protocols import FinishedPanorama as FinishedPanorama
 from .protocols import InterpolatesTurns as InterpolatesTurns
 from .protocols import Interpolator as Interpolator
 from .protocols import KeepsHypotheses as KeepsHypotheses
+from .protocols import KnowsSharpViews as KnowsSharpViews
 from .protocols import KnowsTruth as KnowsTruth
 from .protocols import LensedSource as LensedSource
 from .protocols import LinearlyCorrectedSource as LinearlyCorrectedSource

@@ -193,7 +193,27 @@ class KnowsTruth(Protocol):
             (2,), height and width of a frame. If the camera only turned, also `rotations` (T, 3, 3), directions of a frame to
             those of one camera, and `camera_matrix` (3, 3). If `scene_projection` is "spherical", the scene is an
             equirectangular panorama, 360 degrees wide, whose middle that camera looks at; homographies are then K R K^-1 with
-            determinant 1.
+            determinant 1. If the camera travelled through a scene with depth, there are no homographies but
+            `camera_from_world` (T, 3, 4), which maps points of the world to points of the camera, X_c = R X_w + t, and
+            `camera_matrix`.
+        """
+        ...
+
+
+@runtime_checkable
+class KnowsSharpViews(KnowsTruth, Protocol):
+    """A source that can return its frames without noise, such as a simulator.
+
+    `photonpano simulate --sharp-every` stores them as pictures.
+    """
+
+    def sharp_view(self, frame: int) -> FluxImage:
+        """Return the flux of a frame of the capture: (H, W) float32, photons that are detected per pixel per frame.
+
+        There are no dark counts in it, and no differences between pixels.
+
+        Raises:
+            InputError: there is no such frame.
         """
         ...
 

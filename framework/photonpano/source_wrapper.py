@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.protocols import (
     ColouredSource,
+    KnowsSharpViews,
     KnowsTruth,
     LensedSource,
     LinearlyCorrectedSource,
@@ -43,9 +44,9 @@ class Closing:
 class SourceWrapper(Closing):
     """A source around another source, to which it passes every call. Subclasses override what they change.
 
-    The optional members `packed`, `corrected`, `weights`, `light`, `camera`, `colours` and `truth` come from the classes
-    `PackedWrapper`, `LinearlyCorrectedWrapper`, `WeightedWrapper`, `LitWrapper`, `LensedWrapper`, `ColouredWrapper` and
-    `TruthWrapper`: see `with_capabilities`.
+    The optional members `packed`, `corrected`, `weights`, `light`, `camera`, `colours`, `truth` and `sharp_view` come from
+    the classes `PackedWrapper`, `LinearlyCorrectedWrapper`, `WeightedWrapper`, `LitWrapper`, `LensedWrapper`,
+    `ColouredWrapper`, `TruthWrapper` and `SharpViewsWrapper`: see `with_capabilities`.
 
     Attributes:
         wrapped: the other source.
@@ -160,6 +161,14 @@ class TruthWrapper(SourceWrapper):
         return cast("KnowsTruth", self.wrapped).truth()
 
 
+class SharpViewsWrapper(SourceWrapper):
+    """A wrapper of a source that `KnowsSharpViews`."""
+
+    def sharp_view(self, frame: int) -> FluxImage:
+        """Return the flux of a frame: see `KnowsSharpViews`."""
+        return cast("KnowsSharpViews", self.wrapped).sharp_view(frame)
+
+
 def capabilities_of(source: Source) -> list[type[SourceWrapper]]:
     """Return the classes with which a wrapper gets the optional methods that a source has."""
     known: Any = source
@@ -171,6 +180,7 @@ def capabilities_of(source: Source) -> list[type[SourceWrapper]]:
         LensedSource: LensedWrapper,
         ColouredSource: ColouredWrapper,
         KnowsTruth: TruthWrapper,
+        KnowsSharpViews: SharpViewsWrapper,
     }
     return [wrapper for protocol, wrapper in wrappers.items() if isinstance(known, protocol)]
 

@@ -242,8 +242,9 @@ class IntensitySensor(Config):
 
 
 class FrameObject(Config):
-    """A rectangle in front of the scene, with a texture of its own."""
+    """A rectangle or a disc in front of the scene, with a texture of its own."""
 
+    shape: Literal["rectangle", "disc"] = Field("rectangle", description="a rectangle, or the largest disc that fits into it")
     size: tuple[Size, Size] = Field(
         (0.5, 0.5), description="width and height, as shares of those of the frame; (0.5, 0.5) covers a quarter of it"
     )
@@ -342,7 +343,7 @@ class SimulationConfig(Config):
     distortion: Distortion = Field(
         Distortion(), description="distortion of the lens by OpenCV's model, in place of k1 and k2 of `lens`"
     )
-    objects: tuple[FrameObject, ...] = Field((), max_length=100, description="rectangles in front of the scene")
+    objects: tuple[FrameObject, ...] = Field((), max_length=100, description="rectangles and discs in front of the scene")
     drops: tuple[FrameRange, ...] = Field((), description="frames that are missing in the capture")
     repeats: tuple[FrameRange, ...] = Field(
         (), description="frames that the capture holds twice: all of the range, and then all of it again"

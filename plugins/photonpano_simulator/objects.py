@@ -1,4 +1,4 @@
-"""Rectangles in front of the scene, which move by themselves or stand still in the frame."""
+"""Rectangles and discs in front of the scene, which move by themselves or stand still in the frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _DETAIL_PX = (1.5, 5.0, 15.0)
 
 
 class DrawnObject:
-    """A rectangle with texture, drawn over frames.
+    """A rectangle or a disc with texture, drawn over frames.
 
     Args:
         config: size, texture and motion.
@@ -27,6 +27,7 @@ class DrawnObject:
     def __init__(self, config: FrameObject, frame_shape: tuple[int, int], flux: float, scene_motion: FloatArray) -> None:
         height, width = frame_shape
         self._size = np.array(config.size) * (width, height)
+        self._is_disc = config.shape == "disc"
         last = len(scene_motion) if config.frames is None else config.first + config.frames
         self._frames = range(config.first, last)
         begin = min(config.first, len(scene_motion) - 1)
@@ -46,13 +47,24 @@ class DrawnObject:
         rows = _covered(top, self._size[1], height)
         there = np.array([[1, 0, left + 0.5], [0, 1, top + 0.5]])
         seen = cv2.warpAffine(self._texture, there, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        view += np.outer(rows, columns).astype(np.float32) * (seen - view)
+        covered = _disc(left, top, self._size, view.shape) if self._is_disc else np.outer(rows, columns)
+        view += covered.astype(np.float32) * (seen - view)
 
 
 def _covered(start: float, length: float, n_pixels: int) -> FloatArray:
     """Return the share of each pixel along an axis that lies between `start` and `start + length`."""
     pixels = np.arange(n_pixels)
     return np.asarray(np.clip(np.minimum(pixels + 0.5, start + length) - np.maximum(pixels - 0.5, start), 0, 1))
+
+
+def _disc(left: float, top: float, size: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return the share of each pixel, (H, W), that the largest disc in a rectangle covers.
+
+    The edge counts as straight within a pixel, and as a ramp one pixel wide, which is exact along rows and columns.
+    """
+    y, x = np.ogrid[: shape[0], : shape[1]]
+    from_middle = np.hypot(x - (left + size[0] / 2), y - (top + size[1] / 2))
+    return np.asarray(np.clip(size.min() / 2 - from_middle + 0.5, 0, 1))
 
 
 def texture_of(size: FloatArray, seed: int) -> NDArray[np.float32]:

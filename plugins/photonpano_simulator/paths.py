@@ -267,9 +267,11 @@ def _read_homographies(path: Path, n_frames: int) -> FloatArray:
     Raises:
         InputError: the file is missing, is something else, or has another number of homographies.
     """
-    arrays = read_arrays(path, "a file of homographies", ("homographies", "scene_projection"))
+    arrays = read_arrays(path, "a file of homographies", ("homographies", "scene_projection", "camera_from_world"))
     if "scene_projection" in arrays and str(arrays["scene_projection"]) == "spherical":
         raise InputError(f"{path} is the truth of a turn, and its homographies lie on no plane; take a path of the kind turn")
+    if "camera_from_world" in arrays and "homographies" not in arrays:
+        raise InputError(f"{path} is the truth of a scene with depth, which has no homographies; take that of a planar scene")
     homographies = read_array(path, "a file of homographies", "homographies")
     if homographies.ndim != 3 or homographies.shape[1:] != (3, 3) or homographies.dtype.kind not in "fiu":
         raise InputError(f"{path} holds {homographies.dtype} of shape {homographies.shape}; homographies are (n_frames, 3, 3)")

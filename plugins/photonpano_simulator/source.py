@@ -133,12 +133,29 @@ class SimulatorSource(Closing):
             truth["taken"] = self._taken
         return truth
 
-    def _frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
-        taken = int(self._taken[index])
+    def sharp_view(self, frame: int) -> NDArray[np.float32]:
+        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
+
+        Behind colour filters, each pixel shows its own colour.
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        self.info.require(FrameSpan(frame, frame + 1))
+        taken = int(self._taken[frame])
+        return self._flux(taken) * np.float32(self._light[taken])
+
+    def _flux(self, taken: int) -> NDArray[np.float32]:
+        """Return the flux of a frame that the camera takes, before its gains: (H, W)."""
         views = [self._lit_view(taken, homography) for homography in self._while_open(taken)]
         flux = views[0] if len(views) == 1 else np.mean(views, axis=0)
         for each in self._objects:
             each.draw(flux, taken)
+        return flux
+
+    def _frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
+        taken = int(self._taken[index])
+        flux = self._flux(taken)
         if not self._is_uniform:
             flux *= self._gains * np.float32(self._light[taken])
         return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))

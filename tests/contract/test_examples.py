@@ -34,6 +34,11 @@ SMALL_NIGHT = {
 CAPTURES = {
     "capture": SMALL_STREET | GROUPS,
     "demo-capture": SMALL_STREET | GROUPS | {"source.with.path": "{kind: pan, length_px: 60}"},
+    "room-capture": {
+        "source.with.n_frames": 240,
+        "source.with.frame_shape": "[128, 160]",
+        "source.with.scene": "{kind: planes}",
+    },
 }
 """Specs to simulate, with overrides that make them small. The group size is checked, though it is not used."""
 RUNS: dict[str, dict[str, Any]] = {

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from photonpano.atomic import atomic_folder
+from photonpano.captures.picture_files import counted, write_pngs
+from photonpano.captures.sharp import require_sharp_views, sharp_pictures
 from photonpano.captures.writing import write_packed
 from photonpano.context import Progress, Quiet
 from photonpano.pipeline.components import build_source
 from photonpano.specs import Plan
-from photonpano.threads import thread_count
+from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import StreamInfo
 
 
@@ -25,6 +28,7 @@ class WrittenCapture:
         info: the size and rate of the capture.
         n_masked: how many pixels the source masks; the file holds no mask.
         source: the section of a spec that reads the file.
+        sharp: the folder with pictures of frames without noise, if they were asked for.
     """
 
     path: Path
@@ -32,6 +36,7 @@ class WrittenCapture:
     info: StreamInfo
     n_masked: int
     source: Mapping[str, Any]
+    sharp: Path | None = None
 
 
 def convert(
@@ -55,19 +60,33 @@ def convert(
     return _write(plan, Path(output), progress, resumed or (lambda _: None))
 
 
-def simulate(plan: Plan, output: Path | str, progress: Progress | None = None) -> WrittenCapture:
+def simulate(
+    plan: Plan, output: Path | str, progress: Progress | None = None, sharp_every: int | None = None
+) -> WrittenCapture:
     """Write a capture to a packed .npy file, whole or not at all; a simulated one with its truth beside it.
 
     Args:
         plan: of the capture; its source may be any that gives binary frames.
         output: the .npy file.
         progress: receives the stage; quiet by default.
+        sharp_every: frames from one picture without noise to the next. They are written to the folder CAPTURE.sharp, such as
+            cube.sharp/frame_000050.png for cube.npy: 8 bits, sRGB, the same white in all. None writes none.
 
     Raises:
-        InputError: as `convert`.
-        OutputError: as `convert`.
+        InputError: as `convert`; or the source cannot show frames without noise.
+        OutputError: as `convert`; or the folder of the pictures is there already.
     """
-    return _write(plan, Path(output), progress, None)
+    output = Path(output)
+    if sharp_every is None:
+        return _write(plan, output, progress, None)
+    sharp = output.with_suffix(".sharp")
+    with atomic_folder(sharp) as folder:
+        with build_source(plan) as source, one_thread_inside():
+            views, frames = require_sharp_views(source), range(0, source.info.n_frames, sharp_every)
+            with (progress or Quiet()).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
+                pictures = sharp_pictures(views, frames, thread_count(plan.run.threads))
+                write_pngs(folder, counted(pictures, advance), [f"frame_{frame:06}" for frame in frames])
+        return replace(_write(plan, output, progress, None), sharp=sharp)
 
 
 def _write(plan: Plan, output: Path, progress: Progress | None, resumed: Callable[[int], object] | None) -> WrittenCapture:

@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.protocols import Source
-from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
-from photonpano.values import FrameSpan, StreamInfo
+from photonpano.source_wrapper import ArrayT, SharpViewsWrapper, SourceWrapper, TruthWrapper, capabilities_of, with_capabilities
+from photonpano.values import FluxImage, FrameSpan, StreamInfo
+
+_OF_FRAMES = ("homographies", "rotations", "camera_from_world", "light", "taken")
+"""Arrays of a truth that have an entry for each frame."""
 
 
 def part_of(source: Source, span: FrameSpan) -> Source:
@@ -20,7 +23,8 @@ def part_of(source: Source, span: FrameSpan) -> Source:
         source: the whole capture.
         span: frames that it has.
     """
-    capabilities = [_PartOfTruth if each is TruthWrapper else each for each in capabilities_of(source)]
+    own: dict[type[SourceWrapper], type[SourceWrapper]] = {TruthWrapper: _PartOfTruth, SharpViewsWrapper: _PartOfViews}
+    capabilities = [own.get(each, each) for each in capabilities_of(source)]
     return with_capabilities(Part, capabilities)(source, span)
 
 
@@ -56,7 +60,16 @@ class _PartOfTruth(TruthWrapper):
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
         """Return what the frames of the part show."""
         truth = super().truth()
-        of_frames = {
-            name: truth[name][self._span.start : self._span.stop] for name in ("homographies", "rotations") if name in truth
-        }
+        of_frames = {name: truth[name][self._span.start : self._span.stop] for name in _OF_FRAMES if name in truth}
         return {**truth, **of_frames}
+
+
+class _PartOfViews(SharpViewsWrapper):
+    """A part of a source that `KnowsSharpViews`."""
+
+    _span: FrameSpan
+
+    def sharp_view(self, frame: int) -> FluxImage:
+        """Return the flux of a frame of the part."""
+        self.info.require(FrameSpan(frame, frame + 1))
+        return super().sharp_view(self._span.start + frame)

@@ -61,12 +61,17 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
     require_writable(path, len(names))
     if path.suffix == "":
         with atomic_folder(path) as folder:
-            for name, picture in zip(names, pictures, strict=True):
-                (folder / f"{name}.png").write_bytes(_png(picture))
+            write_pngs(folder, pictures, names)
         return
     write: Callable[[Path, Iterable[Picture], float], None] = _write_mp4 if path.suffix == ".mp4" else _write_animated
     with atomic_path(path) as temporary:
         write(temporary, pictures, fps)
+
+
+def write_pngs(folder: Path, pictures: Iterable[Picture], names: Sequence[str]) -> None:
+    """Write pictures, (H, W) or (H, W, 3) with red first, into a folder under these names, without suffix."""
+    for name, picture in zip(names, pictures, strict=True):
+        (folder / f"{name}.png").write_bytes(_png(picture))
 
 
 def counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+from zipfile import ZipFile
 
 import typer
 
@@ -29,7 +30,13 @@ def print_written(written: WrittenCapture) -> None:
         mask = "mask them with `corrections`"
         warn(f"{written.n_masked} pixels of the capture are masked, and {written.path} holds no mask; {mask}")
     files = [(written.path, str(written.info)), (written.truth, "the truth: motion and scene")]
-    typer.echo(columns([[str(file), decimal(file.stat().st_size), text] for file, text in files if file]))
+    rows = [[str(file), decimal(file.stat().st_size), text] for file, text in files if file]
+    if written.sharp:
+        pictures = list(written.sharp.iterdir())
+        size = decimal(sum(file.stat().st_size for file in pictures))
+        rows.append([str(written.sharp), size, f"{len(pictures):,} frames without noise"])
+    typer.echo(columns(rows))
     typer.echo(f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}")
-    if written.truth:
+    # Runs are scored against homographies, which scenes with depth have not.
+    if written.truth and "homographies.npy" in ZipFile(written.truth).namelist():
         typer.echo(f"\nTo score a run of it: photonpano evaluate RUN --truth {written.truth}")

@@ -15,8 +15,8 @@ from photonpano.corrections.colours import FilteredSource, filtered
 from photonpano.corrections.geometry import Rearrangement
 from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pixels, numbered
 from photonpano.errors import InputError
-from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
-from photonpano.source_wrapper import ArrayT, SourceWrapper, TruthWrapper, with_capabilities
+from photonpano.protocols import KnowsSharpViews, KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
+from photonpano.source_wrapper import ArrayT, SharpViewsWrapper, SourceWrapper, TruthWrapper, with_capabilities
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, FrameSpan, StreamInfo
 
 _TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
@@ -61,8 +61,8 @@ def corrected_source(
 ) -> CorrectedSource | FilteredSource:
     """Return a source with corrections.
 
-    It has `packed` if the source has, `truth` if the source has and no pixel is moved, and `corrected` if a correction changes
-    sums of frames. It is a `ColouredSource` if a correction keeps all colours.
+    It has `packed` if the source has, `truth` and `sharp_view` if the source has and no pixel is moved, and `corrected` if a
+    correction changes sums of frames. It is a `ColouredSource` if a correction keeps all colours.
 
     Args:
         source: the capture as it is read; closing the corrected source closes it.
@@ -75,6 +75,8 @@ def corrected_source(
     capabilities: list[type[SourceWrapper]] = [_PackedFrames] if isinstance(source, PackedSource) else []
     if isinstance(source, KnowsTruth) and not any(isinstance(correction, Rearrangement) for correction in corrections):
         capabilities.append(TruthWrapper)
+        if isinstance(source, KnowsSharpViews):
+            capabilities.append(SharpViewsWrapper)
     if any(correction.changes_sums for correction in corrections):
         capabilities.append(_CorrectedSums)
     corrected = with_capabilities(CorrectedSource, capabilities)(source, corrections, blame)

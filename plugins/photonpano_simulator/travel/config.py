@@ -133,7 +133,7 @@ class TravelConfig(Config):
     frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")
     frame_rate_hz: float = Field(10_000.0, gt=0, le=1e9, description="frames a second, in Hz")
     focal_px: float = Field(
-        500.0,
+        400.0,
         gt=0,
         le=1e6,
         description="focal length of the camera, in px: from a quarter of the width of a frame, which sees 127 degrees across, "

@@ -98,6 +98,14 @@ class TravelSource(Closing):
             **gains,
         }
 
+    def sharp_view(self, frame: int) -> NDArray[np.float32]:
+        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        return sharp_view(self._truth, frame)
+
     def _frame(self, index: int) -> NDArray[np.bool_]:
         flux = sharp_view(self._truth, index) * self._sensor.gains
         return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, int(self._truth.taken[index])))

@@ -12,7 +12,9 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
+from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
+from photonpano_simulator.source import SimulatorSource
 from photonpano_simulator.travel.config import TravelConfig
 from photonpano_simulator.travel.paths import centres
 from photonpano_simulator.travel.source import TravelSource
@@ -188,3 +190,10 @@ def test_wrong_paths_are_refused_before_anything_is_drawn(settings: dict[str, An
 def test_values_out_of_range_are_refused(settings: dict[str, Any], expected: str) -> None:
     with pytest.raises(ValidationError, match=expected):
         config(**settings)
+
+
+def test_homographies_of_a_scene_with_depth_are_refused(travelling, tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **travelling(n_frames=5).truth())
+    path = {"kind": "file", "file": tmp_path / "a.npz"}
+    with pytest.raises(InputError, match=r"a\.npz is the truth of a scene with depth, which has no homographies; take that of"):
+        SimulatorSource(SimulatorConfig.model_validate({"path": path, "n_frames": 5}), SourceContext())

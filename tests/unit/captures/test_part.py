@@ -90,6 +90,28 @@ def test_truth_of_a_part_is_that_of_its_frames(tmp_path: Path) -> None:
     np.testing.assert_array_equal(some["scene"], whole["scene"])
 
 
+def test_part_of_a_capture_with_depth_shows_the_same_views() -> None:
+    from photonpano import KnowsSharpViews, open_source
+    from photonpano_simulator.travel.truth import sharp_view, truth_of
+
+    thing = {"moves_px": [0.5, 0]}
+    keys = {
+        "scene": {"kind": "planes"},
+        "n_frames": 60,
+        "frame_shape": [24, 32],
+        "focal_px": 25,
+        "drift": 2,
+        "objects": [thing],
+    }
+    views = []
+    for more, frame in (({}, 30), ({"frames": [10, 40]}, 20)):
+        with open_source(parse_spec({"version": 1, "source": {"use": "travel-simulator", "with": keys | more}})) as source:
+            assert isinstance(source, KnowsSharpViews)
+            views += [source.sharp_view(frame), sharp_view(truth_of(source.truth()), frame)]
+    for view in views[1:]:
+        np.testing.assert_array_equal(view, views[0])
+
+
 @pytest.mark.parametrize(
     ("frames", "message"),
     [

@@ -58,6 +58,16 @@ def test_load_truth_names_missing_arrays(capture):
     )
 
 
+def test_evaluate_refuses_truth_of_a_scene_with_depth(capture):
+    capture.true["camera_from_world"] = np.zeros((120, 3, 4))
+    del capture.true["homographies"]
+    capture.write()
+    assert failure(capture) == (
+        "truth.npz is the truth of a camera that travelled through a scene with depth, where no homography maps a frame to the "
+        "scene: evaluate compares homographies and rotations; photonpano_simulator.travel.truth tells what frames saw"
+    )
+
+
 def test_load_truth_refuses_pickled_objects(capture):
     capture.true["homographies"] = np.array([{"a": 1}], dtype=object)
     capture.write()
