@@ -16,6 +16,7 @@ from photonpano.protocols import Source
 from photonpano.source_wrapper import (
     ArrayT,
     LinearlyCorrectedWrapper,
+    SharpViewsWrapper,
     SourceWrapper,
     TruthWrapper,
     capabilities_of,
@@ -43,7 +44,11 @@ def attributed(source: Source, origin: str) -> AttributedSource:
     Raises:
         PluginError: `info`, `valid` or `response` is not what it should be.
     """
-    named = {LinearlyCorrectedWrapper: _AttributedSums, TruthWrapper: _AttributedTruth}
+    named = {
+        LinearlyCorrectedWrapper: _AttributedSums,
+        TruthWrapper: _AttributedTruth,
+        SharpViewsWrapper: _AttributedViews,
+    }
     with attributing(origin, "opening"):
         capabilities = [named.get(each, each) for each in capabilities_of(source)]
     return with_capabilities(AttributedSource, capabilities)(source, origin)
@@ -166,6 +171,19 @@ class _AttributedTruth(TruthWrapper, AttributedSource):
                 raise BrokenContract(f"truth() returns a mapping of arrays by name, got {shown(found)}")
             truth: Mapping[str, NDArray[np.generic]] = found
             return truth
+
+
+class _AttributedViews(SharpViewsWrapper, AttributedSource):
+    """A source that can return its frames without noise."""
+
+    def sharp_view(self, frame: int) -> FluxImage:
+        """Return the flux of a frame: see `KnowsSharpViews`."""
+        with attributing(self._origin, "sharp_view()"):
+            found: Any = super().sharp_view(frame)
+            if not isinstance(found, np.ndarray) or found.dtype.kind != "f" or found.shape != self.info.frame_shape:
+                raise BrokenContract(f"sharp_view() returns {self.info.frame_shape} of float32, got {shown(found)}")
+            view: FluxImage = found
+            return view
 
 
 def _checked_info(info: Any) -> StreamInfo:

@@ -147,8 +147,8 @@ def test_photograph_is_hung_in_the_scene(travelling, tmp_path: Path) -> None:
     [
         (
             {"scene": {"kind": "room"}, "path": {"kind": "travel", "centre": (0, 0, 5)}},
-            "the camera leaves the scene: it is at (-0.08, -0.04, 4.97) m in frame 0, and may be between (-2.5, -1.1, -1.8) "
-            "and (2.5, 1.5, 4.2) m; move path.centre, or shorten the path",
+            "the camera leaves the scene: it is at (-0.08, -0.04, 4.97) m, 0% of the way along, and may be between "
+            "(-2.5, -1.1, -1.8) and (2.5, 1.5, 4.2) m; move path.centre, or shorten the path",
         ),
         (
             {"scene": {"kind": "room"}, "path": {"kind": "travel", "centre": (0.3, 0.75, 2.5), "length_m": 1.5}},
@@ -157,7 +157,7 @@ def test_photograph_is_hung_in_the_scene(travelling, tmp_path: Path) -> None:
         ),
         (
             {"path": {"kind": "turn-only", "degrees": 180}},
-            "frame 0 sees past the end of the scene: there is nothing at its pixel (0, 0); "
+            "the camera sees past the end of the scene 0% of the way along: there is nothing at the pixel (0, 0); "
             "move path.look_at to the middle of the scene, or turn by less",
         ),
         (

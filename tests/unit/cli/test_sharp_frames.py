@@ -47,6 +47,15 @@ def test_sharp_frames_are_views_without_noise(here: Path, invoke: Callable[..., 
     np.testing.assert_allclose(shown * white, flux[unsaturated], atol=0.012 * white)
 
 
+def test_corrections_that_move_no_pixels_keep_sharp_frames(here: Path, invoke: Callable[..., Any]) -> None:
+    for number, (correction, code) in enumerate((("{mask: {file: mask.npy}}", 0), ("rot90", 1))):
+        np.save("mask.npy", np.zeros((24, 32), bool))
+        Path("more.yaml").write_text(f"{SPEC}corrections: [{correction}]\n")
+        done = invoke("simulate", "more.yaml", "-o", f"more{number}.npy", "--sharp-every", "20")
+        assert done.exit_code == code, done.output
+        assert Path(f"more{number}.sharp").is_dir() == (code == 0)
+
+
 def test_sharp_frames_of_a_planar_scene(here: Path, invoke: Callable[..., Any]) -> None:
     keys = (
         "{n_frames: 4, frame_shape: [16, 24], scene: {kind: street, width: 256, height: 171}, path: {kind: pan, length_px: 2}}"

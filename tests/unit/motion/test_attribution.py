@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
+from photonpano import FrameSpan, InputError, KnowsSharpViews, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
 from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import AttributedTrajectory
 from photonpano.protocols import ColouredSource
@@ -52,6 +52,17 @@ def test_attributed_source_has_the_optional_methods_of_the_source(source: Any) -
     source.packed = raising(OSError("gone"))
     with pytest.raises(PluginError, match=r"failed at frames 2 to 4: OSError: gone"):
         attributed(source, ORIGIN).packed(SPAN)
+
+
+def test_attributed_source_names_the_plugin_of_sharp_views(source: Any) -> None:
+    source.truth = dict
+    source.sharp_view = lambda frame: source.frames(FrameSpan(frame, frame + 1))[0].astype(np.float32)
+    named = attributed(source, ORIGIN)
+    assert isinstance(named, KnowsSharpViews)
+    np.testing.assert_array_equal(named.sharp_view(2), source.sharp_view(2))
+    source.sharp_view = lambda frame: np.zeros((2, 2), np.float32)
+    with pytest.raises(PluginError, match=r"sharp_view\(\) returns \(4, 6\) of float32, got"):
+        attributed(source, ORIGIN).sharp_view(2)
 
 
 def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type) -> None:
