@@ -91,8 +91,8 @@ def require_free(poses: FloatArray, matrix: FloatArray, frame_shape: tuple[int, 
     if outside.size:
         low, high = (", ".join(f"{each:g}" for each in corner) for corner in room)
         raise InputError(
-            f"the camera leaves the scene: it is at {_point(at[outside[0]])}, {outside[0] / max(1, len(at) - 1):.0%} of the way "
-            f"along, and may be between ({low}) and ({high}) m; move path.centre, or shorten the path"
+            f"the camera leaves the scene: it is at {_point(at[outside[0]])}, {outside[0] / max(1, len(at) - 1):.0%} of the "
+            f"way along, and may be between ({low}) and ({high}) m; move path.centre, or shorten the path"
         )
     crossed = _first_crossing(at, planes)
     if crossed is not None:
@@ -109,8 +109,8 @@ def require_free(poses: FloatArray, matrix: FloatArray, frame_shape: tuple[int, 
         if (owner < 0).any():
             x, y = grid[owner < 0][0]
             raise InputError(
-                f"the camera sees past the end of the scene {frame / max(1, last):.0%} of the way along: there is nothing at the "
-                f"pixel ({x:.0f}, {y:.0f}); move path.look_at to the middle of the scene, or turn by less"
+                f"the camera sees past the end of the scene {frame / max(1, last):.0%} of the way along: there is nothing at "
+                f"the pixel ({x:.0f}, {y:.0f}); move path.look_at to the middle of the scene, or turn by less"
             )
 
 

@@ -60,7 +60,7 @@ def test_attributed_source_names_the_plugin_of_sharp_views(source: Any) -> None:
     named = attributed(source, ORIGIN)
     assert isinstance(named, KnowsSharpViews)
     np.testing.assert_array_equal(named.sharp_view(2), source.sharp_view(2))
-    source.sharp_view = lambda frame: np.zeros((2, 2), np.float32)
+    source.sharp_view = lambda _: np.zeros((2, 2), np.float32)
     with pytest.raises(PluginError, match=r"sharp_view\(\) returns \(4, 6\) of float32, got"):
         attributed(source, ORIGIN).sharp_view(2)
 
