@@ -93,6 +93,40 @@ class RobustMergeConfig(Config):
     )
 
 
+class LocalFlowConfig(Config):
+    """Keys of `local-flow`."""
+
+    sub_exposures: Literal["auto", 3, 5, 9, 17, 33] = Field(
+        "auto",
+        description="parts of a group that are compared and weighted; auto takes 33 or 17 of at least 8 photons per pixel "
+        "each, else 9, 5 or 3 of at least 2, and in less light merges as photon-mle does",
+    )
+    significance: float = Field(
+        4.0,
+        ge=2,
+        le=100,
+        description="difference of the parts, in standard deviations of the photon noise, above which a pixel moves by itself",
+    )
+    tolerated_px: float = Field(
+        0.2, ge=0, le=8, description="error of the global motion, in px of a frame, that does not count as such a difference"
+    )
+    tolerance_px: float = Field(
+        0.5, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
+    )
+
+
+class BurstConfig(Config):
+    """Keys of `burst`."""
+
+    block_frames: int = Field(
+        100, ge=1, le=100_000, description="frames of a block; each block is aligned with the one around the reference instant"
+    )
+    patch_px: Literal[16, 32] = Field(16, description="side of a patch that moves as a whole, in px of a frame")
+    tolerance_px: float = Field(
+        0.5, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
+    )
+
+
 class ShortSpansConfig(Config):
     """Keys of `short-spans`."""
 

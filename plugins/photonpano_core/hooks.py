@@ -16,9 +16,11 @@ from photonpano import (
     hookimpl,
 )
 from photonpano_core.configs import (
+    BurstConfig,
     ExrConfig,
     GroupedConfig,
     InterpolatorConfig,
+    LocalFlowConfig,
     MergeConfig,
     MidpointConfig,
     PhotonMleConfig,
@@ -106,6 +108,18 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
         config=SplatConfig,
         build=_build_splat,
         accepts_corrected_sums=False,
+    )
+    yield MergerContribution(
+        name="local-flow",
+        summary="photon-mle, and optical flow where photons contradict the global motion: moving things and parallax are sharp",
+        config=LocalFlowConfig,
+        build=_build_local_flow,
+    )
+    yield MergerContribution(
+        name="burst",
+        summary="Quanta burst photography (Ma et al. 2020): blocks of frames aligned patch by patch in one shot, a baseline",
+        config=BurstConfig,
+        build=_build_burst,
     )
 
 
@@ -211,6 +225,20 @@ def _build_splat(config: SplatConfig, context: StageContext) -> Merger:
 
     del config, context
     return SplatMerger()
+
+
+def _build_local_flow(config: LocalFlowConfig, context: StageContext) -> Merger:
+    from photonpano_core.dense_motion.local_flow import LocalFlowMerger
+
+    del context
+    return LocalFlowMerger(config)
+
+
+def _build_burst(config: BurstConfig, context: StageContext) -> Merger:
+    from photonpano_core.dense_motion.burst import BurstMerger
+
+    del context
+    return BurstMerger(config)
 
 
 def _build_lucas_kanade(config: InterpolatorConfig, context: StageContext) -> Interpolator:

@@ -121,6 +121,16 @@ class TestSplat(MergerConformance):
     contribution = CATALOG.find("merger", "splat").contribution
 
 
+class TestLocalFlow(MergerConformance):
+    contribution = CATALOG.find("merger", "local-flow").contribution
+
+
+class TestBurst(MergerConformance):
+    contribution = CATALOG.find("merger", "burst").contribution
+    # It finds the motion by itself, as well as patches of 40x56 px allow.
+    compensates = False
+
+
 class TestLucasKanade(InterpolatorConformance):
     contribution = CATALOG.find("interpolator", "lucas-kanade").contribution
 

@@ -1,0 +1,247 @@
+"""Quanta burst photography in one shot, a baseline: `burst` (after Ma et al. 2020; Hasinoff et al. 2016).
+
+The paper compares with it in supplement S1.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from photonpano import (
+    FloatArray,
+    FrameSpan,
+    Group,
+    InputError,
+    LensedSource,
+    LinearlyCorrectedSource,
+    LitSource,
+    Response,
+    Source,
+    Trajectory,
+    VirtualExposure,
+)
+from photonpano.merging import PhotonSum, divided
+from photonpano_core.configs import BurstConfig
+from photonpano_core.dense_motion.patches import Image, PatchGrid, add_patches, search
+from photonpano_core.dense_motion.rescaled import rescaled
+from photonpano_core.dense_motion.sub_exposures import smoothed, worth_of
+from photonpano_core.photon_mle import exposure_of
+
+_DETAIL_PX = 1.0
+"""Blur of blocks before they are compared, in px."""
+_LEVELS = 4
+"""Levels of the pyramid, each of half the size of the one before."""
+_RADIUS = 4, 2
+"""Search around the start, in px: at the coarsest level, and at each other."""
+_RESTS = 2.5
+"""A block rests if no patch agrees better elsewhere by this much, in units of the photon noise."""
+_TOLERANCE = 8.0
+"""Squared difference of a frequency that costs half of its weight, in units of its photon noise."""
+
+
+class BurstMerger:
+    """Aligns blocks of frames patch by patch with the block around the reference instant, once, and merges them.
+
+    It uses no global motion: the trajectory is ignored. Each block is searched around the motion that the blocks before it
+    extrapolate, coarse to fine. Frames are warped by the motion of the blocks, interpolated linearly. Patches are merged in
+    the frequency domain, where a block that differs from the reference by more than noise gets less weight, as in a Wiener
+    filter. The weight of a pixel is the number of frames that showed it; what the filter leaves out is not subtracted.
+    """
+
+    def __init__(self, config: BurstConfig) -> None:
+        self._config = config
+
+    def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
+        """Merge a group; see `photonpano.Merger`.
+
+        Raises:
+            InputError: the lens of the source distorts, or its light changes.
+        """
+        del trajectory
+        if isinstance(source, LensedSource) and source.camera.distorts:
+            raise InputError("merge.use: burst does not warp through a lens that distorts; use photon-mle")
+        if isinstance(source, LitSource):
+            raise InputError("merge.use: burst does not divide by light that changes; use photon-mle")
+        burst = _Burst(source, group, self._config)
+        photons = burst.merged(burst.motion())
+        return exposure_of(photons if scale == 1 else rescaled(photons, scale), source, group, scale)
+
+
+class _Burst:
+    """The blocks of a group."""
+
+    def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
+        self._source, self._group, self._config = source, group, config
+        self._worth = worth_of(source) if worth_of(source).size else np.ones(source.info.frame_shape, np.float32)
+        start = group.span.start
+        parts = divided(len(group.span), max(1, round(len(group.span) / config.block_frames)))
+        self._spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
+        self._reference = next(place for place, span in enumerate(self._spans) if group.reference < span.stop)
+        self._grid = PatchGrid(source.info.frame_shape, config.patch_px)
+
+    def motion(self) -> FloatArray:
+        """Return the displacement of each patch at the middle of each block from the reference block: (K, rows, columns, 2)."""
+        images, noise = zip(*[self._image(span) for span in self._spans], strict=True)
+        found = np.zeros((len(self._spans), *self._grid.n_patches, 2))
+        fixed = self._reference
+        for direction in (1, -1):
+            place = fixed + direction
+            while 0 <= place < len(self._spans):
+                before, earlier = place - direction, place - 2 * direction
+                known = min(earlier, fixed) >= 0 and abs(before - fixed) >= 1
+                start = 2 * found[before] - found[earlier] if known else found[before]
+                variance = noise[place] + noise[fixed]
+                found[place] = aligned(images[fixed], images[place], self._grid, start, variance)
+                place += direction
+        return found
+
+    def _image(self, span: FrameSpan) -> tuple[Image, float]:
+        """Return a block as it lies, on the scale of uniform noise, and its variance there."""
+        counts = self._counts(span)
+        photons = PhotonSum(counts * self._worth, self._worth * np.float32(len(span)))
+        image = smoothed(photons, self._source.response, _DETAIL_PX, 1.0)
+        seen = image.frames > 0
+        values = np.where(seen, image.values, image.values[seen].mean() if seen.any() else 0).astype(np.float32)
+        frames = float(np.median(image.frames[seen])) if seen.any() else 1.0
+        return values, float(self._source.response.stabilised_std(frames)) ** 2
+
+    def _counts(self, span: FrameSpan) -> Image:
+        counts = self._source.counts(span)
+        if isinstance(self._source, LinearlyCorrectedSource):
+            return np.asarray(self._source.corrected(counts, len(span)), np.float32)
+        return counts.astype(np.float32)
+
+    def merged(self, motion: FloatArray) -> PhotonSum:
+        """Merge the blocks along the motion of their patches."""
+        middles = [span.centre for span in self._spans]
+        there = at_instant(middles, motion, self._group.reference)
+        side, shape = self._grid.side, self._grid.n_patches
+        counts = np.zeros((len(self._spans), *shape, side, side), np.float32)
+        weight = np.zeros_like(counts)
+        for place, span in enumerate(self._spans):
+            way = at_instant(middles, motion, span.stop - 1) - at_instant(middles, motion, span.start)
+            way_px = float(np.percentile(np.hypot(*np.moveaxis(way, -1, 0)), 90))
+            for part in divided(len(span), max(1, math.ceil(way_px / self._config.tolerance_px))):
+                chunk = FrameSpan(span.start + part.start, span.start + part.stop)
+                shifts = at_instant(middles, motion, chunk.centre) - there
+                lit = self._counts(chunk) * self._worth
+                add_patches(lit, self._worth, float(len(chunk)), shifts, self._grid.step, counts[place], weight[place])
+        mean = wiener_mean(counts, weight, self._reference, self._source.response)
+        frames = weight.sum(axis=0)
+        return PhotonSum(self._grid.joined(mean * frames), self._grid.joined(frames))
+
+
+def aligned(fixed: Image, moving: Image, grid: PatchGrid, start: FloatArray, variance: float) -> FloatArray:
+    """Find the patches of an image in another, coarse to fine.
+
+    Args:
+        fixed: (H, W) on the scale of uniform noise.
+        moving: (H, W) likewise.
+        grid: the patches of `fixed`.
+        start: (rows, columns, 2), displacements x and y around which the search begins.
+        variance: of the noise of the difference of both images.
+
+    Returns:
+        (rows, columns, 2); zeros if no patch agrees significantly better with another place than its own.
+    """
+    pyramid = [(fixed, moving)]
+    while len(pyramid) < _LEVELS and min(pyramid[-1][0].shape) >= 4 * grid.side:
+        pyramid.append((_halved(pyramid[-1][0]), _halved(pyramid[-1][1])))
+    found, costs = np.zeros((0, 0, 2)), np.zeros((0, 0, 2), np.float32)
+    for level in reversed(range(len(pyramid))):
+        here = PatchGrid(pyramid[level][0].shape, grid.side)
+        starts = [_resized(start, here.n_patches) / 2**level]
+        if found.size:
+            starts += [_resized(found, here.n_patches, shift) * 2 for shift in (-1, 0, 1)]
+        found, costs = np.zeros((*here.n_patches, 2)), np.zeros((*here.n_patches, 2), np.float32)
+        radius = _RADIUS[0] if level == len(pyramid) - 1 else _RADIUS[1]
+        search(*pyramid[level], grid.side, np.rint(starts).astype(np.int64), radius, found, costs)
+        found = np.stack([cv2.medianBlur(np.ascontiguousarray(found[..., axis], np.float32), 3) for axis in range(2)], axis=-1)
+        found = found.astype(np.float64)
+    both = np.isfinite(costs).all(axis=-1)
+    rests = not (costs[both, 0] - costs[both, 1] > _RESTS * variance).any()
+    return np.zeros_like(found) if rests else found
+
+
+def _halved(image: Image) -> Image:
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    return np.asarray(cv2.resize(image[:height, :width], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _resized(motion: FloatArray, n_patches: tuple[int, int], shift: int = 0) -> FloatArray:
+    """Return the motion of the nearest patches of a grid of another size, or of patches `shift` steps from these."""
+    places = [
+        np.clip(np.rint(np.linspace(0, length - 1, n)).astype(int) + shift, 0, length - 1)
+        for length, n in zip(motion.shape[:2], n_patches, strict=True)
+    ]
+    return np.asarray(motion[np.ix_(*places)])
+
+
+def at_instant(middles: list[float], motion: FloatArray, instant: float) -> FloatArray:
+    """Interpolate the motion of blocks linearly in time; beyond the first and the last, the velocity is kept.
+
+    Args:
+        middles: (K,) instants, increasing.
+        motion: (K, ...) at these.
+        instant: in frames.
+    """
+    if len(middles) == 1:
+        return np.asarray(motion[0])
+    after = int(np.clip(np.searchsorted(middles, instant), 1, len(middles) - 1))
+    share = (instant - middles[after - 1]) / (middles[after] - middles[after - 1])
+    return np.asarray((1 - share) * motion[after - 1] + share * motion[after])
+
+
+def wiener_mean(counts: Image, weight: Image, reference: int, response: Response) -> Image:
+    """Merge blocks of patches in the frequency domain.
+
+    D is the difference of a frequency of a block from that of the reference block, and s^2 the variance of D from photon
+    noise. The block is replaced by the reference by the share `|D|^2 / (|D|^2 + 8 s^2)`.
+
+    Args:
+        counts: (K, rows, columns, side, side), sums of blocks.
+        weight: the same of numbers of frames.
+        reference: index of the reference block.
+        response: the camera's response.
+
+    Returns:
+        (rows, columns, side, side), mean count of a frame.
+    """
+    fixed = _mean(counts[reference], weight[reference], np.float32(0))
+    frames = weight.mean(axis=(-2, -1))
+    noise = _variance(fixed.mean(axis=(-2, -1)), response)
+    own = fft.rfft2(fixed)
+    total, n = own * frames[reference, ..., None, None], frames[reference].copy()
+    for place in range(len(counts)):
+        if place == reference:
+            continue
+        other = fft.rfft2(_mean(counts[place], weight[place], fixed))
+        variance = noise / np.maximum(frames[place], 1) + noise / np.maximum(frames[reference], 1)
+        tolerated = (np.float32(_TOLERANCE * fixed.shape[-1] ** 2) * variance)[..., None, None]
+        difference = own - other
+        power = np.abs(difference) ** 2
+        other += power / (power + np.maximum(tolerated, np.float32(1e-12))) * difference
+        total += other * frames[place, ..., None, None]
+        n += frames[place]
+    total /= np.maximum(n, np.float32(1e-6))[..., None, None]
+    return np.maximum(fft.irfft2(total, s=fixed.shape[-2:]), 0).astype(np.float32)
+
+
+def _mean(counts: Image, weight: Image, unseen: NDArray[np.float32] | np.float32) -> Image:
+    """Return the mean count of a frame, and `unseen` where there is none."""
+    seen = weight > 1e-3
+    return np.where(seen, counts / np.where(seen, weight, np.float32(1)), unseen).astype(np.float32)
+
+
+def _variance(mean: Image, response: Response) -> Image:
+    """Return the variance of the count of one frame, from the slope of the scale on which it is uniform."""
+    many = 1e4
+    low, high = mean * np.float32(0.99), mean * np.float32(1.01) + np.float32(1e-4)
+    low_value, high_value = (response.stabilised(response.flux(each, many), many) for each in (low, high))
+    per_unit = (high - low) / np.maximum(high_value - low_value, np.float32(1e-9))
+    return np.asarray(many * (response.stabilised_std(many) * per_unit) ** 2, np.float32)

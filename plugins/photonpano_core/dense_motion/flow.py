@@ -1,0 +1,130 @@
+"""Estimate a dense field of motion from sub-exposures, coarse to fine over time (paper, section 6, "Dense Motion Models")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import BoolArray
+from photonpano.merging import PhotonSum
+from photonpano_core.dense_motion.field import MotionField
+from photonpano_core.dense_motion.sub_exposures import Image, Smoothed, SubExposures, blurred, smoothed
+
+_ROUNDS = 3, 5, 9
+"""Sub-exposures of each round; each later one has one more between every two, as levels of the loop do."""
+_DEGREE = 2
+"""Highest degree of the motion in time."""
+_DETAIL_PX = 1.2
+"""Blur of sub-exposures before they are compared, in px of a frame."""
+_AGREEMENT_PX = 2.0
+"""Window over which displaced sub-exposures are compared, in px of a frame."""
+_SMOOTHING_PX = 3.0
+"""Window over which the motion is fitted, in px of a frame."""
+_TOLERANCE_PX = 1.0
+"""Motion within which frames are summed before they are warped, in px of a frame, while the field is estimated."""
+_PRIOR = 1e-4
+"""Weight of no motion, relative to that of a sub-exposure at an end of the group."""
+_CLIPPED = 0.2, 99.8
+"""Percentiles of the values that are black and white to the optical flow."""
+
+
+def estimate_field(parts: SubExposures, moving: BoolArray) -> MotionField:
+    """Estimate how pixels move beyond the global motion.
+
+    In each round, sub-exposures are merged along the field so far, and joined to 3, then 5, then 9 longer ones. The flow from
+    the reference to each of these is added to the field, which is fitted by polynomials of time. So each round has less motion
+    that is still unknown, and less of it within a sub-exposure.
+
+    Args:
+        parts: the sub-exposures of the last round, merged along the global motion.
+        moving: (H, W) pixels to estimate; the field is 0 elsewhere.
+    """
+    field, sums = MotionField.zero(parts.shape), parts.sums
+    for n in _ROUNDS:
+        if n > len(parts.spans):
+            break
+        if n > _ROUNDS[0]:
+            sums = parts.along(field, moving, _TOLERANCE_PX)
+        field = _refined(parts, sums, field, n, moving)
+    return field
+
+
+def _refined(parts: SubExposures, sums: list[PhotonSum], field: MotionField, n: int, moving: BoolArray) -> MotionField:
+    """Return the field after a round.
+
+    Args:
+        parts: the sub-exposures.
+        sums: these along the field so far.
+        field: so far.
+        n: number of sub-exposures of this round.
+        moving: (H, W) pixels to estimate.
+    """
+    joined = parts.joined(sums, n)
+    images = [smoothed(each, parts.response, _DETAIL_PX, parts.scale) for each in joined.sums]
+    shades = _in_8_bits([each.values for each in images])
+    fixed = joined.reference
+    times, flows, trusts = [], [], []
+    for place, elapsed in enumerate(joined.times):
+        if place != fixed:
+            flow = _dense_flow(shades[fixed], shades[place])
+            times.append(elapsed)
+            flows.append(flow + _displaced(field.at(elapsed), flow))
+            trusts.append(_agreement(images[fixed], images[place], flow, parts))
+    degree = min(_DEGREE, n // 2)
+    coefficients = _fitted(times, flows, trusts, degree, _SMOOTHING_PX * parts.scale)
+    return MotionField(np.where(moving, coefficients, np.float32(0)))
+
+
+def _in_8_bits(images: Sequence[Image]) -> list[NDArray[np.uint8]]:
+    """Stretch images of noise that is uniform to grey levels, all alike."""
+    low, high = np.percentile(np.concatenate([each.ravel() for each in images]), _CLIPPED)
+    return [np.clip((each - low) * (255 / max(high - low, 1e-6)), 0, 255).astype(np.uint8) for each in images]
+
+
+def _dense_flow(fixed: NDArray[np.uint8], moving: NDArray[np.uint8]) -> Image:
+    """Return where pixels of `fixed` lie in `moving`, as a displacement: (2, H, W), x and y."""
+    # Filled, since a flow that is given is where the search starts.
+    start = np.zeros((*fixed.shape, 2), np.float32)
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return np.ascontiguousarray(np.moveaxis(search.calc(fixed, moving, start), -1, 0), np.float32)
+
+
+def _displaced(image: Image, flow: Image) -> Image:
+    """Return an image, (H, W) or (2, H, W), at displaced pixels."""
+    if image.ndim == 3:
+        return np.array([_displaced(each, flow) for each in image])
+    rows, columns = np.indices(image.shape, np.float32)
+    return np.asarray(
+        cv2.remap(image, columns + flow[0], rows + flow[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+    )
+
+
+def _agreement(fixed: Smoothed, moving: Smoothed, flow: Image, parts: SubExposures) -> Image:
+    """Return how well a displaced sub-exposure agrees with the reference: (H, W), 1 up to photon noise, 0 where unseen."""
+    there = Smoothed(_displaced(moving.values, flow), _displaced(moving.frames, flow))
+    error = blurred(there.squared_difference(fixed, parts.response), _AGREEMENT_PX * parts.scale)
+    seen = (there.frames > 0) & (fixed.frames > 0)
+    return np.where(seen, 1 / np.maximum(error, 1) ** 2, 0).astype(np.float32)
+
+
+def _fitted(times: list[float], flows: list[Image], trusts: list[Image], degree: int, blur_px: float) -> Image:
+    """Fit polynomials of time by weighted least squares, over windows: (degree, 2, H, W)."""
+    shape = trusts[0].shape
+    squares = {power: np.zeros(shape, np.float32) for power in range(2, 2 * degree + 1)}
+    right = np.zeros((degree, 2, *shape), np.float32)
+    for time, flow, trust in zip(times, flows, trusts, strict=True):
+        for power, total in squares.items():
+            total += np.float32(time**power) * trust
+        for d in range(degree):
+            right[d] += np.float32(time ** (d + 1)) * trust * flow
+    squares = {power: blurred(total, blur_px) for power, total in squares.items()}
+    right = np.array([[blurred(each, blur_px) for each in both] for both in right])
+    first = squares[2] + np.float32(_PRIOR)
+    if degree == 1:
+        return np.asarray(right / first, np.float32)
+    cross, second = squares[3], squares[4] + np.float32(_PRIOR)
+    determinant = first * second - cross**2
+    return np.array([second * right[0] - cross * right[1], first * right[1] - cross * right[0]], np.float32) / determinant

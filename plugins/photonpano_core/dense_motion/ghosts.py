@@ -1,0 +1,80 @@
+"""Find pixels whose photons contradict the global motion: they move by themselves, lie at another depth, or are occluded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from photonpano import BoolArray, Response
+from photonpano.merging import PhotonSum
+from photonpano_core.dense_motion.sub_exposures import INTERPOLATION, Image, blurred, smoothed
+
+_DETAIL_PX = 1.2
+"""Blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame."""
+_WINDOW_PX = 2.0
+"""Standard deviation of the window over which differences are summed up, in px of a frame."""
+_SMALLEST_PX = 16
+"""Fewer connected pixels, of a frame, are a false alarm: less than the window."""
+_FEWEST = 0.5
+"""Fewest degrees of freedom, on average over the window, of a pixel that is tested."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GhostMap:
+    """Where photons of a group contradict the global motion.
+
+    Convention:
+        The grid is that of the exposure at the reference instant.
+
+    Attributes:
+        significance: (H, W) float32, at least 0: by how many standard deviations of photon noise the sub-exposures differ from
+            each other; 0 where fewer than two saw a pixel.
+        moving: (H, W) bool, where it exceeds the threshold, over an area of some pixels.
+    """
+
+    significance: Image
+    moving: BoolArray
+
+
+def compared(sums: Sequence[PhotonSum], response: Response, scale: float, threshold: float, tolerated_px: float) -> GhostMap:
+    """Compare sub-exposures that are merged along the global motion.
+
+    Of K sub-exposures of a still scene, the squared differences from their mean, in units of the photon noise, add up to
+    chi-squared with K - 1 degrees of freedom, here averaged over a window. The cube root of the average is nearly normal
+    (Wilson and Hilferty 1931), from which the significance follows.
+
+    Args:
+        sums: sub-exposures, on the grid of the exposure.
+        response: the camera's response.
+        scale: pixels of the exposure per pixel of a frame.
+        threshold: significance from which on a pixel moves.
+        tolerated_px: error of the global motion whose effect is not significant, in px of a frame.
+    """
+    images = [smoothed(each, response, _DETAIL_PX, scale) for each in sums]
+    seen = np.maximum(sum(each.frames for each in images), np.float32(1))
+    mean = np.asarray(sum(each.frames * each.values for each in images) / seen, np.float32)
+    tolerated = (np.float32(tolerated_px * scale) * np.hypot(*np.gradient(mean))) ** 2
+    energy, freedom = np.zeros_like(mean), np.full_like(mean, -1)
+    for each in images:
+        variance = response.stabilised_std(np.maximum(each.frames, 1)) ** 2
+        energy += np.where(each.frames > 0, ((each.values - mean) ** 2 - tolerated) / variance, np.float32(0))
+        freedom += each.frames > 0
+    freedom = np.maximum(blurred(np.maximum(freedom, 0), _WINDOW_PX * scale), np.float32(1e-6))
+    ratio = np.maximum(blurred(energy, _WINDOW_PX * scale) / freedom, 0)
+    # Squares of neighbouring pixels are correlated, since their blurs overlap.
+    correlated = (_DETAIL_PX**2 + INTERPOLATION) / (2 * _WINDOW_PX**2 + _DETAIL_PX**2 + INTERPOLATION)
+    spread = np.float32(2 / 9 * correlated) / freedom
+    significance = np.maximum((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread), 0)
+    significance = np.where(freedom > _FEWEST, significance, np.float32(0)).astype(np.float32)
+    return GhostMap(significance, _without_specks(significance > threshold, _SMALLEST_PX * scale**2))
+
+
+def _without_specks(found: BoolArray, smallest: float) -> BoolArray:
+    """Drop connected pixels that are fewer than `smallest`."""
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
+    large = statistics[:, cv2.CC_STAT_AREA] >= smallest
+    large[0] = False
+    return np.asarray(large[labels])
