@@ -104,7 +104,7 @@ class _Burst:
         """Return a block as it lies, on the scale of uniform noise, and its variance there."""
         counts = self._counts(span)
         photons = PhotonSum(counts * self._worth, self._worth * np.float32(len(span)))
-        image = smoothed(photons, self._source.response, _DETAIL_PX, 1.0)
+        image = smoothed(photons, self._source.response, _DETAIL_PX, 1.0, 0.0)
         seen = image.frames > 0
         values = np.where(seen, image.values, image.values[seen].mean() if seen.any() else 0).astype(np.float32)
         frames = float(np.median(image.frames[seen])) if seen.any() else 1.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import MotionField
-from photonpano_core.dense_motion.sub_exposures import Image, Smoothed, SubExposures, blurred, smoothed
+from photonpano_core.dense_motion.sub_exposures import Image, Smoothed, SubExposures, blurred
 
 _ROUNDS = 3, 5, 9
 """Sub-exposures of each round; each later one has one more between every two, as levels of the loop do."""
@@ -23,7 +23,7 @@ _AGREEMENT_PX = 2.0
 """Window over which displaced sub-exposures are compared, in px of a frame."""
 _SMOOTHING_PX = 3.0
 """Window over which the motion is fitted, in px of a frame."""
-_TOLERANCE_PX = 1.0
+_TOLERANCE_PX = 2.0
 """Motion within which frames are summed before they are warped, in px of a frame, while the field is estimated."""
 _PRIOR = 1e-4
 """Weight of no motion, relative to that of a sub-exposure at an end of the group."""
@@ -63,7 +63,7 @@ def _refined(parts: SubExposures, sums: list[PhotonSum], field: MotionField, n: 
         moving: (H, W) pixels to estimate.
     """
     joined = parts.joined(sums, n)
-    images = [smoothed(each, parts.response, _DETAIL_PX, parts.scale) for each in joined.sums]
+    images = [parts.smoothed(each, _DETAIL_PX) for each in joined.sums]
     shades = _in_8_bits([each.values for each in images])
     fixed = joined.reference
     times, flows, trusts = [], [], []

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from photonpano import BoolArray, Response
-from photonpano.merging import PhotonSum
-from photonpano_core.dense_motion.sub_exposures import INTERPOLATION, Image, blurred, smoothed
+from photonpano import BoolArray
+from photonpano_core.dense_motion.sub_exposures import Image, SubExposures, blurred
 
 _DETAIL_PX = 1.2
 """Blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame."""
@@ -39,7 +37,7 @@ class GhostMap:
     moving: BoolArray
 
 
-def compared(sums: Sequence[PhotonSum], response: Response, scale: float, threshold: float, tolerated_px: float) -> GhostMap:
+def compared(parts: SubExposures, n: int, threshold: float, tolerated_px: float) -> GhostMap:
     """Compare sub-exposures that are merged along the global motion.
 
     Of K sub-exposures of a still scene, the squared differences from their mean, in units of the photon noise, add up to
@@ -47,13 +45,13 @@ def compared(sums: Sequence[PhotonSum], response: Response, scale: float, thresh
     (Wilson and Hilferty 1931), from which the significance follows.
 
     Args:
-        sums: sub-exposures, on the grid of the exposure.
-        response: the camera's response.
-        scale: pixels of the exposure per pixel of a frame.
+        parts: sub-exposures along the global motion.
+        n: number of longer ones to which they are joined, for more light.
         threshold: significance from which on a pixel moves.
         tolerated_px: error of the global motion whose effect is not significant, in px of a frame.
     """
-    images = [smoothed(each, response, _DETAIL_PX, scale) for each in sums]
+    scale, response = parts.scale, parts.response
+    images = [parts.smoothed(each, _DETAIL_PX) for each in parts.joined(parts.sums, n).sums]
     seen = np.maximum(sum(each.frames for each in images), np.float32(1))
     mean = np.asarray(sum(each.frames * each.values for each in images) / seen, np.float32)
     tolerated = (np.float32(tolerated_px * scale) * np.hypot(*np.gradient(mean))) ** 2
@@ -65,7 +63,8 @@ def compared(sums: Sequence[PhotonSum], response: Response, scale: float, thresh
     freedom = np.maximum(blurred(np.maximum(freedom, 0), _WINDOW_PX * scale), np.float32(1e-6))
     ratio = np.maximum(blurred(energy, _WINDOW_PX * scale) / freedom, 0)
     # Squares of neighbouring pixels are correlated, since their blurs overlap.
-    correlated = (_DETAIL_PX**2 + INTERPOLATION) / (2 * _WINDOW_PX**2 + _DETAIL_PX**2 + INTERPOLATION)
+    detail = _DETAIL_PX**2 + parts.blur_px2
+    correlated = detail / (2 * _WINDOW_PX**2 + detail)
     spread = np.float32(2 / 9 * correlated) / freedom
     significance = np.maximum((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread), 0)
     significance = np.where(freedom > _FEWEST, significance, np.float32(0)).astype(np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from photonpano import BoolArray, FrameSpan, Group, InputError, LensedSource, Source, Trajectory, VirtualExposure
+from photonpano import BoolArray, FrameSpan, Group, InputError, LensedSource, LitSource, Source, Trajectory, VirtualExposure
 from photonpano.merging import PhotonSum
 from photonpano_core.configs import LocalFlowConfig
 from photonpano_core.dense_motion.flow import estimate_field
@@ -45,7 +45,7 @@ class LocalFlowMerger:
         """Merge a group; see `photonpano.Merger`.
 
         Raises:
-            InputError: the lens of the source distorts.
+            InputError: the lens of the source distorts, or its light changes.
         """
         if trajectory is None:
             return exposure_of(unwarped_sum(source, group, scale), source, group, scale)
@@ -56,21 +56,22 @@ class LocalFlowMerger:
         """Find the pixels of a group whose photons contradict the global motion, on the grid of a frame.
 
         Raises:
-            InputError: the lens of the source distorts.
+            InputError: the lens of the source distorts, or its light changes.
         """
         return self._ghosts(self._divided(source, group, trajectory, 1.0))
 
     def _divided(self, source: Source, group: Group, trajectory: Trajectory, scale: float) -> SubExposures:
         if isinstance(source, LensedSource) and source.camera.distorts:
             raise InputError("merge.use: local-flow does not warp through a lens that distorts; use robust-merge or photon-mle")
+        if isinstance(source, LitSource):
+            raise InputError("merge.use: local-flow does not divide by light that changes; use robust-merge or photon-mle")
         wanted = self._config.sub_exposures
         number = number_of(source, group) if wanted == "auto" else wanted
         return SubExposures(source, group, trajectory, scale, number, self._config.tolerance_px)
 
     def _ghosts(self, parts: SubExposures) -> GhostMap:
         config = self._config
-        sums = parts.joined(parts.sums, min(_COMPARED, len(parts.spans))).sums
-        return compared(sums, parts.response, parts.scale, config.significance, config.tolerated_px)
+        return compared(parts, min(_COMPARED, len(parts.spans)), config.significance, config.tolerated_px)
 
     def _merged(self, parts: SubExposures) -> PhotonSum:
         total, moving = total_of(parts.sums), self._ghosts(parts).moving

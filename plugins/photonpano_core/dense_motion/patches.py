@@ -11,6 +11,8 @@ from photonpano.compiling import compiled
 
 Image = NDArray[np.float32]
 
+_ROUNDED_UP = 1 + 1e-6
+
 
 @dataclass(frozen=True, slots=True)
 class PatchGrid:
@@ -38,7 +40,8 @@ class PatchGrid:
         """Blend patches, (rows, columns, side, side), with windows of raised cosines, which add up to 1: (H, W)."""
         half = self.step
         window = 0.5 - 0.5 * np.cos(np.pi * (np.arange(self.side) + 0.5) / half)
-        patches = patches * np.outer(window, window).astype(np.float32)
+        # Slightly more than 1, so that rounding does not turn one frame into less.
+        patches = patches * (np.outer(window, window) * _ROUNDED_UP).astype(np.float32)
         rows, columns = self.n_patches
         image = np.zeros(((rows + 1) * half, (columns + 1) * half), np.float32)
         for down in range(2):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import MotionField
-from photonpano_core.dense_motion.sub_exposures import Image, SubExposures, blurred, smoothed
+from photonpano_core.dense_motion.sub_exposures import Image, SubExposures, blurred
 
 _DETAIL_PX, _WINDOW_PX = 0.9, 1.2
 """Blur of sub-exposures, and the window over which their differences are averaged, in px of a frame."""
@@ -64,7 +64,7 @@ def best_sum(parts: SubExposures, field: MotionField, where: BoolArray, toleranc
     poor = where & (best.explained < _EXPLAINED)
     movers = where & ~poor & (field.way_px > _MOVES_PX * parts.scale)
     if poor.any() and movers.any():
-        again = parts.along(field.filled(movers), poor, tolerance_px)
+        again = parts.along(field.filled(movers), poor, 2 * tolerance_px)
         mixed = [_replaced(each, other, poor) for each, other in zip(sums, again, strict=True)]
         best = best.improved(_robust_sum(parts, mixed, where), poor)
     return best.improved(_robust_sum(parts, parts.sums, where), where).photons
@@ -77,10 +77,10 @@ def _robust_sum(parts: SubExposures, sums: Sequence[PhotonSum], where: BoolArray
     is `1 / (1 + e)`: the gain of a Wiener filter. Pixels that one of both did not see keep their weight.
     """
     response, scale, reference = parts.response, parts.scale, sums[parts.reference]
-    fixed = smoothed(reference, response, _DETAIL_PX, scale)
+    fixed = parts.smoothed(reference, _DETAIL_PX)
     counts, weight, frames = reference.counts.copy(), reference.weight.copy(), reference.weight.copy()
     for each in (*sums[: parts.reference], *sums[parts.reference + 1 :]):
-        image = smoothed(each, response, _DETAIL_PX, scale)
+        image = parts.smoothed(each, _DETAIL_PX)
         error = blurred(image.squared_difference(fixed, response), _WINDOW_PX * scale)
         trust = np.where(where, 1 / (1 + np.maximum(error - np.float32(_TOLERATED), 0)), np.float32(1))
         counts += trust * each.counts

@@ -16,22 +16,21 @@ from photonpano import (
     FrameSpan,
     Group,
     LinearlyCorrectedSource,
-    LitSource,
     Response,
     Source,
     Trajectory,
     WeightedSource,
 )
-from photonpano.geometry import inverse, translation
-from photonpano.merging import Chunk, CountsCache, PhotonSum, accumulate, chunks_of, divided, gain_image
+from photonpano.geometry import apply, inverse, translation
+from photonpano.merging import Chunk, CountsCache, PhotonSum, accumulate, chunks_of, clipped, divided
 from photonpano_core.dense_motion.field import MotionField
 from photonpano_core.dense_motion.warping import add_along
 from photonpano_core.photon_mle import exposure_shape, to_exposure
 
 Image = NDArray[np.float32]
 
-INTERPOLATION = 1 / 6
-"""Variance of the average bilinear kernel, along an axis, in px squared: interpolation blurs noise by it."""
+_PLACES = 5
+"""Places along an axis, about, at which the blur of interpolation is looked at."""
 _CACHE_BYTES = 64 * 1024**2
 """Memory for sums of frames that are warped again in each round."""
 _SHIFT_PX = 0.2
@@ -86,6 +85,7 @@ class SubExposures:
         scale: pixels of the grid per pixel of a frame.
         sums: counts and weights of each along the global motion.
         reference: index of the one that contains the reference instant.
+        blur_px2: variance of the bilinear kernels, on average, in px of a frame squared: interpolation blurs noise by it.
     """
 
     def __init__(self, source: Source, group: Group, trajectory: Trajectory, scale: float, n: int, tolerance_px: float) -> None:
@@ -108,10 +108,10 @@ class SubExposures:
         start = group.span.start
         self.spans = [FrameSpan(start + part.start, start + part.stop) for part in divided(len(group.span), n)]
         self.reference = next(place for place, span in enumerate(self.spans) if group.reference < span.stop)
-        chunks = [chunks_of(span, trajectory, source.info.frame_shape, tolerance_px) for span in self.spans]
+        chunks = self._chunks(tolerance_px)
         self.sums = [accumulate(source, each, self._onto, self.shape, counts_of=self._cache) for each in chunks]
-        # Classes of light are not kept apart where frames are weighted: the weight is in frames of mean light.
-        self.sums = [PhotonSum(each.counts, each.weight) for each in self.sums]
+        to_image = inverse(self._onto @ np.array([chunk.homography for each in chunks for chunk in each]))
+        self.blur_px2 = _interpolation_blur(to_image, self.shape)
 
     def cropped(self, box: tuple[slice, slice]) -> SubExposures:
         """Return the same sub-exposures on some rows and columns of the grid."""
@@ -134,6 +134,10 @@ class SubExposures:
         times = [self.elapsed((self.spans[each.start].start + self.spans[each.stop - 1].stop - 1) / 2) for each in groups]
         reference = next(place for place, each in enumerate(groups) if self.reference in each)
         return Joined([total_of(sums[each.start : each.stop]) for each in groups], times, reference)
+
+    def smoothed(self, photons: PhotonSum, blur_px: float) -> Smoothed:
+        """Blur a sub-exposure by some px of a frame, and stabilise its noise."""
+        return smoothed(photons, self.response, blur_px, self.scale, self.blur_px2)
 
     @property
     def response(self) -> Response:
@@ -158,19 +162,21 @@ class SubExposures:
         # Frames between which the field moves by less than the tolerance are summed as well.
         fastest_px = float(np.percentile(field.way_px[where], _MOST)) / self.scale
         merged = []
-        for span, total in zip(self.spans, self.sums, strict=True):
-            chunks = chunks_of(span, self._trajectory, self._source.info.frame_shape, tolerance_px)
+        for chunks, total in zip(self._chunks(tolerance_px), self.sums, strict=True):
             counts, weight = np.zeros((2, places.shape[1]), np.float32)
             for chunk in chunks:
                 way_px = fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
                 for part in self._divided(chunk, math.ceil(way_px / tolerance_px)):
                     self._add(part, places, motion, counts, weight)
-            if isinstance(self._source, LitSource):
-                weight *= gain_image(self._source.light, span, inverse(self._onto), self.shape)[where]
             image = PhotonSum(total.counts.copy(), total.weight.copy())
             image.counts[where], image.weight[where] = counts, weight
             merged.append(image)
         return merged
+
+    def _chunks(self, tolerance_px: float) -> list[tuple[Chunk, ...]]:
+        """Return the chunks of each sub-exposure along the global motion."""
+        chunks = chunks_of(self._group.span, self._trajectory, self._source.info.frame_shape, tolerance_px)
+        return [clipped(chunks, span, self._trajectory) for span in self.spans]
 
     def _divided(self, chunk: Chunk, parts: int) -> list[Chunk]:
         if parts < 2:
@@ -186,6 +192,19 @@ class SubExposures:
             lit = lit * self._worth
         to_image, elapsed = inverse(self._onto @ chunk.homography), self.elapsed(chunk.span.centre)
         add_along(lit, self._worth, float(n_frames), to_image, places, motion, elapsed, counts, weight)
+
+
+def _interpolation_blur(to_image: FloatArray, shape: tuple[int, int]) -> float:
+    """Return the mean variance along an axis, `f (1 - f)` at the fraction f of a pixel, of bilinear kernels.
+
+    Args:
+        to_image: (N, 3, 3), pixels of the grid to pixels of frames.
+        shape: (height, width) of the grid.
+    """
+    places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in shape[::-1])), axis=-1)
+    found = apply(to_image, places.reshape(-1, 2))
+    fraction = found - np.floor(found)
+    return float(np.mean(fraction * (1 - fraction)))
 
 
 def worth_of(source: Source) -> Image:
@@ -204,7 +223,7 @@ def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
     return PhotonSum(counts, weight)
 
 
-def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: float) -> Smoothed:
+def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: float, interpolation_px2: float) -> Smoothed:
     """Blur a sub-exposure, and stabilise its noise.
 
     Args:
@@ -212,6 +231,7 @@ def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: floa
         response: the camera's response.
         blur_px: standard deviation of the Gaussian, in px of a frame.
         scale: pixels of the sub-exposure per pixel of a frame.
+        interpolation_px2: variance of the kernel that has blurred the noise before: see `SubExposures`.
     """
     counts, weight = (blurred(each, blur_px * scale) for each in (photons.counts, photons.weight))
     seen = weight > _SEEN * max(float(photons.weight.max()), 1.0)
@@ -220,7 +240,7 @@ def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: floa
     shift_px = (blur_px**2 * scale) * np.hypot(*np.gradient(weight)) / norm
     seen &= shift_px < _SHIFT_PX
     # The square of a Gaussian is a narrower one. Noise is independent between pixels of frames, but for their interpolation.
-    frames = np.maximum(norm * np.float32(4 * math.pi * (blur_px**2 + INTERPOLATION)), np.float32(1))
+    frames = np.maximum(norm * np.float32(4 * math.pi * (blur_px**2 + interpolation_px2)), np.float32(1))
     mean = np.where(seen, np.maximum(counts, 0) / norm, np.float32(0)).astype(np.float32)
     values = response.stabilised(response.flux(mean, frames), frames)
     return Smoothed(np.where(seen, values, np.float32(0)), np.where(seen, frames, np.float32(0)))
