@@ -129,7 +129,7 @@ def test_names_of_missing_plugin_are_errors_with_suggestions(small_capture: Path
     assert checked.exit_code == 2
     merger, locator, last = checked.output.splitlines()
     assert merger.endswith(
-        "scan.yaml:9:8: merge.use: there is no merger 'short-exposure'; known: photon-mle, robust-merge and splat"
+        "scan.yaml:9:8: merge.use: there is no merger 'short-exposure'; known: burst, local-flow, photon-mle, robust-merge and splat"
     )
     assert "scan.yaml:12:8: locate.use: there is no locator 'profile-shift'; known: chain-of-backends, direct, " in locator
     assert last == "error: the spec has 2 problems"
