@@ -169,7 +169,7 @@ def rows(case: Case, folder: Path, pictures: Path | None) -> Iterator[str]:
                 tones = [np.clip(np.nan_to_num(each) / high, 0, 1) ** (1 / 2.2) for each in (flux, capture.view)]
                 error = 0.5 + 2 * (np.nan_to_num(flux) - capture.view) / high
                 picture = np.vstack([*tones, np.clip(error, 0, 1)])
-                cv2.imwrite(str(pictures / f"{case.title}, {name}.png".replace(" ", "-")), 255 * picture)
+                cv2.imwrite(str(pictures / f"{case.title}, {name}.png".replace(" ", "-")), np.uint8(255 * picture))
         for name, motion in motions.items():
             found = FLOW.ghost_map(source, capture.group, motion).moving & inside
             both = (found & moving).sum()
