@@ -13,6 +13,7 @@ from photonpano.captures.sharp import require_sharp_views, sharp_pictures
 from photonpano.captures.writing import write_packed
 from photonpano.context import Progress, Quiet
 from photonpano.pipeline.components import build_source
+from photonpano.protocols import Source
 from photonpano.specs import Plan
 from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import StreamInfo
@@ -57,7 +58,8 @@ def convert(
         InputError: the frames are not binary, or a correction changes sums of frames, which bits cannot hold.
         OutputError: the file cannot be written, the disk is full, or OUTPUT.part is another file.
     """
-    return _write(plan, Path(output), progress, resumed or (lambda _: None))
+    with build_source(plan) as source:
+        return _write(source, plan, Path(output), progress, resumed or (lambda _: None))
 
 
 def simulate(
@@ -77,23 +79,24 @@ def simulate(
         OutputError: as `convert`; or the folder of the pictures is there already.
     """
     output = Path(output)
-    if sharp_every is None:
-        return _write(plan, output, progress, None)
-    sharp = output.with_suffix(".sharp")
-    with atomic_folder(sharp) as folder:
-        with build_source(plan) as source, one_thread_inside():
-            views, frames = require_sharp_views(source), range(0, source.info.n_frames, sharp_every)
-            with (progress or Quiet()).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
+    with build_source(plan) as source:
+        if sharp_every is None:
+            return _write(source, plan, output, progress, None)
+        sharp, views = output.with_suffix(".sharp"), require_sharp_views(source)
+        frames = range(0, source.info.n_frames, sharp_every)
+        with atomic_folder(sharp) as folder:
+            with one_thread_inside(), (progress or Quiet()).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
                 pictures = sharp_pictures(views, frames, thread_count(plan.run.threads))
                 write_pngs(folder, counted(pictures, advance), [f"frame_{frame:06}" for frame in frames])
-        return replace(_write(plan, output, progress, None), sharp=sharp)
+            return replace(_write(source, plan, output, progress, None), sharp=sharp)
 
 
-def _write(plan: Plan, output: Path, progress: Progress | None, resumed: Callable[[int], object] | None) -> WrittenCapture:
-    with build_source(plan) as source:
-        info, n_masked = source.info, int((~source.valid).sum())
-        with (progress or Quiet()).stage(f"writing {output.name}", info.n_frames, "frames") as advance:
-            path, *truth = write_packed(source, output, advance, thread_count(plan.run.threads), resumed)
+def _write(
+    source: Source, plan: Plan, output: Path, progress: Progress | None, resumed: Callable[[int], object] | None
+) -> WrittenCapture:
+    info, n_masked = source.info, int((~source.valid).sum())
+    with (progress or Quiet()).stage(f"writing {output.name}", info.n_frames, "frames") as advance:
+        path, *truth = write_packed(source, output, advance, thread_count(plan.run.threads), resumed)
     keys: dict[str, Any] = {"path": str(path)}
     if info.frame_rate_hz is not None:
         keys["frame_rate_hz"] = info.frame_rate_hz
