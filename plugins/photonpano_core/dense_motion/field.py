@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
+
+_STEPS = 8
+"""Straight lines by which a path is measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +42,9 @@ class MotionField:
 
     @property
     def way_px(self) -> Image:
-        """How far each pixel moves during the group, at most: (H, W), in px of the exposure."""
-        return np.asarray(np.hypot(*np.abs(self.coefficients).sum(axis=0)), np.float32)
+        """How far each pixel moves in a unit of time, on average over two: (H, W), in px of the exposure."""
+        places = [self.at(elapsed) for elapsed in np.linspace(-1, 1, _STEPS + 1)]
+        return np.asarray(sum(np.hypot(*(after - before)) for before, after in pairwise(places)) / 2, np.float32)
 
     def filled(self, known: NDArray[np.bool_]) -> MotionField:
         """Return the field in which each pixel moves as the nearest one that is known, (H, W)."""

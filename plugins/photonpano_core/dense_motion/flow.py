@@ -15,8 +15,8 @@ from photonpano_core.dense_motion.sub_exposures import Image, Smoothed, SubExpos
 
 _ROUNDS = 3, 5, 9
 """Sub-exposures of each round; each later one has one more between every two, as levels of the loop do."""
-_DEGREE = 2
-"""Highest degree of the motion in time."""
+_DEGREE = 4
+"""Highest degree of the motion in time: parallax of a camera in the hand turns back within a group."""
 _DETAIL_PX = 1.2
 """Blur of sub-exposures before they are compared, in px of a frame."""
 _AGREEMENT_PX = 2.0
@@ -122,9 +122,7 @@ def _fitted(times: list[float], flows: list[Image], trusts: list[Image], degree:
             right[d] += np.float32(time ** (d + 1)) * trust * flow
     squares = {power: blurred(total, blur_px) for power, total in squares.items()}
     right = np.array([[blurred(each, blur_px) for each in both] for both in right])
-    first = squares[2] + np.float32(_PRIOR)
-    if degree == 1:
-        return np.asarray(right / first, np.float32)
-    cross, second = squares[3], squares[4] + np.float32(_PRIOR)
-    determinant = first * second - cross**2
-    return np.array([second * right[0] - cross * right[1], first * right[1] - cross * right[0]], np.float32) / determinant
+    rows = [np.stack([squares[i + j + 2] for j in range(degree)], axis=-1) for i in range(degree)]
+    system = np.stack(rows, axis=-2) + np.float32(_PRIOR) * np.eye(degree, dtype=np.float32)
+    found = np.linalg.solve(system, np.moveaxis(right, (0, 1), (-2, -1)))
+    return np.asarray(np.moveaxis(found, (-2, -1), (0, 1)), np.float32)
