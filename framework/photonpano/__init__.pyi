@@ -22,11 +22,13 @@ from .api.verification import clean as clean
 from .api.verification import verify as verify
 from .api.video import Video as Video
 from .api.video import video as video
+from .context import Progress as Progress
 from .contributions import Config as Config
 from .contributions import ExporterContribution as ExporterContribution
 from .contributions import InterpolatorContribution as InterpolatorContribution
 from .contributions import LocatorContribution as LocatorContribution
 from .contributions import MergerContribution as MergerContribution
+from .contributions import PoseEstimatorContribution as PoseEstimatorContribution
 from .contributions import Recognised as Recognised
 from .contributions import RefinerContribution as RefinerContribution
 from .contributions import RendererContribution as RendererContribution
@@ -66,6 +68,7 @@ from .protocols import Locator as Locator
 from .protocols import Merger as Merger
 from .protocols import PackedSource as PackedSource
 from .protocols import PanoramaView as PanoramaView
+from .protocols import PoseEstimator as PoseEstimator
 from .protocols import Refiner as Refiner
 from .protocols import Renderer as Renderer
 from .protocols import Resampler as Resampler
@@ -80,6 +83,7 @@ from .specs import load_spec as load_spec
 from .specs import parse_spec as parse_spec
 from .values import Bayer as Bayer
 from .values import BoolArray as BoolArray
+from .values import CameraGuess as CameraGuess
 from .values import CaptureSummary as CaptureSummary
 from .values import Counts as Counts
 from .values import FloatArray as FloatArray
@@ -90,11 +94,15 @@ from .values import Group as Group
 from .values import Homography as Homography
 from .values import Light as Light
 from .values import Located as Located
+from .values import LostFrames as LostFrames
 from .values import NotLocated as NotLocated
 from .values import Panorama as Panorama
 from .values import PanoramaRows as PanoramaRows
+from .values import PosedView as PosedView
+from .values import PoseEstimate as PoseEstimate
 from .values import Refined as Refined
 from .values import Response as Response
+from .values import ScenePoints as ScenePoints
 from .values import SpanResiduals as SpanResiduals
 from .values import StreamInfo as StreamInfo
 from .values import VirtualExposure as VirtualExposure

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 
 from photonpano.errors import CaptureUnreadError
 from photonpano.paths import given_path, refusal
-from photonpano.protocols import Exporter, Interpolator, Locator, Merger, Refiner, Renderer, Resampler, Source
+from photonpano.protocols import Exporter, Interpolator, Locator, Merger, PoseEstimator, Refiner, Renderer, Resampler, Source
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
@@ -326,3 +326,11 @@ class ExporterContribution(StageContribution):
             raise ValueError(f"{self.name}: suffix is a dot and small letters or digits, such as .exr, got {self.suffix!r}")
         if self.suffix in _TAKEN_SUFFIXES:
             raise ValueError(f"{self.name}: every run writes panorama{self.suffix} itself; choose another suffix")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseEstimatorContribution(StageContribution):
+    """Offers a pose estimator. Experimental: the record may change with any version."""
+
+    kind: ClassVar[str] = "pose-estimator"
+    build: Callable[[Any, StageContext], PoseEstimator]

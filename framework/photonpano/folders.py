@@ -14,7 +14,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from photonpano.atomic import flush, is_partial, partial_paths, remove, unfinished_folder
 from photonpano.errors import OutputError
@@ -57,6 +57,26 @@ def remove_leftovers(directory: Path) -> None:
                 remove(path)
 
 
+def others_in(directory: Path, own: Iterable[str]) -> list[Path]:
+    """Return what lies in a folder beside some files.
+
+    Args:
+        directory: the folder.
+        own: the paths of the files in it. A folder that holds none of them is returned whole.
+    """
+    own = set(own)
+    holders = {str(parent) for name in own for parent in PurePosixPath(name).parents}
+    found, folders = [], [directory]
+    for folder in folders:  # grows meanwhile
+        for path in _entries(folder):
+            name = path.relative_to(directory).as_posix()
+            if name in holders and path.is_dir() and not path.is_symlink():
+                folders.append(path)
+            elif name not in own and not is_ours(name):
+                found.append(path)
+    return found
+
+
 def is_ours(name: str) -> bool:
     """Return whether a name in a folder belongs to its replacement."""
     return name in (PENDING, ".lock") or is_partial(name, ".", ".partial") or _OLDER.fullmatch(name) is not None
@@ -68,13 +88,13 @@ def replace_folder(staging: Path, directory: Path, replaced: Iterable[str]) -> N
     Args:
         staging: from `staging_of`; afterwards it is gone.
         directory: it may be missing.
-        replaced: the names of the files that the old folder loses, or gets anew.
+        replaced: the paths in the folder of the files that it loses, or gets anew, such as `sparse/images.txt`.
 
     Raises:
         OSError: the disk is full, or something cannot be renamed; the folder is as it was.
         OutputError: the new files are complete, but could not all be put in place.
     """
-    written = {path.name for path in staging.iterdir()}
+    written = {path.relative_to(staging).as_posix() for path in _files(staging)}
     flush_folder(staging)
     if staging.parent == directory or not _exchanged(staging, directory, {*replaced, *written}):
         (staging / _REMOVED).write_text("\n".join({*replaced} - written), encoding="utf-8")
@@ -111,24 +131,30 @@ def _put_in_place(pending: Path, directory: Path) -> None:
     removed = pending / _REMOVED
     if removed.exists():  # then none is in place yet
         for name in removed.read_text(encoding="utf-8").splitlines():
-            (directory / name).unlink(missing_ok=True)
+            with suppress(NotADirectoryError):
+                (directory / name).unlink(missing_ok=True)
+            with suppress(OSError):  # other files may lie in it
+                (directory / name).parent.rmdir()
         removed.unlink()
-    for path in pending.iterdir():
-        target = directory / path.name
+    for path in _files(pending):
+        target = directory / path.relative_to(pending)
+        target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists() and target.samefile(path):  # a rename onto itself does nothing
             path.unlink()
         else:
             path.replace(target)
     _flush_committed(directory)
-    pending.rmdir()
+    shutil.rmtree(pending)
 
 
 def _remove_old(old: Path, directory: Path, replaced: set[str]) -> None:
     """Remove the old folder; what another program has put there since it was copied moves to the new one."""
-    for path in _entries(old):
+    for path in others_in(old, replaced):
+        target = directory / path.relative_to(old)
         with suppress(OSError):
-            if path.name not in replaced and not is_ours(path.name) and not os.path.lexists(directory / path.name):
-                path.rename(directory / path.name)
+            if not os.path.lexists(target):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                path.rename(target)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -144,14 +170,16 @@ def _exchanged(staging: Path, directory: Path, replaced: set[str]) -> bool:
         _flush_committed(directory.parent)
         return True
     shutil.copymode(directory, staging)
-    others = [path for path in _entries(directory) if path.name not in replaced and not is_ours(path.name)]
+    others = [path for path in others_in(directory, replaced) if not os.path.lexists(staging / path.relative_to(directory))]
     for path in others:
-        _link(path, staging / path.name)
+        target = staging / path.relative_to(directory)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _link(path, target)
     if others:
         flush(staging)
     if not _exchange(staging, directory):
         for path in others:
-            remove(staging / path.name)
+            remove(staging / path.relative_to(directory))
         return False
     _flush_committed(directory.parent)
     _remove_old(staging, directory, replaced)
@@ -193,9 +221,14 @@ def link_or_copy(path: str | Path, target: str | Path) -> None:
 
 def flush_folder(folder: Path) -> None:
     """Wait until the files of a folder and their names are on the disk."""
-    for path in folder.iterdir():
+    for path in folder.rglob("*"):
         flush(path)
     flush(folder)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Return all files in a folder, those in its folders as well."""
+    return sorted(path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
 
 
 def _entries(directory: Path) -> list[Path]:

@@ -22,6 +22,7 @@ from photonpano.contributions import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
+    PoseEstimatorContribution,
     RefinerContribution,
     RendererContribution,
     ResamplerContribution,
@@ -342,6 +343,36 @@ def photonpano_exporters() -> Iterable[ExporterContribution]:  # type: ignore[em
                 config=PgmConfig,
                 suffix=".pgm",
                 build=lambda config, context: Pgm(),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_pose_estimators() -> Iterable[PoseEstimatorContribution]:  # type: ignore[empty-body]
+    """Offer pose estimators: they find the pose of each frame of a camera that travels through a scene. Experimental.
+
+    Example:
+        ```python
+        from photonpano import Config, LocationError, PoseEstimatorContribution, hookimpl
+
+
+        class NeverFound:
+            def estimate(self, source, camera, progress):
+                raise LocationError("this is an example; choose another pose estimator")
+
+
+        class NeverFoundConfig(Config):
+            pass
+
+
+        @hookimpl
+        def photonpano_pose_estimators():
+            yield PoseEstimatorContribution(
+                name="never-posed",
+                summary="Finds no pose at all",
+                config=NeverFoundConfig,
+                build=lambda config, context: NeverFound(),
             )
         ```
     """

@@ -1,4 +1,4 @@
-"""The interfaces of the eight components that plugins build."""
+"""The interfaces of the components that plugins build."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photonpano.context import Progress
 from photonpano.values import (
     BoolArray,
+    CameraGuess,
     Counts,
     FloatArray,
     FluxImage,
@@ -24,6 +26,7 @@ from photonpano.values import (
     NotLocated,
     Panorama,
     PanoramaRows,
+    PoseEstimate,
     Refined,
     Response,
     SpanResiduals,
@@ -488,5 +491,24 @@ class Exporter(Protocol):
         Args:
             panorama: what to write.
             path: the file; it does not exist yet.
+        """
+        ...
+
+
+class PoseEstimator(Protocol):
+    """Estimates where a camera was in each frame, in six degrees of freedom (paper, section 6). Experimental."""
+
+    def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
+        """Estimate the poses of a capture.
+
+        The framework refuses an estimate with poses for frames that are not located, or without poses for those that are.
+
+        Args:
+            source: the capture.
+            camera: what the spec says about it; what it gives stays as it is.
+            progress: receives stages and messages.
+
+        Raises:
+            LocationError: there are no poses to be found; the message says why, with numbers, and what to do.
         """
         ...

@@ -29,6 +29,7 @@ KINDS = {
     "photonpano_refiners": ("refiner", "jump"),
     "photonpano_renderers": ("renderer", "nearest-pixel"),
     "photonpano_exporters": ("exporter", "pgm"),
+    "photonpano_pose_estimators": ("pose-estimator", "never-posed"),
 }
 
 

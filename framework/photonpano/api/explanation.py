@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from photonpano.errors import PhotonpanoError
+from photonpano.errors import InputError, PhotonpanoError
 from photonpano.motion.pairs import pairs_of
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
 from photonpano.protocols import Source
@@ -27,10 +27,12 @@ def forecast(plan: Plan) -> Forecast:
     """Predict time and memory of a run, from a trial on the middle of the capture.
 
     Raises:
+        InputError: the spec finds poses.
         PhotonpanoError: the trial failed, as the run may.
     """
     from photonpano.pipeline.forecast import forecast as forecast_from
 
+    _require_levels(plan)
     with open_source(plan) as source:
         return forecast_from(plan, source)
 
@@ -51,11 +53,18 @@ def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None 
         InputError: the capture cannot be used as it is.
         SpecError: a stage does not suit it.
     """
+    if with_forecast:
+        _require_levels(plan)
     with open_source(plan) as source:
         title = f"# {plan.file or 'the spec'} as it will run, on {source.info}"
         writer = _Writer(plan, discover() if catalog is None else catalog, list(_levels(plan, source)))
         prediction = [f"# {line}" for line in _forecast_lines(plan, source)] if with_forecast else []
     return "\n".join([title, *writer.lines(), *prediction]) + "\n"
+
+
+def _require_levels(plan: Plan) -> None:
+    if plan.pose is not None:
+        raise InputError("a forecast is of panoramas, and the spec finds poses: leave out --forecast")
 
 
 def _levels(plan: Plan, source: Source) -> Iterator[str]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from photonpano.atomic import atomic_folder
 from photonpano.errors import InputError
-from photonpano.evaluation import load_run_trajectory
-from photonpano.poses import POSE_FORMATS, PoseFormat, Poses
+from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_poses, load_run_trajectory
+from photonpano.poses import POSE_FORMATS, PoseFormat, Poses, centres
 from photonpano.record.contents import require_one_run
 from photonpano.record.run_json import read_record
 
@@ -29,12 +29,12 @@ class ExportedPoses:
 
 
 def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, every: int = 1) -> ExportedPoses:
-    """Write the rotations and the camera of a run for another program.
+    """Write the poses and the camera of a run for another program.
 
     Frames that were not located are left out.
 
     Args:
-        run_folder: written by `run`, with the model `rotation`.
+        run_folder: written by `run`, with the model `rotation` or with `pose`.
         file_format: "colmap" (text model), "nerfstudio" (transforms.json) or "tum" (trajectory).
         output: a new folder.
         every: 1 for all located frames, 2 for every other, and so on.
@@ -54,16 +54,25 @@ def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, 
     with atomic_folder(output) as written:
         for name, text in files.items():
             (written / name).write_text(text, encoding="utf-8")
-    return ExportedPoses(tuple(output / name for name in files), len(poses.frames))
+    return ExportedPoses(tuple(output / name for name in files), len(poses.names))
 
 
 def _poses(folder: Path, every: int, needs_seconds: bool) -> Poses:
-    require_one_run(folder, ["trajectory.npz"])
-    run = load_run_trajectory(folder, needs_std_px=False)
-    if run.turn is None:
-        raise InputError(
-            f"{folder} knows homographies, and no rotations of a camera; run its spec again with --set motion.model=rotation"
-        )
+    require_one_run(folder, ["trajectory.npz", "poses.npz"])
+    positions = None
+    run: RunPoses | RunTrajectory
+    if has_poses(folder):
+        run = load_run_poses(folder)
+        camera, positions = run.camera, centres(run.camera_from_world)
+        rotations = np.swapaxes(run.camera_from_world[:, :, :3], -1, -2)
+    else:
+        run = load_run_trajectory(folder, needs_std_px=False)
+        if run.turn is None:
+            raise InputError(
+                f"{folder} knows homographies, and no rotations of a camera; run its spec again with "
+                "--set motion.model=rotation"
+            )
+        camera, rotations = run.turn.camera, run.turn.rotations
     frames = np.flatnonzero(run.located)[::every]
     if not len(frames):
         raise InputError(f"{folder}: the run located no frame, so that it has no poses")
@@ -74,4 +83,6 @@ def _poses(folder: Path, every: int, needs_seconds: bool) -> Poses:
             "the spec again"
         )
     digits = len(str(len(run.located) - 1))
-    return Poses(run.turn.camera, run.frame_shape, frames, run.turn.rotations[frames], frames / (rate or 1.0), digits)
+    names = tuple(f"frame_{frame:0{digits}}.png" for frame in frames.tolist())
+    places = None if positions is None else positions[frames]
+    return Poses(camera, run.frame_shape, names, rotations[frames], frames / (rate or 1.0), places)

@@ -15,12 +15,13 @@ def check(spec: SpecPath, overrides: Overrides = None) -> None:
     """
     from photonpano.pipeline.components import foreseen_groups, open_source
     from photonpano.specs import load_spec
+    from photonpano.text import counted
 
     plan = load_spec(spec, overrides or ())
     with open_source(plan) as source:
-        count = len(plan.levels)
-        levels = f"{'up to ' if plan.until_converged else ''}{count} level{'' if count == 1 else 's'}"
-        typer.echo(f"{spec}: ok, {levels} on {plan.source.contribution.name}: {source.info}")
+        what = f"poses by {plan.pose.contribution.name}" if plan.pose else counted(len(plan.levels), "level")
+        up_to = "up to " if plan.until_converged else ""
+        typer.echo(f"{spec}: ok, {up_to}{what} on {plan.source.contribution.name}: {source.info}")
         for decision in plan.decisions:
             typer.echo(f"{decision.what} is {decision.value}: {decision.reason}")
         for reason in dict.fromkeys(groups for groups in foreseen_groups(plan, source) if isinstance(groups, str)):

@@ -30,7 +30,7 @@ def export(
 ) -> None:
     """Write where the camera looked in each frame, for other programs.
 
-    Needs a run with the model rotation. Frames that were not located are left out.
+    Needs a run with the model rotation, or with pose. Frames that were not located are left out.
 
     Example: photonpano export runs/turn --format colmap --output poses
     """

@@ -28,6 +28,7 @@ class KindName(StrEnum):
     REFINER = "refiner"
     RENDERER = "renderer"
     EXPORTER = "exporter"
+    POSE_ESTIMATOR = "pose-estimator"
 
 
 _KIND_NAMES = ", ".join(KindName)

@@ -44,15 +44,17 @@ def run(
 
     Writes the run folder: panorama.png to look at, panorama.tiff with linear flux, coverage.tiff, trajectory.npz, run.json
     (settings, versions, results) and report.html. The verdict says whether motion and panorama explain the photons.
+    A spec with 'pose' finds the poses of a camera instead: poses.npz, and files of other programs.
 
     Example: photonpano run scan.yaml --output runs/first --set render.scale=2
     """
     from photonpano.cli.errors import WrongArgumentError, warn
     from photonpano.cli.progress import progress_for_stderr
-    from photonpano.cli.verdict import print_verdict, require_trust
+    from photonpano.cli.verdict import DoubtfulError, print_verdict, require_trust
     from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
     from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
+    from photonpano.text import counted
 
     if resume and from_level is not None:
         raise WrongArgumentError("--resume and --from-level: give one of them")
@@ -63,7 +65,8 @@ def run(
     record, directory = result.record, result.directory.resolve()
     if result.was_finished:
         typer.echo("finished  this run was finished before; nothing was left to do")
-    print_verdict(result.verdict)
+    if result.verdict is not None:
+        print_verdict(result.verdict)
     for warning in record["warnings"]:
         warn(warning)
     for decision in record["decisions"]:
@@ -74,11 +77,17 @@ def run(
             typer.echo(f"refined   {_correction(refinement)}")
     if line := _range(record.get("panorama")):
         typer.echo(f"range     {line}")
-    typer.echo(f"panorama  {directory / 'panorama.png'}")
+    if poses := record["poses"]:
+        typer.echo(f"located   {poses['located']:,} of {counted(record['source']['n_frames'], 'frame')}")
+        typer.echo(f"poses     {directory / 'poses.npz'}")
+    else:
+        typer.echo(f"panorama  {directory / 'panorama.png'}")
     if "report.html" in record["files"]:
         typer.echo(f"report    {directory / 'report.html'}")
-    if strict:
+    if strict and result.verdict is not None:
         require_trust(result.verdict, "all files of the run folder are written")
+    if strict and poses and poses["doubts"]:
+        raise DoubtfulError("the poses are doubtful, and --strict accepts only trusted ones; all files of the run are written")
 
 
 def _range(panorama: "PanoramaRecord | None") -> str:

@@ -3,6 +3,7 @@
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_run_trajectory, load_truth
+from photonpano.evaluation.pose_inputs import RunPoses, has_poses, load_run_poses, load_true_poses
 from photonpano.evaluation.rotations import RotationScore, Turn, rotation_errors
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
@@ -12,6 +13,7 @@ __all__ = [
     "ImageScore",
     "Renderer",
     "RotationScore",
+    "RunPoses",
     "RunTrajectory",
     "TrajectoryScore",
     "Truth",
@@ -20,8 +22,11 @@ __all__ = [
     "covered",
     "evaluate",
     "exposure_bound_px",
+    "has_poses",
     "image_score",
+    "load_run_poses",
     "load_run_trajectory",
+    "load_true_poses",
     "load_truth",
     "pair_bound_px",
     "rotation_errors",

@@ -16,6 +16,8 @@ from photonpano.geometry import PROJECTIONS, Camera, Canvas, corners, nearest_ro
 from photonpano.reading import read_arrays, reading
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
+_TRUTH = "a truth as `photonpano simulate` writes it"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
@@ -88,7 +90,11 @@ def load_truth(path: Path) -> Truth:
         InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
     """
     optional = ("scene", "undistorted_corners", "rotations", "camera_matrix", "distortion")
-    arrays = _read_archive(path, "a truth as `photonpano simulate` writes it", ("homographies", "frame_shape"), optional)
+    if set(read_arrays(path, _TRUTH, ("camera_from_world", "homographies"))) == {"camera_from_world"}:
+        raise InputError(
+            f"{path} is the truth of a camera that travels, which has poses and no homographies; score a run with `pose` by it"
+        )
+    arrays = _read_archive(path, _TRUTH, ("homographies", "frame_shape"), optional)
     scene = arrays.get("scene")
     frame_shape, homographies = _frame_shape(path, arrays), _homographies(path, arrays)
     return Truth(
@@ -114,6 +120,10 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
     path = folder / "trajectory.npz"
+    if (folder / "poses.npz").exists() and not path.exists():
+        raise InputError(
+            f"{folder} is a run with `pose`: it has the poses of a camera that travels, and neither homographies nor a panorama"
+        )
     if not path.exists():
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
     required, error = ("homographies", "canvas", "frame_shape", "located"), ("std_px",)

@@ -27,7 +27,7 @@ from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import attributing, shown
 from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
-from photonpano.protocols import ColouredSource, Resampler, Source, light_of
+from photonpano.protocols import ColouredSource, PoseEstimator, Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
@@ -209,6 +209,24 @@ def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tu
         assert isinstance(choice.contribution, ExporterContribution)
         exporters.append(AttributedExporter(_built(choice, context), choice.label, choice.contribution.suffix))
     return tuple(exporters)
+
+
+def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
+    """Build the pose estimator of a plan that has one.
+
+    Args:
+        plan: which pose estimator.
+        source: the capture.
+        decisions: receives the decisions that it takes.
+    """
+    from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
+
+    assert plan.pose is not None
+    threads = thread_count(plan.run.threads)
+    capture = cache(lambda: summarise(source, threads))
+    context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
+    estimator: PoseEstimator = _built(plan.pose, context)
+    return estimator
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:

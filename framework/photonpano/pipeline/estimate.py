@@ -11,7 +11,7 @@ from photonpano.captures.repeats import timeline_of
 from photonpano.context import Context
 from photonpano.contributions import MergerContribution
 from photonpano.corrections import Vignette, divided_by, estimate_vignette
-from photonpano.errors import CanvasTooLargeError, InputError, LocationError
+from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.level import Level
@@ -19,6 +19,7 @@ from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.run_steps import require_centre
 from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
@@ -68,7 +69,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         CanvasTooLargeError: the panorama would be far larger than the memory.
         PluginError: a component failed in its own way, or broke its contract.
     """
-    _require_camera_of(plan, source)
+    require_centre(plan, source)
     reference = _reference_frame(plan, source)
     levels = build_levels(plan, source, decisions)
     timeline = timeline_of(source, context)
@@ -227,22 +228,6 @@ def model_of(plan: Plan) -> MotionModel:
     camera, distortion = plan.camera, plan.camera.distortion
     k1, k2, p1, p2 = (_given(each) for each in (distortion.k1, distortion.k2, distortion.p1, distortion.p2))
     return MotionModel(plan.motion.model, _given(camera.focal_px), camera.centre_px, (k1, k2, p1, p2))
-
-
-def _require_camera_of(plan: Plan, source: Source) -> None:
-    """Refuse a principal point that does not lie in the frames: the camera is then that of larger ones."""
-    if plan.camera.centre_px is None:
-        return
-    (x, y), (height, width) = plan.camera.centre_px, source.info.frame_shape
-    if not (0 <= x < width and 0 <= y < height):
-        raise InputError(
-            str(
-                plan.place("camera.centre_px").problem(
-                    f"({x:g}, {y:g}) does not lie in the frames of {height}x{width} px; a camera that was calibrated with "
-                    "other frames has another principal point and focal length here: scale and shift both"
-                )
-            )
-        )
 
 
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:

@@ -9,36 +9,31 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from photonpano.captures.fingerprint import capture_files
 from photonpano.captures.obstacles import naming_obstacles
 from photonpano.captures.order import order_warning
-from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
 from photonpano.corrections import CorrectedSource, FilteredSource
-from photonpano.errors import InputError, OutputError
-from photonpano.merging.panorama import RenderedPanorama
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
 from photonpano.pipeline.components import build_refiners, open_source
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.observers import Observers
+from photonpano.pipeline.pose_run import run_poses
 from photonpano.pipeline.rendering import render_into
-from photonpano.pipeline.run_folder import RunFolder, run_folder
-from photonpano.protocols import Source, light_of
-from photonpano.record.run_json import peak_memory_bytes, record_of
+from photonpano.pipeline.run_folder import run_folder
+from photonpano.pipeline.run_steps import COMPILING, read_files, require_photons_of, with_report
+from photonpano.protocols import light_of
+from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_report
-from photonpano.residuals.refinement import Explained, refine
+from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
-from photonpano.values import Light
 
 logger = logging.getLogger(__name__)
-
-COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +43,13 @@ class RunResult:
     Attributes:
         directory: the run folder.
         record: the content of its `run.json`.
-        verdict: whether motion and panorama explain the photons.
+        verdict: whether motion and panorama explain the photons; None for poses, whose doubts are in the record.
         was_finished: whether `resume` found that nothing was left to do.
     """
 
     directory: Path
     record: RunRecord
-    verdict: Verdict
+    verdict: Verdict | None
     was_finished: bool = False
 
 
@@ -67,7 +62,7 @@ def run(
     from_level: int | None = None,
     keep_work: bool = False,
 ) -> RunResult:
-    """Run a plan and write its run folder: panorama, coverage, trajectory, record and report.
+    """Run a plan and write its run folder: panorama, coverage, trajectory, record and report; or poses, for a plan with `pose`.
 
     Args:
         plan: from `load_spec` or `parse_spec`.
@@ -76,7 +71,7 @@ def run(
         resume: go on with a run of the same spec, capture and versions that was interrupted. If it was finished, its results
             are returned.
         from_level: take the levels before this one from the run before, whose work was kept; compute this one and what follows.
-            The work is kept again.
+            The work is kept again. A run of poses keeps no work.
         keep_work: keep what each level has found, beside the run folder, for `from_level`.
 
     Raises:
@@ -86,19 +81,25 @@ def run(
         PluginError: a component failed in its own way, or broke its contract.
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
     """
+    if plan.pose is not None:
+        return RunResult(
+            plan.output.directory,
+            run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keep_work or from_level is not None),
+            verdict=None,
+        )
     observers = Observers(plan.observers, plan.output.directory)
     context = Context(thread_count(plan.run.threads), progress or Quiet(), observers.level_finished)
     with (
         observers.watching(plan.document) as finished,
         open_source(plan) as source,
-        run_folder(plan.output.directory, overwrite=overwrite, inputs=_read_files(plan)) as folder,
+        run_folder(plan.output.directory, overwrite=overwrite, inputs=read_files(plan)) as folder,
         loading_figures(),
         one_thread_inside(),
         notify_on_first_compile(partial(context.progress.note, COMPILING)),
         ExitStack() as stack,
     ):
         start, memory = time.perf_counter(), int(plan.run.memory)
-        _require_photons(plan, source)
+        require_photons_of(plan, source)
         depends_on = run_fingerprint(plan, source)
         if resume and (done := finished_run(plan, depends_on)) is not None:
             finished(done[0])
@@ -127,36 +128,7 @@ def run(
             )
         )
         work.finish()
-        record = _with_report(folder, record, explained, panorama, light_of(source))
+        light = light_of(source)
+        record = with_report(folder, record, lambda record: render_report(record, explained, panorama, light))
         finished(record)
     return RunResult(plan.output.directory, record, verdict)
-
-
-def _read_files(plan: Plan) -> list[Path]:
-    return [*capture_files(plan), *([] if plan.file is None else [plan.file])]
-
-
-def _with_report(
-    folder: RunFolder, record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None
-) -> RunRecord:
-    """Add the report to the run folder. The results are there already: what fails now is a warning."""
-    try:
-        folder.reopen()
-        try:
-            folder.write_report(render_report(record, explained, panorama, light))
-        except Exception as error:
-            logger.debug("the report failed", exc_info=True)
-            warning = f"the report could not be drawn ({type(error).__name__}: {error}); all other files of the run are written"
-            record = {**record, "warnings": [*record["warnings"], warning]}
-        return folder.commit({**record, "peak_memory_bytes": peak_memory_bytes()})
-    except OutputError as error:
-        warning = f"the report could not be added ({error}); all other files of the run are written"
-        return {**record, "warnings": [*record["warnings"], warning]}
-
-
-def _require_photons(plan: Plan, source: Source) -> None:
-    """Refuse a capture that is all dark or all lit, at the place of the spec that names it."""
-    try:
-        require_photons(source)
-    except InputError as error:
-        raise InputError(str(plan.place("source").problem(str(error)))) from error

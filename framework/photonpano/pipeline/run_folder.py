@@ -21,9 +21,9 @@ from photonpano.corrections import Vignette, write_vignette
 from photonpano.errors import OutputError
 from photonpano.folders import (
     finish_replacement,
-    is_ours,
     link_or_copy,
     lock_path,
+    others_in,
     remove_leftovers,
     replace_folder,
     staging_of,
@@ -124,6 +124,7 @@ class RunFolder:
         with _writing(self.directory):
             self.staging = self._stack.enter_context(staging_of(self.directory))
             for name in recorded_contents(self.directory) or ():
+                (self.staging / name).parent.mkdir(parents=True, exist_ok=True)
                 link_or_copy(self.directory / name, self.staging / name)
 
 
@@ -215,7 +216,7 @@ def _require_harmless(directory: Path, inputs: Sequence[Path]) -> None:
 def _require_own(directory: Path) -> None:
     """Refuse a folder with files that no run has written."""
     own = names_of_results(directory) if recorded_json(directory) else set()
-    others = sorted(path.name for path in directory.iterdir() if path.name not in own and not is_ours(path.name))
+    others = sorted(path.relative_to(directory).as_posix() for path in others_in(directory, own))
     if others:
         more = f" and {len(others) - SHOWN_FILES} more" if len(others) > SHOWN_FILES else ""
         raise OutputError(

@@ -8,7 +8,7 @@ import logging
 import stat
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from photonpano.captures.fingerprint import frames_sha256
@@ -31,13 +31,14 @@ RESULTS = frozenset(
 
 
 def contents_of(folder: Path, known: Mapping[str, FileContent] | None = None) -> dict[str, FileContent]:
-    """Return size and SHA-256 of the files in a folder, without run.json.
+    """Return size and SHA-256 of the files in a folder by their paths in it, such as `sparse/images.txt`, without run.json.
 
     Args:
-        folder: all files of it count.
+        folder: all files of it count, those in folders as well.
         known: those of some files, which are not read.
     """
-    names = sorted(path.name for path in folder.iterdir() if path.name != RECORD)
+    paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    names = sorted(name for path in paths if (name := path.relative_to(folder).as_posix()) != RECORD)
     return {name: (known or {}).get(name) or _content(folder / name) for name in names}
 
 
@@ -51,15 +52,15 @@ def recorded_json(folder: Path) -> Mapping[str, Any] | None:
 
 
 def recorded_contents(folder: Path) -> Mapping[str, FileContent] | None:
-    """Return size and SHA-256 of each file as run.json lists them; None if it lists none."""
+    """Return size and SHA-256 of each file as run.json lists them; None if it lists none, or files outside of the folder."""
     listed = (recorded_json(folder) or {}).get("files")
-    if not isinstance(listed, dict) or not all(isinstance(each, dict) for each in listed.values()):
+    if not isinstance(listed, dict) or not all(isinstance(each, dict) and _lies_inside(name) for name, each in listed.items()):
         return None
     return listed
 
 
 def names_of_results(folder: Path) -> set[str]:
-    """Return the names in a folder that belong to its run."""
+    """Return the paths in a folder of the files that belong to its run."""
     return {*RESULTS, *(recorded_contents(folder) or ())}
 
 
@@ -124,6 +125,10 @@ def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source)
     recorded = record.get("capture")
     if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):
         raise InputError(f"{folder}: the capture has other frames than when it was run; it is another capture")
+
+
+def _lies_inside(name: str) -> bool:
+    return not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
 
 
 def _differs(path: Path, recorded: FileContent) -> bool:

@@ -78,6 +78,29 @@ def record_of(
     if plan.until_converged:
         decisions = [*decisions, levels_decision(levels)]
     return {
+        **started_record(plan, stream, [*decisions, *rendered], seconds, capture),
+        "levels": [level_record(result) for result in levels],
+        "panorama": panorama_record(plan, panorama, rendered),
+        "motion": motion_record(motion.std_px),
+        "refinements": [refinement_record(each) for each in explained.refinements],
+        "verdict": verdict_record(verdict),
+        "warnings": [*level_warnings(levels), *motion_warnings(motion), *refinement_warnings(explained.refinements)],
+    }
+
+
+def started_record(
+    plan: Plan, stream: StreamInfo, decisions: Sequence[Decision], seconds: float, capture: CaptureRecord
+) -> RunRecord:
+    """Return the record of a finished run without its results.
+
+    Args:
+        plan: what was run.
+        stream: the capture.
+        decisions: the choices that the spec left open.
+        seconds: time that the run took.
+        capture: its fingerprint.
+    """
+    return {
         "photonpano": importlib.metadata.version("photonpano"),
         "status": "done",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -93,17 +116,18 @@ def record_of(
         },
         "plugins": plugin_records(plan),
         "libraries": library_versions(plan),
-        "decisions": decision_records([*decisions, *rendered]),
-        "levels": [level_record(result) for result in levels],
-        "panorama": panorama_record(plan, panorama, rendered),
-        "motion": motion_record(motion.std_px),
-        "refinements": [refinement_record(each) for each in explained.refinements],
-        "verdict": verdict_record(verdict),
-        "warnings": [*level_warnings(levels), *motion_warnings(motion), *refinement_warnings(explained.refinements)],
+        "decisions": decision_records(decisions),
+        "levels": [],
+        "panorama": None,
+        "motion": None,
+        "refinements": [],
+        "verdict": None,
+        "warnings": [],
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
         "capture": capture,
         "rendered_from": None,
+        "poses": None,
     }
 
 
@@ -149,6 +173,9 @@ def library_versions(plan: Plan) -> dict[str, str]:
 def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
     """Yield the sections of a spec with the component that each chooses, level by level."""
     yield "source", plan.source
+    if plan.pose is not None:
+        yield "pose", plan.pose
+        return
     for level in plan.levels:
         yield from (("resample", level.resample), ("merge", level.merge), ("locate", level.locate))
         yield from (("locate", choice) for choice in level.fallbacks)

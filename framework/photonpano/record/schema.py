@@ -57,11 +57,11 @@ class ClosureRecord(TypedDict):
 class CameraRecord(TypedDict):
     """A camera that turns: focal length and principal point in px of a frame, and k1, k2, p1, p2 of its lens.
 
-    `std_focal_px` and `std_distortion` are the expected errors of what was found, 0 for what was given.
+    `std_focal_px` and `std_distortion` are the expected errors of what was found, 0 for what was given, None if not known.
     """
 
     focal_px: float
-    std_focal_px: float
+    std_focal_px: float | None
     centre_px: Sequence[float]
     distortion: Sequence[float]
     std_distortion: Sequence[float]
@@ -181,6 +181,32 @@ class VerdictRecord(TypedDict):
     residual_ratio: float | None
 
 
+class LostFramesRecord(TypedDict):
+    """Frames whose pose was not found, as a half-open span [start, stop), and why."""
+
+    frames: Sequence[int]
+    reason: str
+
+
+class PosesRecord(TypedDict):
+    """The poses of a camera that travels.
+
+    `located` counts frames. `std_position` and `std_rotation_deg` are the expected errors of the located frames, root mean
+    square; the length of the path is 1. They are None where the estimator knows none. `points` and `exposures` count those of
+    `sparse`; `levels` is what the pose estimator records, and `doubts` are reasons why the poses may be wrong.
+    """
+
+    camera: CameraRecord
+    located: int
+    std_position: float | None
+    std_rotation_deg: float | None
+    points: int
+    exposures: int
+    lost: Sequence[LostFramesRecord]
+    levels: Sequence[Mapping[str, float | int | str | None]]
+    doubts: Sequence[str]
+
+
 class FileContent(TypedDict):
     """The size of a file, and its SHA-256 in hexadecimal digits."""
 
@@ -191,7 +217,8 @@ class FileContent(TypedDict):
 class RunRecord(TypedDict):
     """The content of `run.json`.
 
-    `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none; `peak_memory_bytes` is None where the
+    `created` is an ISO 8601 time. `motion`, `verdict` and `panorama` are None where a run has none, as one of poses, which has
+    `poses` instead; that is None elsewhere. `peak_memory_bytes` is None where the
     system does not report it. `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
     `rendered_from` is the run folder whose motion was rendered again, None where the motion was estimated.
     """
@@ -217,3 +244,4 @@ class RunRecord(TypedDict):
     capture: CaptureRecord
     files: NotRequired[Mapping[str, FileContent]]
     rendered_from: str | None
+    poses: PosesRecord | None

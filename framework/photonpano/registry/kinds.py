@@ -11,6 +11,7 @@ from photonpano.contributions import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
+    PoseEstimatorContribution,
     RefinerContribution,
     RendererContribution,
     ResamplerContribution,
@@ -51,6 +52,7 @@ KINDS: Mapping[str, Kind] = {
         Kind("refiner", "refine", "photonpano_refiners", RefinerContribution, ("refine",)),
         Kind("renderer", "render", "photonpano_renderers", RendererContribution, ("render",)),
         Kind("exporter", "output.formats", "photonpano_exporters", ExporterContribution, ("export",)),
+        Kind("pose-estimator", "pose", "photonpano_pose_estimators", PoseEstimatorContribution, ("estimate",)),
     )
 }
 """All kinds by name, in the order in which a run needs them."""

@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.failures import failure_groups
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Light, true_spans
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 PICTURE_PIXELS = 1600
 """Longer side of the panorama on the page; the files of the run folder have all pixels."""
@@ -39,6 +42,22 @@ def render_report(
         panorama: the panorama; None for a run that failed.
         light: that the run found; None if it is steady.
     """
+    page: str = (
+        environment_of()
+        .get_template("report.html")
+        .render(
+            **head_of(record),
+            stages=figures.STAGE_NAMES,
+            failures=failure_groups(record["levels"]),
+            stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
+            **({"picture": None} if explained is None or panorama is None else _results(record, explained, panorama, light)),
+        )
+    )
+    return page
+
+
+def environment_of() -> Environment:
+    """Return what fills the templates, with filters that write numbers."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -50,18 +69,18 @@ def render_report(
     )
     for name in ("byte_size", "count", "counted", "duration", "pixels", "rate", "share", "span"):
         environment.filters[name] = getattr(text, name)
-    page: str = environment.get_template("report.html").render(
-        record=record,
-        title=_title(record),
-        created=datetime.fromisoformat(record["created"]).strftime("%d %B %Y, %H:%M %Z").strip(),
-        capture_seconds=_capture_seconds(record),
-        stages=figures.STAGE_NAMES,
-        failures=failure_groups(record["levels"]),
-        spec_yaml=_yaml(record["spec"]),
-        stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
-        **({"picture": None} if explained is None or panorama is None else _results(record, explained, panorama, light)),
-    )
-    return page
+    return environment
+
+
+def head_of(record: RunRecord) -> dict[str, Any]:
+    """Return what the pages of all runs show."""
+    return {
+        "record": record,
+        "title": _title(record),
+        "created": datetime.fromisoformat(record["created"]).strftime("%d %B %Y, %H:%M %Z").strip(),
+        "capture_seconds": _capture_seconds(record),
+        "spec_yaml": _yaml(record["spec"]),
+    }
 
 
 def _results(record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None) -> dict[str, Any]:

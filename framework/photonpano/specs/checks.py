@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from photonpano.specs.plan import Choice, Plan
     from photonpano.values import StreamInfo
 
-STAGES = tuple(kind.section for kind in KINDS.values() if kind.name not in ("source", "refiner", "renderer", "exporter"))
+STAGES = tuple(KINDS[name].section for name in ("resampler", "merger", "locator", "interpolator"))
 """The sections of a spec that choose the components of a level, in the order of the loop."""
 MAX_COMPLAINTS = 100
 """Most problems of one component that are reported."""
@@ -28,7 +28,7 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
     Returns:
         The problems, each at its place in the spec; empty if there are none.
     """
-    choices: dict[str, Choice] = {}
+    choices: dict[str, Choice] = {} if plan.pose is None else {"pose": plan.pose}
     for index, level in enumerate(plan.levels):
         choices |= {f"levels.{index}.{stage}": getattr(level, stage) for stage in STAGES}
         choices |= {f"levels.{index}.locate.fallback.{rank}": choice for rank, choice in enumerate(level.fallbacks)}

@@ -19,6 +19,7 @@ from photonpano.specs.resolution import (
     DEFAULTS,
     LEVELS,
     MAX_LEVELS,
+    PANORAMA_ONLY,
     SETTINGS,
     UNTIL_CONVERGED,
     VERSION,
@@ -40,6 +41,11 @@ FALLBACK = "the locators to which a lost pair is offered, in order: one or a lis
 REFINE = "the refiners that correct the motion after the last level, in order: one or a list, each a name or {use, with}"
 """The description of the refiners, but for the default."""
 
+POSE = (
+    "instead of a panorama, the pose of each frame of a camera that travels through a scene: a name, or {use, with}. The "
+    "sections of the panorama do not apply then. Experimental"
+)
+"""The description of the pose estimator."""
 FORMATS = "further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}"
 """The description of the formats."""
 
@@ -65,6 +71,7 @@ def json_schema(catalog: Catalog) -> Schema:
     definitions["fallback"] = _one_or_list(one)
     refiners = _one_or_list(_item(KINDS["refiner"], entries, schemas))
     sections["refine"] = {"description": f"{REFINE}; by default {DEFAULT_REFINER}"} | refiners
+    sections["pose"] = {"description": POSE} | _item(KINDS["pose-estimator"], entries, schemas)
     for entry in entries:
         if isinstance(entry.contribution, LocatorAlias):
             definitions[_definition(schemas[entry.contribution.config])]["properties"]["backends"]["items"] = one
@@ -83,6 +90,8 @@ def json_schema(catalog: Catalog) -> Schema:
         "type": "object",
         "additionalProperties": False,
         "required": ["version", "source"],
+        "if": {"required": ["pose"]},
+        "then": {"properties": dict.fromkeys(PANORAMA_ONLY, False)},
         "properties": {
             "version": {"const": VERSION, "description": "the version of the format"},
             "source": sections.pop("source"),

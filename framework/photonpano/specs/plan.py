@@ -87,6 +87,7 @@ class Plan:
         observers: the plugins that watch the run.
         decisions: choices that the spec leaves open and that reading it made: the source that recognises the capture.
         corrects_itself: `corrections` is `auto`: the run masks what stands still, and divides by a vignette.
+        pose: the pose estimator, which takes the place of the levels, of refiners and of the panorama; None for a panorama.
     """
 
     source: Choice
@@ -109,6 +110,7 @@ class Plan:
     observers: tuple[Observer, ...] = ()
     decisions: tuple[Decision, ...] = ()
     corrects_itself: bool = False
+    pose: Choice | None = None
 
     def place(self, where: str) -> Place:
         """Return where a value was written, by its path in `document`; for a default, where it would stand."""

@@ -66,8 +66,10 @@ SETTINGS: dict[str, type[BaseModel]] = {
 """The framework's own sections."""
 MAX_LISTED = 16
 """The largest number of components in a list, such as fallbacks."""
-SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", *SETTINGS)
+SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", "pose", *SETTINGS)
 """All sections of a spec, in the order in which they are written."""
+PANORAMA_ONLY = (*STAGES, "refine", "levels", "motion", "light", "graph", "render")
+"""The sections that do not apply with `pose`."""
 _CHOICE = ("use", "with")
 """The keys that choose a component."""
 _AGAIN = "would lose the same pairs again"
@@ -124,6 +126,8 @@ class _Resolver:
         root = spec.mapping(spec.data, "")
         if root is None:
             return None
+        if posed := "pose" in root:
+            root = self.without_panorama(root)
         refiners = self.items(KIND_OF["refine"], root.get("refine"), "refine", DEFAULT_REFINER)
         spec.sections_of = self.sections_of(root, refiners)
         spec.check_keys(root, "", SECTIONS)
@@ -143,15 +147,18 @@ class _Resolver:
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
         renderer = self.renderer(root.get("render"))
         formats = self.formats(_written_formats(root))
+        pose = self.pose(root["pose"]) if posed else None
         self.spell_out_light(root)
         settings: dict[str, Any] = {
             name: validate(model, _settings(name, root.get(name)), name, spec) for name, model in SETTINGS.items()
         }
         if isinstance(settings["motion"], MotionSettings) and isinstance(settings["camera"], CameraSettings):
-            self.check_camera(settings["motion"], settings["camera"])
+            self.check_camera(None if posed else settings["motion"], settings["camera"])
+        if not posed and isinstance(settings["output"], OutputSettings) and settings["output"].exposures:
+            spec.wrong("output.exposures", "true needs a section `pose`: a panorama has no exposures with poses; remove it")
         if isinstance(settings["motion"], MotionSettings) and isinstance(settings["render"], RenderSettings):
             self.check_projection(settings["motion"], settings["render"])
-        if source is None or renderer is None or spec.problems:
+        if source is None or renderer is None or (posed and pose is None) or spec.problems:
             return None
         until_converged = root.get("levels") == UNTIL_CONVERGED
         chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
@@ -166,6 +173,11 @@ class _Resolver:
         }
         document["render"] = _component(renderer) | document["render"]
         document["output"] |= {"formats": [_component(each) for each in formats]}
+        if pose is not None:
+            document = {key: value for key, value in document.items() if key not in PANORAMA_ONLY} | {"pose": _component(pose)}
+            del document["output"]["formats"]
+        else:
+            del document["output"]["exposures"]
         return Plan(
             source,
             corrections or (),
@@ -181,18 +193,52 @@ class _Resolver:
             observers=self.catalog.observers,
             decisions=tuple(spec.decisions),
             corrects_itself=corrections is None,
+            pose=pose,
         )
 
-    def check_camera(self, motion: MotionSettings, camera: CameraSettings) -> None:
-        """Refuse what the model homography cannot find: it knows no camera."""
+    def without_panorama(self, root: dict[str, Any]) -> dict[str, Any]:
+        """Refuse the sections that do not apply with `pose`, and return the others."""
+        for key in PANORAMA_ONLY:
+            if key in root:
+                message = "does not apply with `pose`, which finds poses instead of a panorama; remove it, or remove `pose`"
+                self.spec.wrong_key(key, message)
+        if _written_formats(root) is not None:
+            message = "does not apply with `pose`: there is no panorama to write; `photonpano export` writes poses"
+            self.spec.wrong_key("output.formats", message)
+        own = {key: value for key, value in root.items() if key not in PANORAMA_ONLY}
+        output = own.get("output")
+        if isinstance(output, dict):
+            own["output"] = {key: value for key, value in output.items() if key != "formats"}
+        return own
+
+    def pose(self, data: Any) -> Choice | None:
+        """Resolve the pose estimator, which is a name or a mapping."""
+        content = {} if data is None else data
+        return self.item(KIND_OF["pose"], content, "pose")
+
+    def check_camera(self, motion: MotionSettings | None, camera: CameraSettings) -> None:
+        """Refuse what the model homography cannot find, as it knows no camera, and what pose estimators (no motion) cannot."""
+        if motion is None:
+            return self.check_posed_camera(camera)
         if motion.model != "homography":
-            return
+            return None
         distortion = camera.distortion.model_dump()
         for key in (key for key, number in distortion.items() if number == "find"):
             message = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
             self.spec.wrong(f"camera.distortion.{key}", message)
         if camera.focal_px == "find" and any(distortion.values()):
             message = "distortion is in units of the focal length: give camera.focal_px, or take motion.model: rotation"
+            self.spec.wrong_key("camera.distortion", message)
+        return None
+
+    def check_posed_camera(self, camera: CameraSettings) -> None:
+        """Refuse a distortion that is to be found: pose estimators take it as it is given."""
+        distortion = camera.distortion.model_dump()
+        for key in (key for key, number in distortion.items() if number == "find"):
+            message = "find does not apply with `pose`: calibrate the lens, or measure it in a run with motion.model: rotation"
+            self.spec.wrong(f"camera.distortion.{key}", message)
+        if camera.focal_px == "find" and any(number not in (0, "find") for number in distortion.values()):
+            message = "distortion is in units of the focal length: give camera.focal_px"
             self.spec.wrong_key("camera.distortion", message)
 
     def check_projection(self, motion: MotionSettings, render: RenderSettings) -> None:
@@ -210,7 +256,7 @@ class _Resolver:
 
     def sections_of(self, root: dict[str, Any], refiners: list[Any]) -> dict[str, list[str]]:
         """Return the sections in which each key may stand, for the components that the spec chooses."""
-        with_component = ("source", *STAGES, "render")
+        with_component = ("source", *STAGES, "render", "pose")
         keys = {f"{name}.with": self.keys_of(KIND_OF[name], _name(name, root.get(name))) for name in with_component}
         for index, item in enumerate(refiners):
             where = f"refine.{index}.with" if isinstance(root.get("refine"), list) else "refine.with"

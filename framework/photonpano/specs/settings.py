@@ -65,10 +65,10 @@ class DistortionSettings(Config):
 
 
 class CameraSettings(Config):
-    """The camera, for the model rotation, and its lens."""
+    """The camera, for the model rotation and for poses, and its lens."""
 
     focal_px: Literal["find"] | Annotated[float, Field(ge=10, le=1e6)] = Field(
-        "find", description="focal length in px of a frame; find measures it, for the model rotation"
+        "find", description="focal length in px of a frame; find measures it, for the model rotation and for poses"
     )
     centre_px: tuple[float, float] | None = Field(
         None, description="(x, y) of the principal point, in px of a frame; by default the middle of the frames"
@@ -145,6 +145,9 @@ class OutputSettings(Config):
     directory: SpecPath = Field(
         description="the run folder; by default `runs/` and the name of the spec, beside the spec; the name of the capture "
         "follows if `--set` chooses one"
+    )
+    exposures: bool = Field(
+        False, description="with `pose`: whether the exposures whose poses were found are written, as pictures in images/"
     )
 
 

@@ -6,6 +6,7 @@ from photonpano.values.exposure import Panorama, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.light import Light
 from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated
+from photonpano.values.poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
 from photonpano.values.refinement import Refined, SpanResiduals
 from photonpano.values.rendered import PanoramaRows
 
@@ -13,6 +14,7 @@ __all__ = [
     "Ambiguity",
     "Bayer",
     "BoolArray",
+    "CameraGuess",
     "CaptureSummary",
     "Counts",
     "Decision",
@@ -26,11 +28,15 @@ __all__ = [
     "Homography",
     "Light",
     "Located",
+    "LostFrames",
     "NotLocated",
     "Panorama",
     "PanoramaRows",
+    "PoseEstimate",
+    "PosedView",
     "Refined",
     "Response",
+    "ScenePoints",
     "SpanResiduals",
     "StreamInfo",
     "VirtualExposure",

@@ -1,0 +1,108 @@
+"""Write the files of a run with `pose`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from photonpano.errors import OutputError
+from photonpano.geometry import Camera
+from photonpano.photometry import tone_mapped
+from photonpano.poses import Poses, centres, colmap, nerfstudio, ply, tum
+from photonpano.values import FluxImage, PoseEstimate, StreamInfo
+
+_WHITE_QUANTILE = 0.995
+"""Quantile of the flux of an exposure that is white in its picture."""
+
+
+def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
+    """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and if they are asked for pictures in images/.
+
+    Args:
+        folder: where the files of the run are gathered.
+        estimate: in a world in which the path has the length 1.
+        stream: the capture.
+        exposures: whether the exposures are written.
+
+    Returns:
+        Warnings.
+
+    Raises:
+        OutputError: the disk is full.
+    """
+    try:
+        _write(folder, estimate, stream)
+        for name, view in zip(view_names(estimate, stream.n_frames), estimate.views if exposures else (), strict=False):
+            (folder / "images").mkdir(exist_ok=True)
+            (folder / "images" / name).write_bytes(_picture(view.flux()))
+    except OSError as error:
+        reason = error.strerror or "a file was cut short"
+        raise OutputError(f"the poses could not be written ({reason}); what was in the run folder is unchanged") from error
+    if stream.frame_rate_hz is None:
+        return ["poses.tum is not written, since the capture gives no frame rate: set source.with.frame_rate_hz"]
+    return []
+
+
+def view_names(estimate: PoseEstimate, n_frames: int) -> tuple[str, ...]:
+    """Return the file names of the exposures, by the first of their frames, such as `exposure_0250.png`."""
+    digits = len(str(n_frames - 1))
+    return tuple(f"exposure_{view.span.start:0{digits}}.png" for view in estimate.views)
+
+
+def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
+    camera = Camera(estimate.camera_matrix, estimate.distortion)
+    np.savez(
+        folder / "poses.npz",
+        allow_pickle=False,
+        camera_from_world=estimate.camera_from_world,
+        camera_matrix=estimate.camera_matrix,
+        distortion=estimate.distortion,
+        located=estimate.located,
+        std_position=estimate.std_position,
+        std_rotation_deg=estimate.std_rotation_deg,
+        frame_shape=np.array(stream.frame_shape),
+        frame_rate_hz=np.array(np.nan if stream.frame_rate_hz is None else stream.frame_rate_hz),
+    )
+    rate = stream.frame_rate_hz or 1.0
+    seen = _of_views(camera, estimate, stream, rate)
+    (folder / "sparse").mkdir()
+    for name, text in colmap(seen).items():
+        (folder / "sparse" / name).write_text(text, encoding="utf-8")
+    for name, text in nerfstudio(seen).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "points.ply").write_bytes(ply(estimate.points))
+    if stream.frame_rate_hz is not None:
+        frames = np.flatnonzero(estimate.located)
+        poses = estimate.camera_from_world[frames]
+        names = tuple(map(str, frames.tolist()))
+        to_world = np.swapaxes(poses[:, :, :3], -1, -2)
+        located = Poses(camera, stream.frame_shape, names, to_world, frames / rate, centres(poses))
+        (folder / "poses.tum").write_text(tum(located)["trajectory.txt"], encoding="utf-8")
+
+
+def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: float) -> Poses:
+    """Return the poses of the exposures, with what they show."""
+    poses = np.array([view.camera_from_world for view in estimate.views]).reshape(-1, 3, 4)
+    return Poses(
+        camera,
+        stream.frame_shape,
+        view_names(estimate, stream.n_frames),
+        np.swapaxes(poses[:, :, :3], -1, -2),
+        np.array([view.instant for view in estimate.views]) / rate,
+        centres(poses),
+        tuple((np.asarray(view.points), view.xy) for view in estimate.views),
+        estimate.points,
+    )
+
+
+def _picture(flux: FluxImage) -> bytes:
+    """Return an exposure as PNG, grey or in colour, 8 bits in sRGB."""
+    known = np.isfinite(flux)
+    white = float(np.quantile(flux[known], _WHITE_QUANTILE)) if known.any() else 1.0
+    picture = tone_mapped(flux, max(white, 1e-12))
+    encoded, png = cv2.imencode(".png", picture)
+    if not encoded:
+        raise OutputError(f"OpenCV could not encode an exposure of {picture.shape} as PNG")
+    return png.tobytes()

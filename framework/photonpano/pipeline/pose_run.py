@@ -1,0 +1,105 @@
+"""One run with `pose`: open the capture, find the pose of every frame, write the run folder."""
+
+from __future__ import annotations
+
+import logging
+import time
+from functools import partial
+
+from photonpano.captures.fingerprint import fingerprint
+from photonpano.captures.obstacles import naming_obstacles
+from photonpano.captures.order import order_warning
+from photonpano.compiling import notify_on_first_compile
+from photonpano.context import Progress, Quiet
+from photonpano.corrections import CorrectedSource, FilteredSource
+from photonpano.errors import InputError
+from photonpano.motion.attribution import attributing
+from photonpano.pipeline.components import build_pose_estimator, open_source
+from photonpano.pipeline.observers import Observers
+from photonpano.pipeline.pose_checks import require_estimate
+from photonpano.pipeline.pose_files import write_pose_files
+from photonpano.pipeline.run_folder import run_folder
+from photonpano.pipeline.run_steps import COMPILING, read_files, require_centre, require_photons_of, with_report
+from photonpano.poses import in_standard_world
+from photonpano.protocols import Source
+from photonpano.record.pose_record import poses_record, poses_warnings
+from photonpano.record.run_json import started_record
+from photonpano.record.schema import RunRecord
+from photonpano.report import loading_figures, render_pose_report
+from photonpano.specs.plan import Plan
+from photonpano.threads import one_thread_inside
+from photonpano.values import CameraGuess, Decision, PoseEstimate
+
+logger = logging.getLogger(__name__)
+
+
+def run_poses(
+    plan: Plan, progress: Progress | None = None, *, overwrite: bool = False, resume: bool = False, keeps_work: bool = False
+) -> RunRecord:
+    """Run a plan with a pose estimator, and write its run folder.
+
+    Args:
+        plan: from `load_spec` or `parse_spec`.
+        progress: receives stages and messages; quiet by default.
+        overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
+        resume: begin anew, with a note: such a run keeps nothing to go on with.
+        keeps_work: whether the caller asks for work that is kept, which is refused.
+
+    Returns:
+        The content of `run.json`.
+
+    Raises:
+        InputError: the capture cannot be used, shows nothing, or does not suit the plan; or `keeps_work`.
+        LocationError: the poses could not be found.
+        PluginError: the pose estimator failed in its own way, or broke its contract.
+        OutputError: the run folder cannot be written, or another process writes it; it is as it was.
+    """
+    if keeps_work:
+        raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
+    progress = progress or Quiet()
+    if resume:
+        progress.note("a run with `pose` keeps no work: it begins anew")
+    observers = Observers(plan.observers, plan.output.directory)
+    with (
+        observers.watching(plan.document) as finished,
+        open_source(plan) as source,
+        run_folder(plan.output.directory, overwrite=overwrite, inputs=read_files(plan)) as folder,
+        loading_figures(),
+        one_thread_inside(),
+        notify_on_first_compile(partial(progress.note, COMPILING)),
+    ):
+        start = time.perf_counter()
+        require_photons_of(plan, source)
+        if warning := order_warning(source):
+            logger.warning(warning)
+        decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource | FilteredSource) else ())]
+        capture = fingerprint(plan, source)
+        with naming_obstacles(source, decisions):
+            estimate = _estimated(plan, source, decisions, progress)
+        warnings = [*poses_warnings(estimate), *write_pose_files(folder.staging, estimate, source.info, plan.output.exposures)]
+        record = folder.commit(
+            {
+                **started_record(plan, source.info, decisions, time.perf_counter() - start, capture),
+                "poses": poses_record(estimate),
+                "warnings": warnings,
+            }
+        )
+        record = with_report(folder, record, lambda record: render_pose_report(record, estimate))
+        finished(record)
+    return record
+
+
+def camera_guess(plan: Plan) -> CameraGuess:
+    """Return what a spec says about the camera."""
+    camera, given = plan.camera, plan.camera.distortion.model_dump()
+    k1, k2, p1, p2 = (float(given[name]) for name in ("k1", "k2", "p1", "p2"))
+    return CameraGuess(None if camera.focal_px == "find" else camera.focal_px, camera.centre_px, (k1, k2, p1, p2))
+
+
+def _estimated(plan: Plan, source: Source, decisions: list[Decision], progress: Progress) -> PoseEstimate:
+    """Return the poses, checked, in a world in which the path has the length 1."""
+    assert plan.pose is not None
+    require_centre(plan, source)
+    estimator = build_pose_estimator(plan, source, decisions)
+    with attributing(plan.pose.label, "the capture"):
+        return in_standard_world(require_estimate(estimator.estimate(source, camera_guess(plan), progress), source.info))

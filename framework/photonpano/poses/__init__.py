@@ -1,0 +1,17 @@
+"""Poses of a camera: their gauge, and the files in which other programs read them."""
+
+from photonpano.poses.formats import POSE_FORMATS, PoseFormat, Poses, colmap, nerfstudio, ply, tum
+from photonpano.poses.gauge import centres, in_standard_world, path_length
+
+__all__ = [
+    "POSE_FORMATS",
+    "PoseFormat",
+    "Poses",
+    "centres",
+    "colmap",
+    "in_standard_world",
+    "nerfstudio",
+    "path_length",
+    "ply",
+    "tum",
+]

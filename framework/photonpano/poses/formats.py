@@ -1,0 +1,175 @@
+"""The poses of a camera, as files of other programs.
+
+Convention:
+    Rotations map directions of a camera to those of the world, x right, y down, z ahead; positions are those of the camera in
+    the world. For a camera that only turns, the world is the reference camera, and all positions are zero. Integers are pixel
+    centres here; COLMAP and nerfstudio add 0.5.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.geometry import Camera
+from photonpano.photometry import tone_mapped
+from photonpano.values import FloatArray, ScenePoints
+
+PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "tum"]
+
+_GRAPHICS = np.diag([1.0, -1.0, -1.0])
+"""Axes of a camera in OpenGL, x right, y up, z back, to ours."""
+_WHITE_QUANTILE = 0.995
+"""Quantile of the flux of points that is white."""
+_MIDDLE_GREY = 128
+_UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Directions of the reference camera to a world whose z is up, in which that camera looks along y."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Where a camera was, and where it looked.
+
+    Attributes:
+        camera: of all images.
+        frame_shape: (height, width) of an image.
+        names: file names of N images.
+        rotations: (N, 3, 3), directions of each camera to those of the world.
+        seconds: (N,) times of the images.
+        positions: (N, 3) of the cameras in the world; None if the camera only turned.
+        observed: for each image the indices of K points and where it shows them, (K, 2); empty if they are not known.
+        points: of the scene; None if they are not known.
+    """
+
+    camera: Camera
+    frame_shape: tuple[int, int]
+    names: tuple[str, ...]
+    rotations: FloatArray
+    seconds: FloatArray
+    positions: FloatArray | None = None
+    observed: tuple[tuple[NDArray[np.intp], FloatArray], ...] = ()
+    points: ScenePoints | None = None
+
+    @property
+    def places(self) -> FloatArray:
+        """(N, 3) positions of the cameras, zeros if the camera only turned."""
+        return np.zeros((len(self.names), 3)) if self.positions is None else self.positions
+
+
+def colmap(poses: Poses) -> dict[str, str]:
+    """Return the text files of a COLMAP model by name: one OPENCV camera, the images, and the points that are known."""
+    camera, (height, width) = poses.camera, poses.frame_shape
+    centre = (each + 0.5 for each in camera.centre_px)
+    numbers = (camera.matrix[0, 0], camera.matrix[1, 1], *centre, *camera.distortion)
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then its points"]
+    from_world = np.swapaxes(poses.rotations, -1, -2)
+    moved = -(from_world @ poses.places[..., None])[..., 0] + 0.0  # without negative zeros
+    observed = poses.observed or ((np.zeros(0, np.intp), np.zeros((0, 2))),) * len(poses.names)
+    tracks: dict[int, list[str]] = {}
+    rows = zip(poses.names, _quaternions(from_world), moved, observed, strict=True)
+    for place, (name, (x, y, z, w), shift, (points, xy)) in enumerate(rows, start=1):
+        seen = [f"{_line(*position)} {point + 1}" for point, position in zip(points.tolist(), xy + 0.5, strict=True)]
+        images += [f"{place} {_line(w, x, y, z, *shift)} 1 {name}", " ".join(seen)]
+        for index, point in enumerate(points.tolist()):
+            tracks.setdefault(point, []).append(f"{place} {index}")
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY, K1, K2, P1, P2"]
+    cameras.append(f"1 OPENCV {width} {height} {_line(*numbers)}")
+    cloud = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK"]
+    if poses.points is not None:
+        greys, errors = greys_of(poses.points), point_errors(poses)
+        for point, track in sorted(tracks.items()):
+            position, grey = _line(*poses.points.positions[point]), greys[point]
+            cloud.append(f"{point + 1} {position} {grey} {grey} {grey} {_line(errors[point])} {' '.join(track)}")
+    files = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": cloud}
+    return {name: "\n".join(lines) + "\n" for name, lines in files.items()}
+
+
+def nerfstudio(poses: Poses) -> dict[str, str]:
+    """Return the `transforms.json` of nerfstudio: cameras have the axes of OpenGL.
+
+    For a camera that only turned, z of the world is up. Otherwise the world is that of `points.ply`, which the file names if
+    points are known; nerfstudio turns it upright itself.
+    """
+    camera, (height, width) = poses.camera, poses.frame_shape
+    poses_4x4 = np.tile(np.eye(4), (len(poses.names), 1, 1))
+    poses_4x4[:, :3, :3] = (_UPRIGHT if poses.positions is None else np.eye(3)) @ poses.rotations @ _GRAPHICS
+    poses_4x4[:, :3, 3] = poses.places
+    content = {
+        "camera_model": "OPENCV",
+        "fl_x": camera.matrix[0, 0],
+        "fl_y": camera.matrix[1, 1],
+        "cx": camera.centre_px[0] + 0.5,
+        "cy": camera.centre_px[1] + 0.5,
+        "w": width,
+        "h": height,
+        **dict(zip(("k1", "k2", "p1", "p2"), camera.distortion.tolist(), strict=True)),
+        **({} if poses.points is None else {"ply_file_path": "points.ply"}),
+        "frames": [
+            {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+            for name, pose in zip(poses.names, poses_4x4, strict=True)
+        ],
+    }
+    return {"transforms.json": json.dumps(content, indent=1) + "\n"}
+
+
+def tum(poses: Poses) -> dict[str, str]:
+    """Return the trajectory as the TUM benchmark has it: seconds, position, quaternion of the camera in the world."""
+    rows = zip(poses.seconds, poses.places, _quaternions(poses.rotations), strict=True)
+    lines = ["# seconds tx ty tz qx qy qz qw", *(f"{_line(second, *place, *q)}" for second, place, q in rows)]
+    return {"trajectory.txt": "\n".join(lines) + "\n"}
+
+
+POSE_FORMATS: Mapping[PoseFormat, Callable[[Poses], dict[str, str]]] = {"colmap": colmap, "nerfstudio": nerfstudio, "tum": tum}
+"""Each returns the content of files by name."""
+
+
+def ply(points: ScenePoints) -> bytes:
+    """Return points as a binary PLY file: x, y, z, and their grey level as red, green and blue."""
+    names = [*(("<f4", axis) for axis in "xyz"), *(("u1", colour) for colour in ("red", "green", "blue"))]
+    table = np.zeros(len(points.positions), [(name, kind) for kind, name in names])
+    for axis, values in zip("xyz", points.positions.T, strict=True):
+        table[axis] = values
+    for colour in ("red", "green", "blue"):
+        table[colour] = greys_of(points)
+    words = {"<f4": "float", "u1": "uchar"}
+    properties = "".join(f"property {words[kind]} {name}\n" for kind, name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}end_header\n"
+    return header.encode("ascii") + table.tobytes()
+
+
+def greys_of(points: ScenePoints) -> NDArray[np.uint8]:
+    """Return the grey levels of points in sRGB; those whose flux is not known are of middle grey."""
+    known = np.isfinite(points.flux)
+    if not known.any():
+        return np.full(len(points.flux), _MIDDLE_GREY, np.uint8)
+    white = float(np.quantile(points.flux[known], _WHITE_QUANTILE))
+    return np.where(known, tone_mapped(points.flux, max(white, 1e-12)), _MIDDLE_GREY).astype(np.uint8)
+
+
+def point_errors(poses: Poses) -> FloatArray:
+    """Return the mean distance in px between where images show each point and where its position would be: (N,)."""
+    assert poses.points is not None
+    total, times = np.zeros(len(poses.points.positions)), np.zeros(len(poses.points.positions))
+    matrix = poses.camera.matrix
+    for rotation, place, (points, xy) in zip(poses.rotations, poses.places, poses.observed, strict=True):
+        seen = (poses.points.positions[points] - place) @ rotation @ matrix.T
+        away = poses.camera.distorted(seen[:, :2] / seen[:, 2:]) - xy
+        np.add.at(total, points, np.linalg.norm(away, axis=1))
+        np.add.at(times, points, 1)
+    return np.asarray(total / np.maximum(times, 1))
+
+
+def _quaternions(rotations: FloatArray) -> FloatArray:
+    """Return x, y, z, w of rotations, (N, 4), with w not below 0."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True))
+
+
+def _line(*numbers: float) -> str:
+    return " ".join(repr(float(number)) for number in numbers)

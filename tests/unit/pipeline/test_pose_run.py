@@ -1,0 +1,276 @@
+"""Runs with `pose`, with a pose estimator that knows the poses."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import photonpano
+from photonpano import (
+    CameraGuess,
+    Config,
+    FrameSpan,
+    InputError,
+    LocationError,
+    LostFrames,
+    PluginError,
+    PosedView,
+    PoseEstimate,
+    PoseEstimatorContribution,
+    ScenePoints,
+    discover,
+    run,
+)
+from photonpano.record.contents import changed_files
+from photonpano.specs import Plan, parse_spec
+
+N_FRAMES, LOST = 300, FrameSpan(280, 300)
+
+
+class Keys(Config):
+    """No keys."""
+
+
+def estimate_of(source: Any, camera: Any) -> PoseEstimate:
+    """Return the poses of a camera that moves to the right by 1 % of a unit a frame and turns; the last frames are lost."""
+    instants = np.arange(N_FRAMES)
+    rotations = Rotation.from_rotvec(np.outer(instants, [0, 1e-3, 2e-4])).as_matrix()
+    places = np.stack([0.01 * instants + 5, 0.1 * np.sin(instants / 50), np.zeros(N_FRAMES)], axis=1)
+    poses = np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+    located = instants < LOST.start
+    nan = np.where(located, 1.0, np.nan)
+    matrix = np.array([[camera.focal_px or 150.0, 0, 79.5], [0, camera.focal_px or 150.0, 63.5], [0, 0, 1]])
+    points = np.random.default_rng(0).uniform([-2, -2, 4], [12, 2, 9], (60, 3))
+    views = []
+    for span in FrameSpan(0, 250).blocks(50):
+        pose = poses[int(span.centre)]
+        seen = points @ pose[:, :3].T + pose[:, 3]
+        shown = np.flatnonzero(seen[:, 2] > 1)
+        xy = (seen[shown] @ matrix.T)[:, :2] / seen[shown, 2:]
+
+        def flux(span: FrameSpan = span) -> Any:
+            return source.response.flux((source.counts(span) / len(span)).astype(np.float32), len(span))
+
+        views.append(PosedView(span, int(span.centre), pose, shown, xy, flux))
+    return PoseEstimate(
+        matrix,
+        np.array(camera.distortion, float),
+        0.0,
+        poses * nan[:, None, None],
+        located,
+        0.02 * nan,
+        0.1 * nan,
+        ScenePoints(points, np.linspace(0.1, 1, len(points)).astype(np.float32)),
+        tuple(views),
+        (LostFrames(LOST, "the exposure shows 3 points, fewer than 12"),),
+        ({"exposures": 5, "median_parallax_deg": 4.25},),
+    )
+
+
+@pytest.fixture
+def plan_of(small_spec: dict[str, Any], tmp_path: Path) -> Callable[..., Plan]:
+    """Make the plan of a run of the small capture with a pose estimator whose estimate is changed."""
+
+    def plan_of(change: Callable[[PoseEstimate], Any] = lambda it: it, **sections: Any) -> Plan:
+        def estimate(source: Any, camera: Any, progress: Any) -> Any:
+            with progress.stage("poses", 1, "capture") as advance:
+                advance(1)
+            return change(estimate_of(source, camera))
+
+        toy = PoseEstimatorContribution(
+            name="toy", summary="Toy", config=Keys, build=lambda *_: SimpleNamespace(estimate=estimate)
+        )
+        spec = {"version": 1, "source": small_spec["source"], "pose": "toy", **sections}
+        return parse_spec(spec, output=tmp_path / "run", catalog=discover().including(toy))
+
+    return plan_of
+
+
+def test_pose_run_writes_exactly_the_promised_files(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
+    record = run(plan_of(output={"exposures": True})).record
+    folder = tmp_path / "run"
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    model = {f"sparse/{name}.txt" for name in ("cameras", "images", "points3D")}
+    pictures = {f"images/exposure_{start:03}.png" for start in range(0, 250, 50)}
+    others = {"poses.npz", "transforms.json", "points.ply", "poses.tum", "run.json", "report.html"}
+    assert files == model | pictures | others
+    assert set(record["files"]) == files - {"run.json"}
+    assert changed_files(folder) == []
+    assert photonpano.verify(folder).n_files == len(files) - 1
+    assert record == json.loads((folder / "run.json").read_text())
+
+
+def test_world_begins_at_the_first_camera_and_its_path_has_length_1(
+    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
+) -> None:
+    run(plan_of())
+    with np.load(tmp_path / "run" / "poses.npz") as archive:
+        found = dict(archive)
+    poses, located = found["camera_from_world"], found["located"]
+    np.testing.assert_array_equal(located, np.arange(N_FRAMES) < LOST.start)
+    assert np.isnan(poses[~located]).all()
+    np.testing.assert_allclose(poses[0], np.eye(3, 4), atol=1e-12)
+    places = -np.einsum("nji,nj->ni", poses[located, :, :3], poses[located, :, 3])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert steps.sum() == pytest.approx(1)
+    it = estimate_of(None, CameraGuess()).camera_from_world[located]
+    true = -np.einsum("nji,nj->ni", it[:, :, :3], it[:, :, 3])
+    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    np.testing.assert_allclose(steps * length, np.linalg.norm(np.diff(true, axis=0), axis=1), rtol=1e-9)
+    np.testing.assert_allclose(found["std_position"][located] * length, 0.02)
+    np.testing.assert_array_equal(found["frame_shape"], [128, 160])
+
+
+def test_colmap_reads_the_sparse_model_and_its_points_reproject(
+    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    record = run(plan_of(camera={"focal_px": 140, "centre_px": [79.5, 63.5], "distortion": {"k1": 0.01}})).record
+    model = pycolmap.Reconstruction(str(tmp_path / "run" / "sparse"))
+    assert record["poses"]["camera"]["focal_px"] == 140
+    assert model.num_reg_images() == record["poses"]["exposures"] == 5
+    assert {image.name for image in model.images.values()} == {f"exposure_{start:03}.png" for start in range(0, 250, 50)}
+    [camera] = model.cameras.values()
+    assert camera.params.tolist() == [140, 140, 80, 64, 0.01, 0, 0, 0]
+    errors = []
+    for image in model.images.values():
+        for seen in image.points2D:
+            # the toy forgot the distortion of 1 %
+            ideal = image.cam_from_world() * model.points3D[seen.point3D_id].xyz
+            errors.append(np.abs(140 * ideal[:2] / ideal[2] + (80, 64) - seen.xy).max())
+    assert len(errors) == sum(len(point.track.elements) for point in model.points3D.values()) > 50
+    assert max(errors) < 1e-6
+    assert model.points3D[1].error > 0
+
+
+def test_other_files_hold_the_same_poses(plan_of: Callable[..., Plan], tmp_path: Path, without_report: None) -> None:
+    run(plan_of())
+    folder = tmp_path / "run"
+    poses = np.load(folder / "poses.npz")["camera_from_world"]
+    tum = np.loadtxt(folder / "poses.tum")
+    assert len(tum) == LOST.start
+    np.testing.assert_allclose(tum[:, 0], np.arange(LOST.start) / 96800, rtol=1e-12)
+    rotation = Rotation.from_quat(tum[70, 4:]).as_matrix().T
+    np.testing.assert_allclose(rotation, poses[70, :, :3], atol=1e-12)
+    np.testing.assert_allclose(-rotation @ tum[70, 1:4], poses[70, :, 3], atol=1e-12)
+    content = json.loads((folder / "transforms.json").read_text())
+    assert content["ply_file_path"] == "points.ply"
+    view = content["frames"][1]
+    assert view["file_path"] == "images/exposure_050.png"
+    to_world = np.array(view["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+    np.testing.assert_allclose(np.linalg.inv(to_world)[:3], poses[74], atol=1e-9)
+    assert (folder / "points.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 60\n")
+    exported = photonpano.export(folder, "tum", tmp_path / "poses", every=2)
+    assert exported.n_frames == LOST.start / 2
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "poses" / "trajectory.txt"), tum[::2])
+
+
+def test_panorama_in_the_same_folder_replaces_the_poses(
+    plan_of: Callable[..., Plan], small_spec: dict[str, Any], tmp_path: Path, without_report: None
+) -> None:
+    folder = tmp_path / "run"
+    run(plan_of())
+    (folder / "sparse" / "mine.txt").write_text("a user's")
+    panorama = parse_spec(small_spec | {"levels": 1, "refine": []}, output=folder)
+    with pytest.raises(photonpano.OutputError, match=re.escape("files that no run has written: sparse/mine.txt")):
+        run(panorama)
+    run(panorama, overwrite=True)
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {
+        *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"),
+        *("sparse", "sparse/mine.txt"),
+    }
+    run(plan_of(), overwrite=True)
+    assert (folder / "sparse" / "mine.txt").read_text() == "a user's"
+    assert (folder / "sparse" / "images.txt").exists()
+    assert not (folder / "panorama.tiff").exists()
+
+
+def test_commands_of_panoramas_refuse_a_run_of_poses(
+    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
+) -> None:
+    run(plan_of())
+    for command in (photonpano.check_run, lambda folder: photonpano.render(folder, tmp_path / "again")):
+        with pytest.raises(InputError, match="is a run with `pose`: it has the poses of a camera that travels"):
+            command(tmp_path / "run")
+
+
+def test_doubts_and_lost_frames_are_in_record_report_and_warnings(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
+    doubt = "the points lie on a plane; move more"
+    record = run(plan_of(lambda it: replace(it, doubts=(doubt,)))).record
+    assert record["poses"]["doubts"] == [doubt]
+    assert record["poses"]["lost"] == [{"frames": [280, 300], "reason": "the exposure shows 3 points, fewer than 12"}]
+    assert record["warnings"] == [
+        f"doubtful: {doubt}",
+        "20 of 300 frames have no pose (frames 280 to 299: the exposure shows 3 points, fewer than 12)",
+    ]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert page.count(doubt) == 1
+    assert all(text in page for text in ("280 to 299", "median parallax deg", "from above", "doubtful", "pose-errors-"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda _: None, "expected a PoseEstimate, got a NoneType"),
+        (lambda it: replace(it, located=np.ones(N_FRAMES, bool)), "must be finite rotations and translations"),
+        (lambda it: replace(it, located=np.zeros(N_FRAMES, bool)), "no frame is located; raise a LocationError"),
+        (lambda it: replace(it, camera_from_world=np.tile(np.eye(3, 4), (N_FRAMES, 1, 1))), "must be NaN where a frame"),
+        (lambda it: replace(it, camera_from_world=2 * it.camera_from_world), "must be finite rotations and translations"),
+        (lambda it: replace(it, camera_from_world=it.camera_from_world[:9]), "of the shape (300, 3, 4), got (9, 3, 4)"),
+        (lambda it: replace(it, std_position=-it.std_position), "std_position must be 0 or more where a frame is located"),
+        (lambda it: replace(it, lost=()), "frame 280 is not located, and no entry of lost says why"),
+        (lambda it: replace(it, camera_matrix=np.zeros((3, 3))), "must be finite with positive focal lengths"),
+        (lambda it: replace(it, views=(replace(it.views[0], points=it.views[0].points + 60),)), "must show points 0 to 59"),
+    ],
+)
+def test_broken_contract_is_an_error_that_names_the_plugin(
+    plan_of: Callable[..., Plan], change: Callable[[PoseEstimate], Any], message: str, tmp_path: Path, without_report: None
+) -> None:
+    with pytest.raises(PluginError, match=f"pose-estimator 'toy' .* broke its contract at the capture: .*{re.escape(message)}"):
+        run(plan_of(change))
+    assert not (tmp_path / "run").exists()
+
+
+def test_camera_that_stays_where_it_is_has_no_poses(plan_of: Callable[..., Plan], without_report: None) -> None:
+    def still(it: PoseEstimate) -> PoseEstimate:
+        poses = np.concatenate([it.camera_from_world[:, :, :3], 0 * it.camera_from_world[:, :, 3:]], axis=-1)
+        return replace(it, camera_from_world=poses)
+
+    with pytest.raises(LocationError, match="the camera does not travel: all located frames have one position"):
+        run(plan_of(still))
+
+
+def test_work_is_not_kept(plan_of: Callable[..., Plan], without_report: None) -> None:
+    for options in ({"keep_work": True}, {"from_level": 2}):
+        with pytest.raises(InputError, match="a run with `pose` has no levels to keep"):
+            run(plan_of(), **options)
+    assert run(plan_of(), resume=True).was_finished is False
+
+
+def test_other_sections_are_refused(plan_of: Callable[..., Plan], without_report: None) -> None:
+    with pytest.raises(photonpano.SpecError) as caught:
+        plan_of(levels=2, output={"formats": ["hdr"]}, camera={"distortion": {"k1": "find"}})
+    assert [problem.where for problem in caught.value.problems] == ["levels", "output.formats", "camera.distortion.k1"]
+
+
+def test_document_is_a_spec_itself(plan_of: Callable[..., Plan], without_report: None) -> None:
+    plan = plan_of(camera={"focal_px": 99})
+    assert list(plan.document) == ["version", "source", "corrections", "camera", "output", "run", "pose"]
+    toy = plan.pose.contribution
+    assert parse_spec(plan.document, catalog=discover().including(toy)).document == plan.document
+
+
+def test_explain_and_check_describe_a_spec_with_pose(plan_of: Callable[..., Plan], without_report: None) -> None:
+    text = photonpano.explain(plan := plan_of(), catalog=discover().including(plan_of().pose.contribution))
+    assert "pose:\n  use: toy" in text
+    with pytest.raises(InputError, match="a forecast is of panoramas"):
+        photonpano.explain(plan, with_forecast=True)
