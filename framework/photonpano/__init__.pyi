@@ -47,6 +47,8 @@ from .errors import PhotonpanoError as PhotonpanoError
 from .errors import PluginError as PluginError
 from .errors import SpecError as SpecError
 from .evaluation import Evaluation as Evaluation
+from .evaluation import PoseScore as PoseScore
+from .evaluation import evaluate_poses as evaluate_poses
 from .hookspecs import hookimpl as hookimpl
 from .pipeline.components import open_source as open_source
 from .pipeline.forecast import Forecast as Forecast

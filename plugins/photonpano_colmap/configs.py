@@ -1,10 +1,16 @@
-"""Config of the locator; light enough to be imported when plugins are listed."""
+"""Configs of the components; light enough to be imported when plugins are listed."""
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 from pydantic import Field
 
+from photonpano import Config
 from photonpano.locating import KeypointConfig
+
+MIN_AVERAGES = 5
+"""Averages of a capture, at least: a spline through fewer poses would be a guess."""
 
 
 class PycolmapTwoViewConfig(KeypointConfig):
@@ -18,4 +24,36 @@ class PycolmapTwoViewConfig(KeypointConfig):
     )
     peak_threshold: float = Field(
         0.0067, ge=0, le=1, description="keypoints with less contrast after a blur of 1 px are dropped; white is 1"
+    )
+
+
+class ColmapAveragesConfig(Config):
+    """Averages of frames into COLMAP, and a spline through their poses."""
+
+    group_size: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = Field(
+        "auto", description="number of frames that are averaged; auto chooses it by light and motion"
+    )
+    step: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = Field(
+        "auto", description="number of frames from one average to the next; auto takes group_size, side by side"
+    )
+    mapper: Literal["incremental", "global"] = Field(
+        "incremental", description="how COLMAP finds poses: incremental adds one image after the other, global all at once"
+    )
+    matcher: Literal["exhaustive", "sequential"] = Field(
+        "exhaustive",
+        description="which averages are matched: exhaustive matches all pairs, and its time grows with the square of their "
+        "number; sequential matches each with the 10 that follow",
+    )
+    max_keypoints: int = Field(4096, ge=64, le=32_768, description="number of keypoints of an average, at most")
+    min_parallax_deg: float = Field(
+        2.0,
+        ge=0.1,
+        le=60,
+        description="smallest parallax, in degrees: the median angle between the views of a point that differ most; with less, "
+        "there are no poses to rely on",
+    )
+    disconnected: Literal["error", "largest"] = Field(
+        "error",
+        description="if COLMAP finds several pieces whose poses are not connected: stop with an error that names them, or go "
+        "on with the largest",
     )

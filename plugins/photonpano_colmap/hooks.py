@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from photonpano import LocatorContribution, Requirement, hookimpl
-from photonpano_colmap.configs import PycolmapTwoViewConfig
+from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, hookimpl
+from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, PycolmapTwoViewConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from photonpano import Locator, StageContext
+    from photonpano import Locator, PoseEstimator, StageContext, StreamInfo
+
+_REQUIRES = (Requirement("pycolmap", "photonpano[colmap]"),)
 
 
 @hookimpl
@@ -21,7 +23,20 @@ def photonpano_locators() -> Iterator[LocatorContribution]:
         summary="COLMAP's SIFT and matcher, LO-RANSAC, and a least-squares fit of the inliers",
         config=PycolmapTwoViewConfig,
         build=_build_two_view,
-        requires=(Requirement("pycolmap", "photonpano[colmap]"),),
+        requires=_REQUIRES,
+    )
+
+
+@hookimpl
+def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
+    """Offer the poses that COLMAP finds from averages of frames."""
+    yield PoseEstimatorContribution(
+        name="colmap-averages",
+        summary="Averages of frames into COLMAP, and a spline through their poses (paper, section 6, Fig. 11)",
+        config=ColmapAveragesConfig,
+        build=_build_averages,
+        check=_problems_of_averages,
+        requires=_REQUIRES,
     )
 
 
@@ -29,3 +44,19 @@ def _build_two_view(config: PycolmapTwoViewConfig, context: StageContext) -> Loc
     from photonpano_colmap.two_view import TwoViewLocator
 
     return TwoViewLocator(config, context.seed)
+
+
+def _build_averages(config: ColmapAveragesConfig, context: StageContext) -> PoseEstimator:
+    from photonpano_colmap.averages import AveragesEstimator
+
+    return AveragesEstimator(config, context)
+
+
+def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> list[str]:
+    if config.group_size == "auto":
+        return []
+    step = config.group_size if config.step == "auto" else config.step
+    number = 1 + (stream.n_frames - config.group_size) // step
+    if number < MIN_AVERAGES:
+        return [f"the capture has {stream.n_frames} frames, {max(0, number)} averages; at least {MIN_AVERAGES} are needed"]
+    return []

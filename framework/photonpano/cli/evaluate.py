@@ -8,7 +8,7 @@ import typer
 from photonpano.cli.options import Json
 
 if TYPE_CHECKING:
-    from photonpano.evaluation import Evaluation, ImageScore
+    from photonpano.evaluation import Evaluation, ImageScore, PoseScore
 
 
 def evaluate(
@@ -28,6 +28,8 @@ def evaluate(
     of rotations are angles, after the best common rotation. PSNR and SSIM compare the panorama with the true scene, where it
     was seen. The oracle is the panorama along the true motion.
 
+    Of a run with 'pose', positions are in m after the best similarity (ATE), and relative errors (RPE) over some frames.
+
     Example: photonpano evaluate runs/scan --truth cube.truth.npz
     """
     import json
@@ -35,7 +37,12 @@ def evaluate(
     from photonpano.api.runs import evaluate as evaluate_run
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.tables import columns
+    from photonpano.evaluation import evaluate_poses, has_poses
 
+    if has_poses(run):
+        score = evaluate_poses(run, truth)
+        typer.echo(json.dumps(_pose_data(score), indent=2) if as_json else columns(_pose_rows(score)))
+        return
     evaluation = evaluate_run(run, truth, oracle, progress_for_stderr())
     typer.echo(json.dumps(_data(evaluation), indent=2) if as_json else columns(_rows(evaluation)))
 
@@ -63,6 +70,37 @@ def _rows(evaluation: "Evaluation") -> list[list[str]]:
     if evaluation.below_oracle_db is not None:
         rows.append(["PSNR below the oracle", f"{evaluation.below_oracle_db:.2f} dB"])
     return rows
+
+
+def _pose_rows(score: "PoseScore") -> list[list[str]]:
+    rows = [
+        ["position error (ATE), rms", f"{score.ate_m:.4g} m, {100 * score.ate_share:.3f} % of the path"],
+        ["rotation error, rms", f"{score.rotation_deg:.4f} degrees"],
+    ]
+    if score.rpe_m is not None:
+        rows.append([f"RPE over {score.rpe_frames} frames, rms", f"{score.rpe_m:.4g} m, {score.rpe_deg:.4f} degrees"])
+    rows.append(["frames located", f"{100 * score.located_share:.1f} %"])
+    if score.honest_shares is not None:
+        shares = ", ".join(f"{100 * share:.1f} %" for share in score.honest_shares)
+        rows += [["within 1, 2, 3 std_position", shares], ["error over std_position, rms", f"{score.std_ratio:.2f}"]]
+    if score.focal_error is not None:
+        rows.append(["focal length", f"{100 * score.focal_error:+.3f} %"])
+    return rows
+
+
+def _pose_data(score: "PoseScore") -> dict[str, Any]:
+    return {
+        "ate_m": score.ate_m,
+        "ate_share": score.ate_share,
+        "rotation_deg": score.rotation_deg,
+        "rpe_frames": score.rpe_frames,
+        "rpe_m": score.rpe_m,
+        "rpe_deg": score.rpe_deg,
+        "located_share": score.located_share,
+        "within_std_shares": score.honest_shares,
+        "std_ratio": score.std_ratio,
+        "focal_error": score.focal_error,
+    }
 
 
 def _data(evaluation: "Evaluation") -> dict[str, Any]:

@@ -4,6 +4,7 @@ from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_run_trajectory, load_truth
 from photonpano.evaluation.pose_inputs import RunPoses, has_poses, load_run_poses, load_true_poses
+from photonpano.evaluation.poses import PoseScore, align_positions, evaluate_poses, pose_errors
 from photonpano.evaluation.rotations import RotationScore, Turn, rotation_errors
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
@@ -11,6 +12,7 @@ from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 __all__ = [
     "Evaluation",
     "ImageScore",
+    "PoseScore",
     "Renderer",
     "RotationScore",
     "RunPoses",
@@ -18,9 +20,11 @@ __all__ = [
     "TrajectoryScore",
     "Truth",
     "Turn",
+    "align_positions",
     "corner_errors",
     "covered",
     "evaluate",
+    "evaluate_poses",
     "exposure_bound_px",
     "has_poses",
     "image_score",
@@ -29,6 +33,7 @@ __all__ = [
     "load_true_poses",
     "load_truth",
     "pair_bound_px",
+    "pose_errors",
     "rotation_errors",
     "true_panorama",
     "white_flux",

@@ -1,0 +1,173 @@
+"""Scores of poses against the true ones.
+
+Absolute and relative errors are those of benchmarks of visual odometry (Sturm et al. 2012; the tool evo): the absolute
+trajectory error (ATE) after the best similarity (Umeyama 1991), and the relative pose error (RPE) over a number of frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.errors import InputError
+from photonpano.evaluation.pose_inputs import load_run_poses, load_true_poses
+from photonpano.geometry import rotation_vectors
+from photonpano.poses import centres
+from photonpano.record.contents import require_one_run
+from photonpano.values import BoolArray, FloatArray
+
+_RPE_SHARE = 0.01
+"""The relative error is that over this share of the frames."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseScore:
+    """Errors of poses over the located frames, after the best similarity of their positions.
+
+    Attributes:
+        errors_m: (T,) distance of each camera from its true position; NaN where not located.
+        errors_deg: (T,) angle between the found and the true rotation, after the same similarity; NaN where not located.
+        ate_m: absolute trajectory error: root mean square of `errors_m`.
+        ate_share: the same as a share of the length of the true path of the located frames.
+        rotation_deg: root mean square of `errors_deg`.
+        rpe_frames: frames over which relative errors are taken.
+        rpe_m: root mean square error of the motion over that many frames; None if no two located frames are that far apart.
+        rpe_deg: root mean square error of the turn over that many frames.
+        located_share: share of the located frames, 0 to 1.
+        honest_shares: shares of the located frames whose position error is within 1, 2 and 3 expected errors; None if the run
+            knows none.
+        std_ratio: root mean square of the errors of positions, in units of the expected ones; None if the run knows none.
+        focal_error: error of the focal length, relative to the true one; None if that is not known.
+    """
+
+    errors_m: FloatArray
+    errors_deg: FloatArray
+    ate_m: float
+    ate_share: float
+    rotation_deg: float
+    rpe_frames: int
+    rpe_m: float | None
+    rpe_deg: float | None
+    located_share: float
+    honest_shares: tuple[float, float, float] | None
+    std_ratio: float | None
+    focal_error: float | None = None
+
+
+def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | None = None) -> PoseScore:
+    """Score the poses of a run against the truth of its capture.
+
+    Args:
+        run_folder: written by `run`, with `pose`.
+        truth: the `.truth.npz` that was simulated with the capture; `camera_from_world` in m.
+        rpe_frames: frames over which the relative error is taken; by default 1 % of the capture.
+
+    Raises:
+        InputError: a file is missing or damaged, has no poses, or run and truth are not of the same capture.
+        ValueError: `rpe_frames` is below 1.
+    """
+    folder, truth = Path(run_folder), Path(truth)
+    if rpe_frames is not None and rpe_frames < 1:
+        raise ValueError(f"rpe_frames must be at least 1, got {rpe_frames}")
+    require_one_run(folder, ["poses.npz"])
+    run, true = load_run_poses(folder), load_true_poses(truth)
+    n_frames, true_frames = len(run.located), len(true.camera_from_world)
+    if n_frames != true_frames:
+        raise InputError(
+            f"{truth} is the truth of {true_frames} frames, but the run in {folder} has {n_frames}; they belong to different "
+            "captures"
+        )
+    frames = rpe_frames or max(1, round(_RPE_SHARE * n_frames))
+    try:
+        score = pose_errors(run.camera_from_world, true.camera_from_world, run.located, frames, run.std_position)
+    except ValueError as error:
+        raise InputError(f"{folder} and {truth} cannot be compared: {error}") from error
+    return score if true.focal_px is None else replace(score, focal_error=run.camera.focal_px / true.focal_px - 1)
+
+
+def pose_errors(
+    found: FloatArray, true: FloatArray, located: BoolArray, rpe_frames: int, std_position: FloatArray | None = None
+) -> PoseScore:
+    """Score poses against the true ones.
+
+    Args:
+        found: (T, 3, 4), world to camera, in a world of any scale.
+        true: (T, 3, 4), in m.
+        located: (T,) the frames to compare.
+        rpe_frames: frames over which the relative error is taken, for every pair of located frames that are so far apart.
+        std_position: (T,) expected errors of the positions, in units of the found world; None or not finite if not known.
+
+    Raises:
+        ValueError: fewer than three located frames, or their true or found positions are all the same.
+    """
+    scale, rotation, shift = align_positions(centres(found[located]), centres(true[located]))
+    aligned = np.full((len(found), 3, 4), np.nan)
+    aligned[:, :, :3] = found[:, :, :3] @ rotation.T
+    aligned[:, :, 3] = scale * found[:, :, 3] - aligned[:, :, :3] @ shift
+    places, true_places = centres(aligned), centres(true)
+    errors_m = np.where(located, np.linalg.norm(places - true_places, axis=1), np.nan)
+    errors_deg = np.full(len(found), np.nan)
+    errors_deg[located] = _angles(aligned[located, :, :3] @ np.swapaxes(true[located, :, :3], 1, 2))
+    path_m = float(np.linalg.norm(np.diff(true_places[located], axis=0), axis=1).sum())
+    ate_m = _rms(errors_m[located])
+    shares, ratio = None, None
+    if std_position is not None and np.isfinite(std_m := scale * std_position[located]).all() and (std_m > 0).all():
+        one, two, three = (float((errors_m[located] <= times * std_m).mean()) for times in (1, 2, 3))
+        shares, ratio = (one, two, three), ate_m / _rms(std_m)
+    first = np.flatnonzero(located[:-rpe_frames] & located[rpe_frames:])
+    apart = _relative(_relative_of(true, first, rpe_frames), _relative_of(aligned, first, rpe_frames)) if len(first) else None
+    return PoseScore(
+        errors_m=errors_m,
+        errors_deg=errors_deg,
+        ate_m=ate_m,
+        ate_share=ate_m / path_m,
+        rotation_deg=_rms(errors_deg[located]),
+        rpe_frames=rpe_frames,
+        rpe_m=None if apart is None else _rms(np.linalg.norm(apart[:, :, 3], axis=1)),
+        rpe_deg=None if apart is None else _rms(_angles(apart[:, :, :3])),
+        located_share=float(located.mean()),
+        honest_shares=shares,
+        std_ratio=ratio,
+    )
+
+
+def align_positions(found: FloatArray, true: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return scale, rotation and shift that bring (N, 3) found positions nearest to the true ones (Umeyama 1991).
+
+    Raises:
+        ValueError: there are fewer than three positions, or they are all the same.
+    """
+    if len(found) < 3:
+        raise ValueError(f"{len(found)} located frames; at least 3 are needed to align two worlds")
+    middles = found.mean(axis=0), true.mean(axis=0)
+    here, there = found - middles[0], true - middles[1]
+    if not here.any() or not there.any():
+        raise ValueError("all positions are the same, so that the worlds have no common scale")
+    left, strengths, right = np.linalg.svd(there.T @ here)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = (left * signs) @ right
+    scale = float((strengths * signs).sum() / (here**2).sum())
+    return scale, rotation, middles[1] - scale * rotation @ middles[0]
+
+
+def _relative_of(poses: FloatArray, first: NDArray[np.intp], frames: int) -> FloatArray:
+    """Return the motions from some frames to those that follow by some frames: (N, 3, 4)."""
+    return _relative(poses[first], poses[first + frames])
+
+
+def _relative(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return `other` after the inverse of `one`, both (N, 3, 4)."""
+    rotations = other[:, :, :3] @ np.swapaxes(one[:, :, :3], 1, 2)
+    shifts = other[:, :, 3] - np.einsum("nij,nj->ni", rotations, one[:, :, 3])
+    return np.concatenate([rotations, shifts[:, :, None]], axis=2)
+
+
+def _angles(rotations: FloatArray) -> FloatArray:
+    return np.asarray(np.rad2deg(np.linalg.norm(rotation_vectors(rotations), axis=-1)))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,340 @@
+"""Pose estimator `colmap-averages`: averages of frames into COLMAP, and a spline through their poses (paper, section 6)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import (
+    BoolArray,
+    CameraGuess,
+    CaptureSummary,
+    FloatArray,
+    FluxImage,
+    FrameSpan,
+    Group,
+    LinearlyCorrectedSource,
+    LocationError,
+    LostFrames,
+    PosedView,
+    PoseEstimate,
+    Progress,
+    ScenePoints,
+    Source,
+    StageContext,
+    VirtualExposure,
+)
+from photonpano.geometry import Camera, camera_matrix
+from photonpano.locating import blur_against_noise, stabilised_8_bit
+from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
+from photonpano_colmap.pose_noise import PoseNoise, pose_noise
+from photonpano_colmap.pose_spline import PoseSpline, left_out, positions_of
+from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
+
+_PHOTONS = 60.0
+"""Photons of a pixel in an average: with fewer, keypoints are noise."""
+_BLUR_PX = 6.0
+"""Blur of an average by motion that keypoints bear; the less of both decides."""
+_MOST = 150
+"""Averages of a capture, at most: matching all pairs takes minutes."""
+_FEWEST = 24
+"""Averages of a capture, at least, if it is long enough."""
+_SHORTEST = 4
+_TEXTURE = 60, 15
+"""Keypoints of an average, and matches with another one, below which it shows too little texture."""
+_FOCAL_SHARE = 0.02
+"""Expected error of a focal length that was found, relative to it, above which the poses are doubtful."""
+_FOCAL_BIAS = 0.01
+"""Error of a found focal length that residuals do not show, relative to it: blur moves keypoints alike in many averages."""
+_PLANE = 0.01
+"""Smallest extent of the points, relative to their largest, below which they lie in a plane."""
+_SHOWN_PIECES = 4
+
+
+class AveragesEstimator:
+    """Averages groups of frames, lets COLMAP find their poses, and interpolates."""
+
+    def __init__(self, config: ColmapAveragesConfig, context: StageContext) -> None:
+        self._config = config
+        self._context = context
+
+    def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
+        """Estimate the poses of a capture: see `photonpano.PoseEstimator`.
+
+        Raises:
+            LocationError: the averages show too little texture, the camera only turns or travels too little, or the poses fall
+                into pieces.
+        """
+        spans = self._spans(source.info.n_frames)
+        images = []
+        with progress.stage("average frames", len(spans), "average") as advance:
+            for span in spans:
+                images.append(_picture(_exposure(source, span)))
+                advance(1)
+        with progress.stage("COLMAP: features, matches, poses", 1, "model") as advance:
+            found = reconstruct(images, camera, self._config, self._context.seed)
+            advance(1)
+        piece = self._chosen(found, spans)
+        estimate = _Assembly(source, spans, found, piece, camera).estimate()
+        if camera.focal_px is None:
+            reason = f"found with the poses, with an expected error of {estimate.std_focal_px:.2g} px; calibrate to be sure"
+            self._context.decide("focal_px", round(piece.focal_px, 2), reason)
+        return estimate
+
+    def _spans(self, n_frames: int) -> list[FrameSpan]:
+        """Return the frames of each average."""
+        size = self._config.group_size
+        if size == "auto":
+            size, reason = chosen_size(self._context.capture(), n_frames)
+            self._context.decide("group_size", size, reason)
+        if self._config.step == "auto":  # side by side, and the last one ends with the capture
+            starts = np.linspace(0, n_frames - size, -(-n_frames // size)).round().astype(int).tolist()
+        else:
+            starts = list(range(0, n_frames - size + 1, self._config.step))
+        spans = [FrameSpan(start, start + size) for start in starts if n_frames >= size]
+        if len(spans) < MIN_AVERAGES:
+            raise LocationError(
+                f"{n_frames} frames are {len(spans)} averages of {size}; at least {MIN_AVERAGES} are needed: choose a smaller "
+                "pose.with.group_size, or record longer"
+            )
+        return spans
+
+    def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan]) -> Piece:
+        """Return the piece of the poses to go on with."""
+        _require_texture(found)
+        if not found.pieces or len(found.pieces[0].images) < MIN_AVERAGES:
+            raise LocationError(
+                f"COLMAP found no poses: no two averages share enough of the scene from places that lie far enough apart; of "
+                f"{int(np.median(found.n_keypoints))} keypoints in an average, {int(np.median(found.n_matches))} match. If the "
+                "camera only turns, leave out `pose` and set motion: {model: rotation}; otherwise try another "
+                "pose.with.group_size, or move farther"
+            )
+        piece = found.pieces[0]
+        if len(found.pieces) > 1 and self._config.disconnected == "error":
+            named = "; ".join(_described(each, spans) for each in found.pieces[:_SHOWN_PIECES])
+            raise LocationError(
+                f"the poses fall into {len(found.pieces)} pieces that are not connected: {named}. Choose a smaller "
+                "pose.with.step, so that neighbours overlap more, or keep the largest with pose.with.disconnected: largest"
+            )
+        angle = np.rad2deg(np.median(parallax(piece)))
+        if angle < self._config.min_parallax_deg:
+            raise LocationError(
+                f"the camera travels too little: the views of a point differ by {angle:.2g} degrees (the median), less than "
+                f"{self._config.min_parallax_deg:g}, so that depth cannot be told from noise. If the camera only turns, leave "
+                "out `pose` and set motion: {model: rotation}; otherwise move farther, or lower pose.with.min_parallax_deg"
+            )
+        return piece
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Assembly:
+    """Makes the estimate of all frames from the poses of averages."""
+
+    source: Source
+    spans: Sequence[FrameSpan]
+    found: Reconstruction
+    piece: Piece
+    guess: CameraGuess
+
+    def estimate(self) -> PoseEstimate:
+        piece, n_frames = self.piece, self.source.info.n_frames
+        height, width = self.source.info.frame_shape
+        centre = self.guess.centre_px or ((width - 1) / 2, (height - 1) / 2)
+        camera = Camera(camera_matrix(piece.focal_px, centre), np.array(self.guess.distortion))
+        ideal = [(indices, camera.ideal(xy)) for indices, xy in piece.observed]
+        noise = pose_noise(piece.poses, piece.points, ideal, camera.matrix, self.guess.focal_px is None)
+        instants = np.array([self.spans[image].centre for image in piece.images])
+        located = self._located(n_frames)
+        frames = np.arange(n_frames, dtype=np.float64)
+        poses = PoseSpline(instants, piece.poses).at(frames)
+        poses[~located] = np.nan
+        apart, angles = left_out(instants, piece.poses)
+        std_position = _between(frames, instants, noise.std_position, apart, located)
+        std_rotation = _between(frames, instants, noise.std_rotation, angles, located)
+        length = float(np.linalg.norm(np.diff(positions_of(piece.poses), axis=0), axis=1).sum())
+        return PoseEstimate(
+            camera_matrix=camera.matrix,
+            distortion=camera.distortion,
+            std_focal_px=self._std_focal(noise),
+            camera_from_world=poses,
+            located=located,
+            std_position=std_position,
+            std_rotation_deg=np.rad2deg(std_rotation),
+            points=ScenePoints(piece.points, self._flux()),
+            views=tuple(self._view(place) for place in range(len(piece.images))),
+            lost=self._lost(located),
+            levels=(self._level(noise, length),),
+            doubts=tuple(self._doubts(noise)),
+        )
+
+    def _located(self, n_frames: int) -> BoolArray:
+        """Return which frames lie in an average with a pose, or between two neighbours with poses: (T,)."""
+        posed = np.zeros(len(self.spans), np.bool_)
+        posed[self.piece.images] = True
+        located = np.zeros(n_frames, np.bool_)
+        for place in np.flatnonzero(posed).tolist():
+            stop = self.spans[place].stop
+            if place + 1 < len(posed) and posed[place + 1]:
+                stop = max(stop, self.spans[place + 1].start)
+            located[self.spans[place].start : stop] = True
+        return located
+
+    def _view(self, place: int) -> PosedView:
+        image = int(self.piece.images[place])
+        span, (points, xy) = self.spans[image], self.piece.observed[place]
+
+        def flux() -> FluxImage:
+            return _exposure(self.source, span).flux
+
+        return PosedView(span, span.centre, self.piece.poses[place], points, xy, flux)
+
+    def _flux(self) -> FluxImage:
+        """Return the mean flux of the pixels in which averages show each point: (M,)."""
+        total, times = np.zeros(len(self.piece.points)), np.zeros(len(self.piece.points))
+        for image, (indices, xy) in zip(self.piece.images.tolist(), self.piece.observed, strict=True):
+            flux = _exposure(self.source, self.spans[image]).flux
+            column, row = (np.clip(np.rint(xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
+            seen = flux[row, column]
+            known = np.isfinite(seen)
+            np.add.at(total, indices[known], seen[known])
+            np.add.at(times, indices[known], 1)
+        return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
+
+    def _lost(self, located: BoolArray) -> tuple[LostFrames, ...]:
+        """Return the frames without a pose: those of averages that COLMAP left out, and the rest at the end."""
+        others = {int(image): number for number, piece in enumerate(self.found.pieces[1:], 2) for image in piece.images}
+        posed, lost = set(self.piece.images.tolist()), []
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], ~located, [False]]).astype(np.int8))).reshape(-1, 2)
+        for start, stop in edges.tolist():
+            inside = [
+                number
+                for number, span in enumerate(self.spans)
+                if number not in posed and span.start < stop and span.stop > start
+            ]
+            elsewhere = [number for number in inside if number in others]
+            if elsewhere:
+                reason = f"their averages belong to piece {others[elsewhere[0]]}, which is not connected to the largest"
+            elif inside:
+                matches = int(self.found.n_matches[inside].max())
+                reason = f"COLMAP found no pose for {_counted(inside)}, with at most {matches} matching keypoints"
+            else:
+                reason = "they are fewer than an average"
+            lost.append(LostFrames(FrameSpan(start, stop), reason))
+        return tuple(lost)
+
+    def _level(self, noise: PoseNoise, length: float) -> dict[str, float | int | str | None]:
+        return {
+            "group_frames": len(self.spans[0]),
+            "averages": len(self.spans),
+            "located": len(self.piece.images),
+            "points": len(self.piece.points),
+            "keypoints": float(np.median(self.found.n_keypoints)),
+            "parallax_deg": float(np.rad2deg(np.median(parallax(self.piece)))),
+            "residual_px": noise.residual_px,
+            "std_position": float(np.sqrt(np.mean(noise.std_position**2))) / length if length else None,
+        }
+
+    def _std_focal(self, noise: PoseNoise) -> float:
+        """Return the expected error of the focal length, 0 if it was given."""
+        return math.hypot(noise.std_focal_px, _FOCAL_BIAS * self.piece.focal_px) if self.guess.focal_px is None else 0.0
+
+    def _doubts(self, noise: PoseNoise) -> list[str]:
+        doubts = []
+        focal = self.piece.focal_px
+        if (std := self._std_focal(noise)) > _FOCAL_SHARE * focal:
+            doubts.append(
+                f"the focal length was found as {focal:.0f} px with an expected error of {std:.2g} px, "
+                f"{100 * std / focal:.2g} %; calibrate the camera, and give camera.focal_px"
+            )
+        extents = np.linalg.svd(self.piece.points - np.median(self.piece.points, axis=0), compute_uv=False)
+        if self.guess.focal_px is None and extents[2] < _PLANE * extents[0]:
+            doubts.append("the points lie in a plane, from which no focal length can be found; give camera.focal_px")
+        share = len(self.piece.images) / len(self.spans)
+        if share < 0.5:
+            doubts.append(
+                f"only {len(self.piece.images)} of {len(self.spans)} averages have a pose; choose another pose.with.group_size"
+            )
+        return doubts
+
+
+def chosen_size(capture: CaptureSummary, n_frames: int) -> tuple[int, str]:
+    """Return the number of frames of an average, and a clause with the reason.
+
+    Light wants 60 photons a pixel, motion a blur of at most 6 px, and the less of both decides; a capture has 24 to 150
+    averages.
+    """
+    light = _PHOTONS / max(capture.flux, 1e-9)
+    motion = math.inf if not capture.speed_px else _BLUR_PX / capture.speed_px
+    wanted = min(light, motion)
+    size = round(min(max(wanted, n_frames / _MOST, _SHORTEST), max(n_frames / _FEWEST, _SHORTEST)))
+    speed = "at an unknown speed" if capture.speed_px is None else f"at {capture.speed_px:.2g} px per frame"
+    blur = "" if capture.speed_px is None else f" and are blurred by {size * capture.speed_px:.2g} px"
+    return size, f"{speed} ({capture.how}) averages of {size} frames hold {size * capture.flux:.2g} photons a pixel{blur}"
+
+
+def parallax(piece: Piece) -> FloatArray:
+    """Return for each point the largest angle between its directions from the first view and from another: (M,)."""
+    places = positions_of(piece.poses)
+    angles, first = np.zeros(len(piece.points)), np.full((len(piece.points), 3), np.nan)
+    for place, (indices, _) in zip(places, piece.observed, strict=True):
+        rays = piece.points[indices] - place
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        new = np.isnan(first[indices, 0])
+        first[indices[new]] = rays[new]
+        cosines = np.clip(np.einsum("ki,ki->k", rays, first[indices]), -1, 1)
+        angles[indices] = np.maximum(angles[indices], np.arccos(cosines))
+    return angles
+
+
+def _exposure(source: Source, span: FrameSpan) -> VirtualExposure:
+    """Average the frames of a span."""
+    counts, frames = source.counts(span), len(span)
+    lit = source.corrected(counts, frames) if isinstance(source, LinearlyCorrectedSource) else counts
+    flux = source.response.flux((lit / np.float32(frames)).astype(np.float32), float(frames))
+    weight = np.where(source.valid, frames, 0).astype(np.float32)
+    flux = np.where(source.valid, flux, np.nan).astype(np.float32)
+    return VirtualExposure(flux, weight, Group(span, span.centre), 1.0, source.response)
+
+
+def _picture(exposure: VirtualExposure) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure, "auto"))
+    return image, np.where(mask > 0, 255, 0).astype(np.uint8)
+
+
+def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: FloatArray, located: BoolArray) -> FloatArray:
+    """Return the expected error of each frame: that of the poses, and what a spline between them misses; NaN if not located."""
+    at_poses = np.interp(frames, instants, std)
+    # Distances of poses from the spline through the others hold the noise of the poses as well.
+    missed = max(0.0, float(np.mean(apart**2)) - 2 * float(np.mean(std**2))) if len(apart) else 0.0
+    return np.where(located, np.sqrt(at_poses**2 + _MISSED_SHARE * missed), np.nan)
+
+
+_MISSED_SHARE = 0.5
+"""Share of the variance about a spline with a gap that one without a gap misses between poses."""
+
+
+def _require_texture(found: Reconstruction) -> None:
+    keypoints, matches = (float(np.median(each)) for each in (found.n_keypoints, found.n_matches))
+    if keypoints < _TEXTURE[0] or matches < _TEXTURE[1]:
+        raise LocationError(
+            f"the averages show too little texture, or too much noise: of {keypoints:.0f} keypoints in an average (the median) "
+            f"{matches:.0f} match another average; choose a larger pose.with.group_size for less noise, or a smaller one for "
+            "less blur"
+        )
+
+
+def _described(piece: Piece, spans: Sequence[FrameSpan]) -> str:
+    """Describe the frames of a piece."""
+    images = piece.images
+    runs = np.split(images, np.flatnonzero(np.diff(images) > 1) + 1)
+    named = " and ".join(f"{spans[run[0]].start} to {spans[run[-1]].stop - 1}" for run in runs[:3])
+    more = f" and {len(runs) - 3} more spans" if len(runs) > 3 else ""
+    return f"frames {named}{more} ({len(images)} averages)"
+
+
+def _counted(numbers: Sequence[int]) -> str:
+    return "1 average" if len(numbers) == 1 else f"{len(numbers)} averages"

@@ -1,0 +1,195 @@
+"""Structure from motion by COLMAP: poses and points of some images, in one or several pieces.
+
+Convention:
+    Positions in images are (x, y) with integers as pixel centres; COLMAP's are 0.5 larger and are converted here.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from photonpano import CameraGuess, FloatArray
+from photonpano_colmap.configs import ColmapAveragesConfig
+
+_FIRST_CENTRE = 0.5
+"""Position of the first pixel's centre in COLMAP; ours is 0."""
+_SEEDS = 2**31
+"""Seeds of the library are below this."""
+_USUAL_FOCAL = 1.2
+"""Focal length to start from where none is given, as a share of the longer side of a frame."""
+_START_ANGLE_DEG = 4.0
+"""Parallax of the pair that COLMAP starts with: captures are short, so this is less than its own 16 degrees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """Images whose poses are connected.
+
+    Attributes:
+        images: (N,) their indices, increasing.
+        poses: (N, 3, 4), world to camera.
+        points: (M, 3) positions in the world.
+        observed: for each image the indices of K points, and where it shows them, (K, 2).
+        focal_px: focal length.
+    """
+
+    images: NDArray[np.intp]
+    poses: FloatArray
+    points: FloatArray
+    observed: tuple[tuple[NDArray[np.intp], FloatArray], ...]
+    focal_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """What COLMAP found.
+
+    Attributes:
+        pieces: the largest first; empty if no pair of images was enough to begin with.
+        n_keypoints: (N,) keypoints of each image.
+        n_matches: (N,) keypoints of each image that match those of another one, in agreement with a motion: the most of any.
+    """
+
+    pieces: tuple[Piece, ...]
+    n_keypoints: NDArray[np.intp]
+    n_matches: NDArray[np.intp]
+
+
+def reconstruct(
+    images: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]],
+    camera: CameraGuess,
+    config: ColmapAveragesConfig,
+    seed: int,
+) -> Reconstruction:
+    """Find the poses of images with COLMAP, in a folder that is removed again.
+
+    It has one thread: with more, COLMAP numbers the images in another order each time, and finds other poses.
+
+    Args:
+        images: (H, W) pictures of 8 bits, and masks of the same shape, 0 where no keypoints may lie.
+        camera: what is known.
+        config: mapper, matcher and number of keypoints.
+        seed: of RANSAC.
+    """
+    # What it would print as an error, such as that it found no poses, becomes a message of ours.
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    seed %= _SEEDS
+    pycolmap.set_random_seed(seed)
+    with tempfile.TemporaryDirectory(prefix="photonpano-colmap-") as name:
+        folder = Path(name)
+        database, pictures = folder / "database.db", folder / "images"
+        for part in ("images", "masks", "sparse"):
+            (folder / part).mkdir()
+        for index, (picture, mask) in enumerate(images):
+            cv2.imwrite(str(pictures / _name(index)), picture)
+            cv2.imwrite(str(folder / "masks" / f"{_name(index)}.png"), mask)
+        _extract(database, folder, camera, images[0][0].shape, config)
+        _match(database, config, seed)
+        keypoints, matches = _counts(database, len(images))
+        found = _map(database, folder, camera, config, seed)
+        pieces = sorted((_piece(each) for each in found), key=lambda piece: -len(piece.images))
+    return Reconstruction(tuple(pieces), keypoints, matches)
+
+
+def _extract(database: Path, folder: Path, camera: CameraGuess, shape: tuple[int, ...], config: ColmapAveragesConfig) -> None:
+    options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+    options.sift.max_num_features = config.max_keypoints
+    height, width = shape[:2]
+    x, y = camera.centre_px or ((width - 1) / 2, (height - 1) / 2)
+    focal = camera.focal_px or _USUAL_FOCAL * max(height, width)
+    reader = pycolmap.ImageReaderOptions(mask_path=str(folder / "masks"))
+    numbers: tuple[float, ...] = (focal, x + _FIRST_CENTRE, y + _FIRST_CENTRE)
+    if any(camera.distortion):
+        reader.camera_model, numbers = "OPENCV", (focal, *numbers, *camera.distortion)
+    else:
+        reader.camera_model = "SIMPLE_PINHOLE"
+    reader.camera_params = ",".join(map(repr, map(float, numbers)))
+    pycolmap.extract_features(
+        database,
+        folder / "images",
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _match(database: Path, config: ColmapAveragesConfig, seed: int) -> None:
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    options: dict[str, Any] = {"matching_options": matching, "verification_options": verification}
+    if config.matcher == "exhaustive":
+        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu, **options)
+    else:
+        pycolmap.match_sequential(database, device=pycolmap.Device.cpu, **options)
+
+
+def _counts(database: Path, n_images: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the number of keypoints of each image, and of those that match another image: the most of any."""
+    keypoints, matches = np.zeros(n_images, np.intp), np.zeros(n_images, np.intp)
+    with pycolmap.Database.open(database) as opened:
+        index_of = {image.image_id: _index(image.name) for image in opened.read_all_images()}
+        for image_id, index in index_of.items():
+            keypoints[index] = opened.num_keypoints_for_image(image_id)
+        pairs, geometries = opened.read_two_view_geometries()
+        for pair, geometry in zip(pairs, geometries, strict=True):
+            for image_id in pycolmap.pair_id_to_image_pair(pair):
+                index = index_of[image_id]
+                matches[index] = max(matches[index], len(geometry.inlier_matches))
+    return keypoints, matches
+
+
+def _map(
+    database: Path, folder: Path, camera: CameraGuess, config: ColmapAveragesConfig, seed: int
+) -> list[pycolmap.Reconstruction]:
+    finds_focal = camera.focal_px is None
+    place = folder / "images", folder / "sparse"
+    if config.mapper == "global":
+        every = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=seed)
+        every.mapper.bundle_adjustment.refine_focal_length = finds_focal
+        every.mapper.bundle_adjustment.refine_principal_point = False
+        every.mapper.bundle_adjustment.refine_extra_params = False
+        return list(pycolmap.global_mapping(database, *place, options=every).values())
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, extract_colors=False)
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = finds_focal
+    options.ba_refine_principal_point = options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_tri_angle = _START_ANGLE_DEG
+    return list(pycolmap.incremental_mapping(database, *place, options=options).values())
+
+
+def _piece(found: pycolmap.Reconstruction) -> Piece:
+    """Return poses and points of a reconstruction in numpy."""
+    images = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
+    numbers = {identifier: number for number, identifier in enumerate(sorted(found.points3D))}
+    observed = []
+    for image in images:
+        seen = [point for point in image.points2D if point.has_point3D()]
+        indices = np.array([numbers[point.point3D_id] for point in seen], np.intp)
+        xy = np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2) - _FIRST_CENTRE
+        observed.append((indices, xy))
+    [camera] = found.cameras.values()
+    return Piece(
+        np.array([_index(image.name) for image in images], np.intp),
+        np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        np.array([found.points3D[identifier].xyz for identifier in sorted(found.points3D)]).reshape(-1, 3),
+        tuple(observed),
+        float(camera.params[0]),
+    )
+
+
+def _name(index: int) -> str:
+    return f"{index:06}.png"
+
+
+def _index(name: str) -> int:
+    return int(name.partition(".")[0])

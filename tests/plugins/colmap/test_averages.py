@@ -1,0 +1,213 @@
+"""Poses from averages of frames, on a small scene of four textured planes."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from photonpano import CameraGuess, CaptureSummary, FrameSpan, LocationError, StageContext, StreamInfo, discover
+from photonpano.context import Quiet
+from photonpano.evaluation import pose_errors
+from photonpano.geometry import camera_matrix
+from photonpano.testing import MemorySource
+
+pytest.importorskip("pycolmap")
+
+from photonpano_colmap.averages import AveragesEstimator, chosen_size
+from photonpano_colmap.configs import ColmapAveragesConfig
+from photonpano_colmap.pose_noise import pose_noise
+from photonpano_colmap.pose_spline import PoseSpline, positions_of
+from photonpano_colmap.reconstruction import Piece, Reconstruction
+
+SHAPE, FOCAL_PX, N_FRAMES, SIZE = (128, 160), 150.0, 320, 20
+MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
+PLANES = ((6.0, (-4, -4, 4, 4)), (3.5, (-1.6, -1.0, -0.5, 0.6)), (4.2, (0.4, -1.2, 1.6, 0.1)), (3.0, (-0.3, 0.2, 1.0, 1.1)))
+"""Depth, and left, top, right and bottom edge, in m."""
+
+
+def true_poses(travels: bool = True) -> np.ndarray:
+    """Return the poses of a camera that moves to the right by 1.2 m, or only turns by 20 degrees."""
+    times = np.linspace(-1, 1, N_FRAMES)
+    places = np.stack([0.6 * times, 0.1 * np.cos(3 * times), 0.15 * times**2], axis=1) * travels
+    turns = np.stack([0.02 * times, 0.06 * times if travels else 0.17 * times, 0.01 * np.sin(4 * times)], axis=1)
+    rotations = Rotation.from_rotvec(turns).as_matrix()
+    return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+
+
+@cache
+def capture(travels: bool = True) -> MemorySource:
+    """Simulate binary frames with 1 photon a pixel."""
+    rng = np.random.default_rng(4)
+    frames = np.empty((N_FRAMES, *SHAPE), np.uint8)
+    textures = []
+    for depth, (left, top, right, bottom) in PLANES:
+        size = round(FOCAL_PX * (bottom - top) / depth), round(FOCAL_PX * (right - left) / depth)
+        textures.append(np.clip(1 + 5 * (cv2.GaussianBlur(rng.uniform(0, 1, size), (0, 0), 1.2) - 0.5), 0.1, 3))
+    for frame, pose in enumerate(true_poses(travels)):
+        flux = np.zeros(SHAPE)
+        for (depth, (left, top, right, bottom)), texture in zip(PLANES, textures, strict=True):
+            height, width = texture.shape
+            to_world = np.array([[(right - left) / width, 0, left], [0, (bottom - top) / height, top], [0, 0, depth]])
+            to_frame = MATRIX @ (pose[:, :3] @ to_world + np.outer(pose[:, 3], [0, 0, 1]))
+            seen = cv2.warpPerspective(texture, to_frame, SHAPE[::-1], flags=cv2.INTER_LINEAR, borderValue=-1)
+            flux = np.where(seen > 0, seen, flux)
+        frames[frame] = rng.random(SHAPE) < -np.expm1(-flux)
+    return MemorySource(frames)
+
+
+def estimated(source: MemorySource, camera: CameraGuess | None = None, **keys: Any) -> Any:
+    decided: list[Any] = []
+    context = StageContext(source.info, source.response, 0, 2, decide=lambda *each: decided.append(each))
+    config = ColmapAveragesConfig(group_size=SIZE, **keys)
+    estimate = AveragesEstimator(config, context).estimate(source, camera or CameraGuess(FOCAL_PX), Quiet())
+    return estimate, decided
+
+
+def test_poses_points_and_expected_errors_are_right() -> None:
+    estimate, decided = estimated(capture())
+    assert estimate.located.all()
+    score = pose_errors(estimate.camera_from_world, true_poses(), estimate.located, 10, estimate.std_position)
+    assert score.ate_share < 0.02
+    assert score.rotation_deg < 1
+    assert 0.3 < score.std_ratio < 2
+    assert len(estimate.views) == N_FRAMES // SIZE
+    assert len(estimate.points.positions) > 100
+    view = estimate.views[3]
+    ideal = (estimate.points.positions[view.points] @ view.camera_from_world[:, :3].T + view.camera_from_world[:, 3]) @ MATRIX.T
+    assert np.median(np.linalg.norm(ideal[:, :2] / ideal[:, 2:] - view.xy, axis=1)) < 1
+    assert view.flux().shape == SHAPE
+    assert 0.1 < np.nanmedian(estimate.points.flux) < 3
+    assert (decided, estimate.doubts, estimate.std_focal_px) == ([], (), 0)
+    again, _ = estimated(capture())
+    np.testing.assert_array_equal(again.camera_from_world, estimate.camera_from_world)
+
+
+def test_camera_that_only_turns_is_refused() -> None:
+    with pytest.raises(LocationError) as caught:
+        estimated(capture(travels=False))
+    assert "motion: {model: rotation}" in str(caught.value)
+
+
+def test_scene_without_texture_is_refused() -> None:
+    frames = np.random.default_rng(0).integers(0, 2, (5 * SIZE, *SHAPE))
+    with pytest.raises(LocationError, match=r"too little texture, or too much noise: of \d+ keypoints in an average"):
+        estimated(MemorySource(frames))
+
+
+@pytest.fixture
+def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let COLMAP find the poses of the averages 0 to 7 and 9 to 14 apart from each other, and none of 8 and 15."""
+    poses, points = true_poses()[::SIZE], np.random.default_rng(0).uniform([-2, -1, 3], [2, 1, 6], (80, 3))
+
+    def piece(images: range) -> Piece:
+        observed = []
+        for pose in poses[list(images)]:
+            seen = (points @ pose[:, :3].T + pose[:, 3]) @ MATRIX.T
+            observed.append((np.arange(len(points)), seen[:, :2] / seen[:, 2:]))
+        return Piece(np.array(images), poses[list(images)], points, tuple(observed), FOCAL_PX)
+
+    found = Reconstruction((piece(range(8)), piece(range(9, 15))), np.full(16, 300), np.full(16, 40))
+    monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
+
+
+@pytest.mark.usefixtures("pieces")
+def test_pieces_are_named_or_the_largest_is_kept() -> None:
+    source = MemorySource(np.zeros((N_FRAMES, *SHAPE)))
+    with pytest.raises(LocationError) as caught:
+        estimated(source)
+    assert str(caught.value) == (
+        "the poses fall into 2 pieces that are not connected: frames 0 to 159 (8 averages); frames 180 to 299 (6 averages). "
+        "Choose a smaller pose.with.step, so that neighbours overlap more, or keep the largest with pose.with.disconnected: "
+        "largest"
+    )
+    estimate, _ = estimated(source, disconnected="largest")
+    np.testing.assert_array_equal(estimate.located, np.arange(N_FRAMES) < 160)
+    [lost] = estimate.lost
+    assert (lost.span, lost.reason) == (
+        FrameSpan(160, 320),
+        "their averages belong to piece 2, which is not connected to the largest",
+    )
+
+
+@pytest.mark.usefixtures("pieces")
+def test_little_parallax_is_refused() -> None:
+    with pytest.raises(LocationError, match=r"the camera travels too little: the views of a point differ by .* less than 60"):
+        estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))), disconnected="largest", min_parallax_deg=60)
+
+
+@pytest.mark.usefixtures("pieces")
+def test_focal_length_that_was_found_is_a_decision() -> None:
+    estimate, [decision] = estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))), CameraGuess(), disconnected="largest")
+    assert decision[:2] == ("focal_px", FOCAL_PX)
+    assert estimate.std_focal_px == pytest.approx(0.01 * FOCAL_PX, rel=0.1)
+
+
+def test_few_averages_are_refused() -> None:
+    contribution = discover().find("pose-estimator", "colmap-averages").contribution
+    config = ColmapAveragesConfig(group_size=40)
+    [problem] = contribution.check(config, StreamInfo(160, *SHAPE, None))
+    assert problem == "the capture has 160 frames, 4 averages; at least 5 are needed"
+    with pytest.raises(LocationError, match="160 frames are 4 averages of 40; at least 5 are needed: choose a smaller"):
+        AveragesEstimator(config, SimpleNamespace()).estimate(MemorySource(np.zeros((160, 8, 8))), CameraGuess(), Quiet())
+
+
+@pytest.mark.parametrize(
+    ("flux", "speed_px", "n_frames", "size"), [(0.3, 0.01, 10_000, 200), (0.3, 0.1, 8000, 60), (0.01, None, 2400, 100)]
+)
+def test_size_is_chosen_by_light_and_motion(flux: float, speed_px: float | None, n_frames: int, size: int) -> None:
+    chosen, reason = chosen_size(CaptureSummary(flux, speed_px, "measured"), n_frames)
+    assert chosen == size
+    assert f"averages of {size} frames hold" in reason
+
+
+def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert "needs pycolmap, which is not installed" in str(discover().find("pose-estimator", "colmap-averages").unavailable)
+
+
+def test_spline_is_exact_for_a_smooth_path_and_keeps_its_velocity_beyond() -> None:
+    instants, poses = np.arange(5.0, N_FRAMES, 20), true_poses()
+    spline = PoseSpline(instants, poses[instants.astype(int)])
+    found = spline.at(np.arange(N_FRAMES, dtype=float))
+    np.testing.assert_allclose(found, poses, atol=5e-3)
+    np.testing.assert_allclose(found[instants.astype(int)], poses[instants.astype(int)], atol=1e-12)
+    places = positions_of(spline.at(np.array([310.0, 314, 318])))
+    np.testing.assert_allclose(places[2] - places[1], places[1] - places[0], atol=1e-12)
+    turns = Rotation.from_matrix(found[1:5, :, :3] @ np.swapaxes(found[:4, :, :3], 1, 2)).magnitude()
+    np.testing.assert_allclose(turns, turns[0], rtol=1e-6)
+
+
+def seen(x: np.ndarray, n_poses: int) -> np.ndarray:
+    """Return where poses (rotation vectors, then translations) see points: (n_poses, M, 2)."""
+    vectors, shifts, points = np.split(x.reshape(-1, 3), [n_poses, 2 * n_poses])
+    rotations = Rotation.from_rotvec(vectors).as_matrix()
+    ideal = ((rotations[:, None] @ points[None, :, :, None])[..., 0] + shifts[:, None]) @ MATRIX.T
+    return ideal[..., :2] / ideal[..., 2:]
+
+
+def test_expected_errors_of_bundle_adjustment_are_honest() -> None:
+    """Least squares moves poses and points by the pseudo-inverse of the derivatives, here by differences."""
+    poses, rng, noise_px = true_poses()[::40], np.random.default_rng(0), 0.05
+    n_poses, points = len(poses), rng.uniform([-2, -1.2, 3], [2, 1.2, 6], (40, 3))
+    true = np.concatenate([Rotation.from_matrix(poses[:, :, :3]).as_rotvec(), poses[:, :, 3], points]).ravel()
+    steps = 1e-6 * np.eye(len(true))
+    slopes = np.stack([(seen(true + step, n_poses) - seen(true - step, n_poses)).ravel() / 2e-6 for step in steps], axis=1)
+    solve = np.linalg.pinv(slopes, rcond=1e-6)
+    ratios = []
+    for _ in range(8):
+        xy = seen(true, n_poses) + noise_px * rng.normal(size=(n_poses, 40, 2))
+        found = true + solve @ (xy - seen(true, n_poses)).ravel()
+        vectors, shifts, positions = np.split(found.reshape(-1, 3), [n_poses, 2 * n_poses])
+        fitted = np.concatenate([Rotation.from_rotvec(vectors).as_matrix(), shifts[..., None]], axis=-1)
+        noise = pose_noise(fitted, positions, [(np.arange(40), each) for each in xy], MATRIX, False)
+        score = pose_errors(fitted, poses, np.ones(n_poses, bool), 1, noise.std_position)
+        ratios.append([score.std_ratio, np.deg2rad(score.rotation_deg) / np.sqrt(np.mean(noise.std_rotation**2))])
+        assert noise.residual_px == pytest.approx(noise_px, rel=0.25)
+    assert np.sqrt(np.mean(np.square(ratios), axis=0)) == pytest.approx([1, 1], abs=0.25)

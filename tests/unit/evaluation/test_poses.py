@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from photonpano import InputError, evaluate, evaluate_poses
+from photonpano.cli.app import app
+from photonpano.evaluation import load_truth, pose_errors
+
+N_FRAMES, RATE = 200, 1000.0
+MATRIX = np.array([[90.0, 0, 44.5], [0, 90, 29.5], [0, 0, 1]])
+
+
+def poses_of(places: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    rotations = Rotation.from_rotvec(vectors).as_matrix()
+    return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+
+
+def path(noise_m: float = 0.0, noise_rad: float = 0.0) -> np.ndarray:
+    """Return poses on a bent path, with noise that is independent in each frame."""
+    times, rng = np.linspace(0, 1, N_FRAMES), np.random.default_rng(1)
+    places = np.stack([2 * times, np.sin(5 * times), 2 * times**2], axis=1)
+    vectors = np.outer(times, [0.1, 0.4, -0.2])
+    return poses_of(places + noise_m * rng.normal(size=(N_FRAMES, 3)), vectors + noise_rad * rng.normal(size=(N_FRAMES, 3)))
+
+
+def in_other_world(poses: np.ndarray, scale: float = 0.2) -> np.ndarray:
+    """Return the same poses where the world is turned, moved and scaled."""
+    turn, shift = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.array([3.0, -4, 1])
+    rotations = poses[:, :, :3] @ turn.T
+    return np.concatenate([rotations, (scale * poses[:, :, 3] - rotations @ shift)[..., None]], axis=-1)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A run folder with poses that err by 1 mm and 1 mrad along each axis, and its truth beside it."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    located = np.arange(N_FRAMES) < 180
+    poses = in_other_world(path(0.001, 0.001))
+    poses[~located] = np.nan
+    write(folder, poses, located)
+    np.savez(tmp_path / "truth.npz", camera_from_world=path(), camera_matrix=MATRIX * [[0.9], [0.9], [1]])
+    return folder
+
+
+def write(folder: Path, poses: np.ndarray, located: np.ndarray, **changes: Any) -> None:
+    arrays = {
+        "camera_from_world": poses,
+        "located": located,
+        "camera_matrix": MATRIX,
+        "distortion": np.zeros(4),
+        "std_position": np.where(located, 0.2 * 0.001 * np.sqrt(3), np.nan),
+        "std_rotation_deg": np.where(located, 0.1, np.nan),
+        "frame_shape": np.array([60, 90]),
+        "frame_rate_hz": np.array(RATE),
+    }
+    np.savez(folder / "poses.npz", **(arrays | changes))
+
+
+def test_errors_are_those_of_the_noise_whatever_the_world(folder: Path, tmp_path: Path) -> None:
+    score = evaluate_poses(folder, tmp_path / "truth.npz", rpe_frames=5)
+    assert score.located_share == 0.9
+    assert score.ate_m == pytest.approx(0.001 * np.sqrt(3), rel=0.1)
+    length = np.linalg.norm(np.diff(-np.einsum("nji,nj->ni", path()[:180, :, :3], path()[:180, :, 3]), axis=0), axis=1).sum()
+    assert score.ate_share == pytest.approx(score.ate_m / length)
+    assert score.rotation_deg == pytest.approx(np.rad2deg(0.001 * np.sqrt(3)), rel=0.2)
+    assert score.rpe_frames == 5
+    assert score.rpe_m == pytest.approx(0.001 * np.sqrt(6), rel=0.15)
+    assert score.rpe_deg == pytest.approx(np.rad2deg(0.001 * np.sqrt(6)), rel=0.2)
+    assert score.honest_shares == pytest.approx((0.61, 0.995, 1), abs=0.12)
+    assert score.std_ratio == pytest.approx(1, abs=0.1)
+    assert score.focal_error == pytest.approx(1 / 0.9 - 1)
+    assert np.isnan(score.errors_m[180:]).all()
+
+
+def test_perfect_poses_have_no_error() -> None:
+    score = pose_errors(in_other_world(path()), path(), np.ones(N_FRAMES, bool), rpe_frames=10)
+    assert max(score.ate_m, score.rotation_deg, score.rpe_m, score.rpe_deg) < 1e-5
+    assert score.honest_shares is None
+
+
+def test_mirrored_poses_are_not_right() -> None:
+    mirrored = path() * np.array([-1.0, 1, 1])[:, None]
+    mirrored[:, :, 0] *= -1
+    assert pose_errors(mirrored, path(), np.ones(N_FRAMES, bool), 10).ate_m > 0.01
+
+
+def test_command_prints_ate_and_rpe(folder: Path, tmp_path: Path) -> None:
+    arguments = ["evaluate", str(folder), "--truth", str(tmp_path / "truth.npz")]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "position error (ATE), rms" in done.stdout
+    assert "RPE over 2 frames, rms" in done.stdout
+    assert '"std_ratio": ' in CliRunner().invoke(app, [*arguments, "--json"]).stdout
+
+
+@pytest.mark.parametrize(
+    ("truth", "message"),
+    [
+        (
+            {"homographies": np.eye(3)[None]},
+            "has homographies and no poses (camera_from_world): it is the truth of a flat",
+        ),
+        ({"camera_from_world": path()[:9]}, "is the truth of 9 frames, but the run in"),
+        ({"camera_from_world": np.zeros((N_FRAMES, 3, 4))}, "camera_from_world must be finite rotations and translations"),
+        ({"camera_from_world": np.zeros((N_FRAMES, 4, 4))}, "of the shape (frames, 3, 4), got (200, 4, 4)"),
+        ({"other": np.zeros(3)}, "lacks camera_from_world; it contains other"),
+    ],
+)
+def test_truth_of_something_else_is_refused(folder: Path, tmp_path: Path, truth: dict[str, Any], message: str) -> None:
+    np.savez(tmp_path / "other.npz", **truth)
+    with pytest.raises(InputError) as caught:
+        evaluate_poses(folder, tmp_path / "other.npz")
+    assert message in str(caught.value)
+
+
+def test_panorama_and_its_truth_are_kept_apart(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="which has poses and no homographies; score a run with `pose` by it"):
+        load_truth(tmp_path / "truth.npz")
+    with pytest.raises(InputError, match="is a run with `pose`: it has the poses of a camera that travels"):
+        evaluate(folder, tmp_path / "truth.npz", oracle=False)
+
+
+def test_damaged_poses_are_refused(folder: Path, tmp_path: Path) -> None:
+    located = np.ones(N_FRAMES, bool)
+    write(folder, in_other_world(path()), located, std_position=np.zeros(3))
+    with pytest.raises(InputError, match="std_position must have a number for each of 200 frames"):
+        evaluate_poses(folder, tmp_path / "truth.npz")
+    write(folder, poses_of(np.zeros((N_FRAMES, 3)), np.zeros((N_FRAMES, 3))), located)
+    with pytest.raises(InputError, match="all positions are the same"):
+        evaluate_poses(folder, tmp_path / "truth.npz")
