@@ -88,7 +88,7 @@ RUNS: dict[str, dict[str, Any]] = {
 """Specs to run, with overrides that make them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
-NEEDS = {"colmap": "pycolmap", "high-speed-video": "av", "kornia": "kornia"}
+NEEDS = {"colmap": "pycolmap", "poses": "pycolmap", "high-speed-video": "av", "kornia": "kornia"}
 """Optional libraries of specs, which run only if the library is installed."""
 REPORTS = {"scan", "revisits", "high-speed-video"}
 """Specs whose reports are drawn; those of others show no more."""
@@ -135,7 +135,7 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
 
 
 def test_every_example_spec_is_in_this_file():
-    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS}
+    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, "poses"}
 
 
 def test_examples_readme_links_every_spec():
@@ -173,6 +173,15 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
     assert record["spec"]["merge"]["with"].get("compensate", True) == (name != "naive-average")
     assert any(level["revisits"]["located"] for level in record["levels"]) == (name == "revisits")
     assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
+
+
+def test_example_of_poses_runs(examples, tmp_path, without_report):
+    pytest.importorskip(NEEDS["poses"])
+    printed = photonpano("run", examples / "poses.yaml", "--output", tmp_path / "run")
+    assert "located   480 of 480 frames" in printed
+    assert len(list((tmp_path / "run" / "images").glob("*.png"))) == 16
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["poses"]["std_position"] < 0.02
 
 
 def test_tutorial_specs_equal_example_specs():

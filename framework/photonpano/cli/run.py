@@ -77,7 +77,7 @@ def run(
             typer.echo(f"refined   {_correction(refinement)}")
     if line := _range(record.get("panorama")):
         typer.echo(f"range     {line}")
-    if poses := record["poses"]:
+    if poses := record.get("poses"):
         typer.echo(f"located   {poses['located']:,} of {counted(record['source']['n_frames'], 'frame')}")
         typer.echo(f"poses     {directory / 'poses.npz'}")
     else:

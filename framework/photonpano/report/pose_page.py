@@ -23,6 +23,7 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
             **head_of(record),
             poses=record["poses"],
             warnings=[each for each in record["warnings"] if not each.startswith(DOUBTFUL)],
+            path=pose_figures.path(estimate),
             path_and_points=pose_figures.path_and_points(estimate),
             errors_over_time=pose_figures.errors_over_time(estimate, record["source"]["frame_rate_hz"]),
         )

@@ -6,6 +6,7 @@ from .exporters import ExporterConformance as ExporterConformance
 from .interpolators import InterpolatorConformance as InterpolatorConformance
 from .locators import LocatorConformance as LocatorConformance
 from .mergers import MergerConformance as MergerConformance
+from .pose_estimators import PoseEstimatorConformance as PoseEstimatorConformance
 from .refiners import RefinerConformance as RefinerConformance
 from .renderers import RendererConformance as RendererConformance
 from .resamplers import ResamplerConformance as ResamplerConformance

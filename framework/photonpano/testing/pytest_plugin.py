@@ -12,7 +12,17 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_KINDS = ("sources", "resamplers", "mergers", "locators", "interpolators", "refiners", "renderers", "exporters")
+_KINDS = (
+    "sources",
+    "resamplers",
+    "mergers",
+    "locators",
+    "interpolators",
+    "refiners",
+    "renderers",
+    "exporters",
+    "pose_estimators",
+)
 for _name in ("conformance", "stages", *_KINDS):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sys
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,6 +15,7 @@ from photonpano.context import Quiet
 from photonpano.evaluation import pose_errors
 from photonpano.geometry import camera_matrix
 from photonpano.testing import MemorySource
+from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 
@@ -26,40 +25,8 @@ from photonpano_colmap.pose_noise import pose_noise
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction
 
-SHAPE, FOCAL_PX, N_FRAMES, SIZE = (128, 160), 150.0, 320, 20
+SIZE = 20
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
-PLANES = ((6.0, (-4, -4, 4, 4)), (3.5, (-1.6, -1.0, -0.5, 0.6)), (4.2, (0.4, -1.2, 1.6, 0.1)), (3.0, (-0.3, 0.2, 1.0, 1.1)))
-"""Depth, and left, top, right and bottom edge, in m."""
-
-
-def true_poses(travels: bool = True) -> np.ndarray:
-    """Return the poses of a camera that moves to the right by 1.2 m, or only turns by 20 degrees."""
-    times = np.linspace(-1, 1, N_FRAMES)
-    places = np.stack([0.6 * times, 0.1 * np.cos(3 * times), 0.15 * times**2], axis=1) * travels
-    turns = np.stack([0.02 * times, 0.06 * times if travels else 0.17 * times, 0.01 * np.sin(4 * times)], axis=1)
-    rotations = Rotation.from_rotvec(turns).as_matrix()
-    return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
-
-
-@cache
-def capture(travels: bool = True) -> MemorySource:
-    """Simulate binary frames with 1 photon a pixel."""
-    rng = np.random.default_rng(4)
-    frames = np.empty((N_FRAMES, *SHAPE), np.uint8)
-    textures = []
-    for depth, (left, top, right, bottom) in PLANES:
-        size = round(FOCAL_PX * (bottom - top) / depth), round(FOCAL_PX * (right - left) / depth)
-        textures.append(np.clip(1 + 5 * (cv2.GaussianBlur(rng.uniform(0, 1, size), (0, 0), 1.2) - 0.5), 0.1, 3))
-    for frame, pose in enumerate(true_poses(travels)):
-        flux = np.zeros(SHAPE)
-        for (depth, (left, top, right, bottom)), texture in zip(PLANES, textures, strict=True):
-            height, width = texture.shape
-            to_world = np.array([[(right - left) / width, 0, left], [0, (bottom - top) / height, top], [0, 0, depth]])
-            to_frame = MATRIX @ (pose[:, :3] @ to_world + np.outer(pose[:, 3], [0, 0, 1]))
-            seen = cv2.warpPerspective(texture, to_frame, SHAPE[::-1], flags=cv2.INTER_LINEAR, borderValue=-1)
-            flux = np.where(seen > 0, seen, flux)
-        frames[frame] = rng.random(SHAPE) < -np.expm1(-flux)
-    return MemorySource(frames)
 
 
 def estimated(source: MemorySource, camera: CameraGuess | None = None, **keys: Any) -> Any:
@@ -70,26 +37,18 @@ def estimated(source: MemorySource, camera: CameraGuess | None = None, **keys: A
     return estimate, decided
 
 
-def test_poses_points_and_expected_errors_are_right() -> None:
+def test_points_and_views_fit_together() -> None:
     estimate, decided = estimated(capture())
-    assert estimate.located.all()
-    score = pose_errors(estimate.camera_from_world, true_poses(), estimate.located, 10, estimate.std_position)
-    assert score.ate_share < 0.02
-    assert score.rotation_deg < 1
-    assert 0.3 < score.std_ratio < 2
     assert len(estimate.views) == N_FRAMES // SIZE
     assert len(estimate.points.positions) > 100
     view = estimate.views[3]
     ideal = (estimate.points.positions[view.points] @ view.camera_from_world[:, :3].T + view.camera_from_world[:, 3]) @ MATRIX.T
     assert np.median(np.linalg.norm(ideal[:, :2] / ideal[:, 2:] - view.xy, axis=1)) < 1
-    assert view.flux().shape == SHAPE
     assert 0.1 < np.nanmedian(estimate.points.flux) < 3
-    assert (decided, estimate.doubts, estimate.std_focal_px) == ([], (), 0)
-    again, _ = estimated(capture())
-    np.testing.assert_array_equal(again.camera_from_world, estimate.camera_from_world)
+    assert (decided, estimate.doubts, estimate.std_focal_px, estimate.lost) == ([], (), 0, ())
 
 
-def test_camera_that_only_turns_is_refused() -> None:
+def test_camera_that_only_turns_is_offered_rotations() -> None:
     with pytest.raises(LocationError) as caught:
         estimated(capture(travels=False))
     assert "motion: {model: rotation}" in str(caught.value)

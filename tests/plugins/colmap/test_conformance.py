@@ -1,9 +1,9 @@
-"""The locator of this plugin keeps what every locator promises."""
+"""The components of this plugin keep what every one of their kind promises."""
 
 from __future__ import annotations
 
 from photonpano import discover
-from photonpano.testing import LocatorConformance
+from photonpano.testing import LocatorConformance, PoseEstimatorConformance
 
 CATALOG = discover()
 
@@ -11,3 +11,8 @@ CATALOG = discover()
 class TestPycolmapTwoView(LocatorConformance):
     contribution = CATALOG.find("locator", "pycolmap-two-view").contribution
     tolerance_px = 0.3
+
+
+class TestColmapAverages(PoseEstimatorConformance):
+    contribution = CATALOG.find("pose-estimator", "colmap-averages").contribution
+    config = {"group_size": 20}
