@@ -69,7 +69,7 @@ class Plan:
     Attributes:
         source: the capture.
         corrections: the corrections of its frames, in order.
-        levels: one plan for each level, in order.
+        levels: one plan for each level, in order; none with `pose`, which has no refiners either.
         refine: the refiners that correct the motion after the last level, in order.
         until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
         renderer: the component that renders the panorama.

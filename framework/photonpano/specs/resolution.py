@@ -169,20 +169,21 @@ class _Resolver:
             **chosen,
             "refine": [_component(refiner) for refiner in refine if refiner],
             "levels": UNTIL_CONVERGED if until_converged else [_level(level, chosen) for level in levels if level],
+            **({} if pose is None else {"pose": _component(pose)}),
             **{name: section.model_dump(mode="json") for name, section in settings.items()},
         }
         document["render"] = _component(renderer) | document["render"]
         document["output"] |= {"formats": [_component(each) for each in formats]}
         if pose is not None:
-            document = {key: value for key, value in document.items() if key not in PANORAMA_ONLY} | {"pose": _component(pose)}
+            document = {key: value for key, value in document.items() if key not in PANORAMA_ONLY}
             del document["output"]["formats"]
         else:
             del document["output"]["exposures"]
         return Plan(
             source,
             corrections or (),
-            tuple(filter(None, levels)),
-            tuple(filter(None, refine)),
+            () if posed else tuple(filter(None, levels)),
+            () if posed else tuple(filter(None, refine)),
             renderer,
             formats,
             until_converged,

@@ -194,6 +194,34 @@ def test_panorama_in_the_same_folder_replaces_the_poses(
     assert not (folder / "panorama.tiff").exists()
 
 
+def test_folder_that_cannot_be_renamed_gets_the_same_files(
+    plan_of: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_report: None
+) -> None:
+    """The current folder keeps its name: the files are moved into it one by one."""
+    folder = tmp_path / "run"
+    run(plan_of(output={"exposures": True}))
+    (folder / "images" / "mine.png").write_text("a user's")
+    monkeypatch.chdir(folder)
+    run(plan_of(), overwrite=True)
+    assert [path.name for path in (folder / "images").iterdir()] == ["mine.png"]
+    assert {path.name for path in (folder / "sparse").iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
+    assert changed_files(folder) == []
+    assert not [path for path in folder.iterdir() if path.name.startswith(".") and path.name != ".lock"]
+
+
+def test_record_that_lists_files_elsewhere_is_not_followed(
+    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
+) -> None:
+    folder, other = tmp_path / "run", tmp_path / "precious.txt"
+    run(plan_of())
+    other.write_text("precious")
+    record = json.loads((folder / "run.json").read_text())
+    record["files"]["../precious.txt"] = {"bytes": 8, "sha256": ""}
+    (folder / "run.json").write_text(json.dumps(record))
+    run(plan_of(), overwrite=True)
+    assert other.read_text() == "precious"
+
+
 def test_commands_of_panoramas_refuse_a_run_of_poses(
     plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
 ) -> None:
@@ -264,7 +292,7 @@ def test_other_sections_are_refused(plan_of: Callable[..., Plan], without_report
 
 def test_document_is_a_spec_itself(plan_of: Callable[..., Plan], without_report: None) -> None:
     plan = plan_of(camera={"focal_px": 99})
-    assert list(plan.document) == ["version", "source", "corrections", "camera", "output", "run", "pose"]
+    assert list(plan.document) == ["version", "source", "corrections", "pose", "camera", "output", "run"]
     toy = plan.pose.contribution
     assert parse_spec(plan.document, catalog=discover().including(toy)).document == plan.document
 
@@ -272,5 +300,7 @@ def test_document_is_a_spec_itself(plan_of: Callable[..., Plan], without_report:
 def test_explain_and_check_describe_a_spec_with_pose(plan_of: Callable[..., Plan], without_report: None) -> None:
     text = photonpano.explain(plan := plan_of(), catalog=discover().including(plan_of().pose.contribution))
     assert "pose:\n  use: toy" in text
+    assert "levels" not in text
+    assert plan.levels == plan.refine == ()
     with pytest.raises(InputError, match="a forecast is of panoramas"):
         photonpano.explain(plan, with_forecast=True)

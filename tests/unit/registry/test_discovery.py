@@ -75,7 +75,7 @@ def test_framework_offers_names_through_its_own_entry_point(kind, name):
             "@hookimpl\ndef photonpano_source(): return []",
             "there is no hook 'photonpano_source'; known: photonpano_sources, photonpano_resamplers, photonpano_mergers, "
             "photonpano_locators, photonpano_interpolators, photonpano_refiners, photonpano_renderers, photonpano_exporters, "
-            "photonpano_run_started, photonpano_stage_finished and "
+            "photonpano_pose_estimators, photonpano_run_started, photonpano_stage_finished and "
             "photonpano_run_finished",
         ),
         ("def photonpano_sources(): return []", "photonpano_sources is not marked with @photonpano.hookimpl"),
