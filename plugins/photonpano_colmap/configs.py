@@ -57,3 +57,14 @@ class ColmapAveragesConfig(Config):
         description="if COLMAP finds several pieces whose poses are not connected: stop with an error that names them, or go "
         "on with the largest",
     )
+
+
+class StratifiedPoseConfig(ColmapAveragesConfig):
+    """Averages of frames into COLMAP; then denser and denser exposures, merged and located through the depth of the scene."""
+
+    levels: int = Field(
+        4, ge=2, le=8, description="number of levels, the averages included; each has about 1.5 times the exposures of the last"
+    )
+    min_group_size: int = Field(
+        64, ge=4, le=100_000, description="number of frames of an exposure below which no further level is made"
+    )

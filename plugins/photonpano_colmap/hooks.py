@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, hookimpl
-from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, PycolmapTwoViewConfig
+from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,6 +38,14 @@ def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
         check=_problems_of_averages,
         requires=_REQUIRES,
     )
+    yield PoseEstimatorContribution(
+        name="stratified-pose",
+        summary="Denser and denser exposures, merged and located through the depth of the scene; begins with colmap-averages",
+        config=StratifiedPoseConfig,
+        build=_build_stratified,
+        check=_problems_of_averages,
+        requires=(*_REQUIRES, Requirement("gtsam", "photonpano[poses]")),
+    )
 
 
 def _build_two_view(config: PycolmapTwoViewConfig, context: StageContext) -> Locator:
@@ -50,6 +58,12 @@ def _build_averages(config: ColmapAveragesConfig, context: StageContext) -> Pose
     from photonpano_colmap.averages import AveragesEstimator
 
     return AveragesEstimator(config, context)
+
+
+def _build_stratified(config: StratifiedPoseConfig, context: StageContext) -> PoseEstimator:
+    from photonpano_colmap.stratified import StratifiedEstimator
+
+    return StratifiedEstimator(config, context)
 
 
 def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> list[str]:

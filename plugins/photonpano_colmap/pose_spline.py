@@ -8,6 +8,7 @@ Convention:
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -23,8 +24,9 @@ class PoseSpline:
         self._positions = CubicSpline(instants, positions_of(poses))
         self._rotations = RotationSpline(instants, Rotation.from_matrix(poses[:, :, :3]))
 
-    def at(self, instants: FloatArray) -> FloatArray:
+    def at(self, instants: ArrayLike) -> FloatArray:
         """Return the poses of N instants: (N, 3, 4)."""
+        instants = np.asarray(instants, dtype=np.float64)
         inside = np.clip(instants, *self._ends)
         beyond = (instants - inside)[:, None]
         places = self._positions(inside) + beyond * self._positions(inside, 1)

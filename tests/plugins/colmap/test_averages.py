@@ -48,9 +48,12 @@ def test_points_and_views_fit_together() -> None:
     assert (decided, estimate.doubts, estimate.std_focal_px, estimate.lost) == ([], (), 0, ())
 
 
-def test_camera_that_only_turns_is_offered_rotations() -> None:
+def test_camera_that_only_turns_is_offered_rotations(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Reconstruction((), np.full(16, 300), np.full(16, 100))
+    monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
     with pytest.raises(LocationError) as caught:
-        estimated(capture(travels=False))
+        estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))))
+    assert "of 300 keypoints in an average, 100 match" in str(caught.value)
     assert "motion: {model: rotation}" in str(caught.value)
 
 

@@ -16,3 +16,10 @@ class TestPycolmapTwoView(LocatorConformance):
 class TestColmapAverages(PoseEstimatorConformance):
     contribution = CATALOG.find("pose-estimator", "colmap-averages").contribution
     config = {"group_size": 20}
+
+
+class TestStratifiedPose(PoseEstimatorConformance):
+    contribution = CATALOG.find("pose-estimator", "stratified-pose").contribution
+    config = {"group_size": 20, "levels": 2}
+    tolerance = 0.01
+    tolerance_deg = 0.5

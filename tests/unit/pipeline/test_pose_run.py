@@ -34,6 +34,7 @@ from photonpano.record.contents import changed_files
 from photonpano.specs import Plan, parse_spec
 
 N_FRAMES, LOST = 300, FrameSpan(280, 300)
+CATALOG = discover()
 
 
 class Keys(Config):
@@ -90,7 +91,7 @@ def plan_of(small_spec: dict[str, Any], tmp_path: Path) -> Callable[..., Plan]:
             name="toy", summary="Toy", config=Keys, build=lambda *_: SimpleNamespace(estimate=estimate)
         )
         spec = {"version": 1, "source": small_spec["source"], "pose": "toy", **sections}
-        return parse_spec(spec, output=tmp_path / "run", catalog=discover().including(toy))
+        return parse_spec(spec, output=tmp_path / "run", catalog=CATALOG.including(toy))
 
     return plan_of
 
@@ -294,11 +295,11 @@ def test_document_is_a_spec_itself(plan_of: Callable[..., Plan], without_report:
     plan = plan_of(camera={"focal_px": 99})
     assert list(plan.document) == ["version", "source", "corrections", "pose", "camera", "output", "run"]
     toy = plan.pose.contribution
-    assert parse_spec(plan.document, catalog=discover().including(toy)).document == plan.document
+    assert parse_spec(plan.document, catalog=CATALOG.including(toy)).document == plan.document
 
 
 def test_explain_and_check_describe_a_spec_with_pose(plan_of: Callable[..., Plan], without_report: None) -> None:
-    text = photonpano.explain(plan := plan_of(), catalog=discover().including(plan_of().pose.contribution))
+    text = photonpano.explain(plan := plan_of(), catalog=CATALOG.including(plan_of().pose.contribution))
     assert "pose:\n  use: toy" in text
     assert "levels" not in text
     assert plan.levels == plan.refine == ()

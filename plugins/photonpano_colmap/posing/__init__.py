@@ -1,0 +1,1 @@
+"""Poses of a camera that moves through a scene, from exposures that are merged through its depth."""

@@ -1,0 +1,210 @@
+"""Bundle adjustment of exposures and points, by GTSAM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L as POINT
+from gtsam.symbol_shorthand import X as POSE
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from photonpano import FloatArray
+from photonpano_colmap.pose_spline import positions_of
+from photonpano_colmap.posing.path import posed, projected
+
+_ROBUST = 2.0
+"""Sightings further off than this many standard deviations count by their distance, not by its square."""
+_FLOOR_PX = 0.02
+"""Error that sightings have beside photon noise: interpolation, and depth that is not quite right."""
+_PRIOR_RAD, _PRIOR_SHIFT = 0.02, 0.2
+"""How far poses may be from where they begin: in radians, and in mean distances of the cameras from their middle."""
+_PRIOR_POINT = 100.0
+"""The same of points, whose depth sightings may not tell."""
+_OUTLIER = 3.0
+"""Points are kept if they are seen within this many standard deviations, ..."""
+_SEEN_BY = 3
+"""... by at least this many exposures."""
+_MOST_STEPS = 30
+_REWEIGHTINGS = 3
+"""After the first solution, sightings are weighted by the residuals of their point."""
+_MEDIAN_OF_TWO = 2 * np.log(2)
+"""Median of the sum of the squares of two normal numbers."""
+_SHARED_PX = 6.0
+"""Patches nearer to each other have most of their photons in common."""
+_FAR_PX = 1e3
+"""Residual of a point behind a camera."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Points that exposures see.
+
+    Attributes:
+        points: (M,) numbers of the points.
+        views: (M,) numbers of the exposures.
+        pixels: (M, 2) px.
+        covariance: (M, 2, 2) px^2, up to a common factor.
+    """
+
+    points: NDArray[np.intp]
+    views: NDArray[np.intp]
+    pixels: FloatArray
+    covariance: FloatArray
+
+    def kept(self, which: NDArray[np.bool_]) -> Sightings:
+        """Return some of the sightings."""
+        return Sightings(self.points[which], self.views[which], self.pixels[which], self.covariance[which])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """Poses and points that agree best with all sightings.
+
+    Attributes:
+        poses: (V, 3, 4).
+        points: (N, 3).
+        confirmed: (N,) points that at least 3 exposures see where they should be.
+        std_position: (V,) expected distance of a camera from its true place, after the best similarity of all.
+        std_rotation: (V,) expected angle in radians, after the best rotation of all.
+        residual_px: median distance of a sighting from where its point is seen.
+    """
+
+    poses: FloatArray
+    points: FloatArray
+    confirmed: NDArray[np.bool_]
+    std_position: FloatArray
+    std_rotation: FloatArray
+    residual_px: float
+
+
+def adjust(poses: FloatArray, points: FloatArray, sightings: Sightings, camera_matrix: FloatArray) -> Adjusted:
+    """Solve for the poses and points that agree best with the sightings.
+
+    Args:
+        poses: (V, 3, 4) to begin with.
+        points: (N, 3) to begin with.
+        sightings: each of the points is seen at least twice.
+        camera_matrix: (3, 3) K.
+    """
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setMaxIterations(_MOST_STEPS)
+    settings.setRelativeErrorTol(1e-6)
+    covariance, shared = sightings.covariance + _FLOOR_PX**2 * np.eye(2), _shared(sightings)
+    for _ in range(_REWEIGHTINGS):
+        graph, values = _problem(poses, points, sightings, covariance * shared[:, None, None], camera_matrix)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
+        found = [values.atPose3(POSE(view)) for view in range(len(poses))]
+        poses = posed(
+            np.array([each.rotation().matrix().T for each in found]), np.array([each.translation() for each in found])
+        )
+        points = np.array([values.atPoint3(POINT(point)) for point in range(len(points))])
+        residuals = sightings.pixels - projected(poses[sightings.views], points[sightings.points], camera_matrix)
+        residuals = np.where(np.isfinite(residuals), residuals, _FAR_PX)
+        squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(covariance), residuals)
+        # Patches at the edges of things show two depths, and wander between them.
+        of_point = _median_by(sightings.points, squares, len(points)) / _MEDIAN_OF_TWO
+        covariance = covariance * of_point[sightings.points, None, None] + _FLOOR_PX**2 * np.eye(2)
+    fits = squares < _OUTLIER**2 * of_point[sightings.points]
+    confirmed = np.bincount(sightings.points[fits], minlength=len(points)) >= _SEEN_BY
+    std_position, std_rotation = _uncertainty(graph, values, poses, len(points))
+    return Adjusted(
+        poses,
+        points,
+        confirmed,
+        std_position,
+        std_rotation,
+        float(np.median(np.linalg.norm(residuals, axis=1))),
+    )
+
+
+def _problem(
+    poses: FloatArray, points: FloatArray, sightings: Sightings, covariance: FloatArray, camera_matrix: FloatArray
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Return the factors of a bundle adjustment, and the values that it begins with."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    (f_x, _, c_x), (_, f_y, c_y), _ = camera_matrix
+    calibration = gtsam.Cal3_S2(f_x, f_y, 0.0, c_x, c_y)
+    centres = positions_of(poses)
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
+    nearby = gtsam.noiseModel.Diagonal.Sigmas(np.array(3 * [_PRIOR_RAD] + 3 * [_PRIOR_SHIFT * spread]))
+    for view, (pose, centre) in enumerate(zip(poses, centres, strict=True)):
+        start = gtsam.Pose3(gtsam.Rot3(pose[:, :3].T), centre)
+        values.insert(POSE(view), start)
+        graph.add(gtsam.PriorFactorPose3(POSE(view), start, nearby))
+    somewhere = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_POINT * spread)
+    for point, place in enumerate(points):
+        values.insert(POINT(point), place)
+        graph.add(gtsam.PriorFactorPoint3(POINT(point), place, somewhere))
+    robust = gtsam.noiseModel.mEstimator.Cauchy.Create(_ROBUST)
+    rows = zip(sightings.points, sightings.views, sightings.pixels, np.linalg.inv(covariance), strict=True)
+    for point, view, pixel, information in rows:
+        noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Information(information))
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, POSE(int(view)), POINT(int(point)), calibration))
+    return graph, values
+
+
+def _uncertainty(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, poses: FloatArray, n_points: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the expected errors of places, (V,), and of rotations in radians, (V,), where the world itself is free."""
+    n_views = len(poses)
+    order = gtsam.Ordering()
+    for point in range(n_points):
+        order.push_back(POINT(point))
+    _, of_poses = graph.linearize(values).eliminatePartialMultifrontal(order)
+    order = gtsam.Ordering()
+    for view in range(n_views):
+        order.push_back(POSE(view))
+    covariance = np.linalg.inv(of_poses.hessian(order)[0]).reshape(n_views, 6, n_views, 6)
+    # Of each pose, the rotation comes first, and both are in the frame of the camera.
+    to_world = np.swapaxes(poses[:, :, :3], 1, 2)
+    turned, moved = (
+        np.einsum("vij,vjwk,wlk->viwl", to_world, covariance[:, part, :, part], to_world).reshape(3 * n_views, 3 * n_views)
+        for part in (slice(3), slice(3, 6))
+    )
+    centres = positions_of(poses)
+    centres = centres - centres.mean(axis=0)
+    everywhere = np.tile(np.eye(3), (n_views, 1))
+    similarity = np.concatenate([everywhere, -_crosses(centres).reshape(-1, 3), centres.reshape(-1, 1)], axis=1)
+    return _left(moved, similarity), _left(turned, everywhere)
+
+
+def _shared(sightings: Sightings) -> FloatArray:
+    """Return how many sightings share the photons of each, since points of several key exposures coincide: (M,)."""
+    shared = np.ones(len(sightings.points))
+    for view in np.unique(sightings.views):
+        of_view = np.flatnonzero(sightings.views == view)
+        pixels = sightings.pixels[of_view]
+        shared[of_view] = cKDTree(pixels).query_ball_point(pixels, _SHARED_PX, return_length=True)
+    return shared
+
+
+def _median_by(group: NDArray[np.intp], values: FloatArray, number: int) -> FloatArray:
+    """Return the medians of the values of each group: (number,)."""
+    order = np.lexsort((values, group))
+    counts = np.bincount(group, minlength=number)
+    middle = np.cumsum(counts) - counts + counts // 2
+    return np.asarray(values[order][np.minimum(middle, len(values) - 1)])
+
+
+def _left(covariance: FloatArray, free: FloatArray) -> FloatArray:
+    """Return the expected lengths of vectors, (V,), once what is free is fitted and removed.
+
+    Args:
+        covariance: (3 V, 3 V).
+        free: (3 V, K) directions in which all vectors may move together.
+    """
+    basis, _ = np.linalg.qr(free)
+    keeps = np.eye(len(covariance)) - basis @ basis.T
+    variances = np.einsum("ij,ij->i", keeps @ covariance, keeps)
+    return np.asarray(np.sqrt(np.maximum(variances.reshape(-1, 3).sum(axis=1), 0)))
+
+
+def _crosses(vectors: FloatArray) -> FloatArray:
+    """Return the matrices of cross products with (N, 3) vectors: (N, 3, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,197 @@
+"""One level of stratified poses: re-sample, merge, locate, interpolate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import FloatArray, FrameSpan, Group, LocationError, Source
+from photonpano_colmap.posing.adjustment import Adjusted, Sightings, adjust
+from photonpano_colmap.posing.depth import inverse_depth_of
+from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
+from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
+from photonpano_colmap.posing.path import CorrectedPath, Path, between
+
+_PATCHES = 300
+"""Patches of a key exposure."""
+_KEYS = 12
+"""Key exposures, whose patches are sought in others: about so many, and at least every 10th exposure."""
+_EVERY = 10
+_NEIGHBOURS = 12
+"""Patches are sought in so many exposures before and after, and in every 6th of all others."""
+_FURTHER = 6
+_SEEN_BY = 4
+"""A point must be seen by so many exposures."""
+_LEAST_SIGHTINGS = 20
+"""An exposure with fewer sightings is not located."""
+_OUT_OF_SIGHT = 0.8
+"""Exposures are not compared if the middle of one lies further than this from that of the other, in sides of a frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What is known of capture and scene before a level.
+
+    Attributes:
+        path: of the camera.
+        points: (N, 3) of the world.
+    """
+
+    path: Path
+    points: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedLevel:
+    """The exposures of a level, located.
+
+    Attributes:
+        groups: of the exposures.
+        located: (V,) bool.
+        adjusted: poses of the located exposures, and points.
+        sightings: of these points, in the located exposures.
+        exposures: all of them.
+        path: of the camera.
+    """
+
+    groups: Sequence[Group]
+    located: NDArray[np.bool_]
+    adjusted: Adjusted
+    sightings: Sightings
+    exposures: Sequence[PosedExposure]
+    path: Path
+
+    @property
+    def scene(self) -> Scene:
+        """What the next level begins with."""
+        return Scene(self.path, self.adjusted.points[self.adjusted.confirmed])
+
+
+def refine(source: Source, scene: Scene, group_size: int, camera_matrix: FloatArray, pool: ThreadPoolExecutor) -> PosedLevel:
+    """Locate denser groups (paper, section 4), merged and registered through the depth of the scene."""
+    groups = resample(source.info.n_frames, group_size)
+    exposures = merge(source, groups, scene, camera_matrix, pool)
+    points, sightings = locate(exposures, camera_matrix, pool)
+    return interpolate(groups, exposures, points, sightings, scene, camera_matrix)
+
+
+def resample(n_frames: int, group_size: int) -> tuple[Group, ...]:
+    """Return groups side by side, of about this size."""
+    number = max(1, round(n_frames / group_size))
+    borders = [round(index * n_frames / number) for index in range(number + 1)]
+    spans = [FrameSpan(start, stop) for start, stop in pairwise(borders)]
+    return tuple(Group(span, span.centre) for span in spans)
+
+
+def merge(
+    source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: FloatArray, pool: ThreadPoolExecutor
+) -> list[PosedExposure]:
+    """Merge each group as its reference instant sees it."""
+
+    def merged(group: Group) -> PosedExposure:
+        pose = scene.path.at([group.reference])[0]
+        depth = inverse_depth_of(pose, scene.points, camera_matrix, source.info.frame_shape)
+        if depth is None:  # the sightings tell whether this view is of any use
+            seen = scene.points @ pose[2, :3] + pose[2, 3]
+            depth = np.full(source.info.frame_shape, 1 / np.median(seen[seen > 0]) if (seen > 0).any() else 0, np.float32)
+        return merge_through_depth(source, group, scene.path, depth, camera_matrix)
+
+    return list(pool.map(merged, groups))
+
+
+def locate(
+    exposures: Sequence[PosedExposure], camera_matrix: FloatArray, pool: ThreadPoolExecutor
+) -> tuple[FloatArray, Sightings]:
+    """Choose points in key exposures, and find them in the others.
+
+    Returns:
+        (N, 3) points of the world, where the depth so far has them, and where exposures see them.
+
+    Raises:
+        LocationError: no patch of an exposure is found in another one.
+    """
+    views = list(pool.map(stabilised, exposures))
+    number = len(exposures)
+    keys = range(0, number, max(1, min(_EVERY, number // _KEYS)))
+
+    def sought(key: int) -> tuple[FloatArray, list[tuple[int, Found]]]:
+        here = exposures[key]
+        patches = patches_of(here, views[key], _PATCHES)
+        found = [
+            (other, find_patches(patches, (here, views[key]), (exposures[other], views[other]), camera_matrix))
+            for other in range(number)
+            if other != key and _near(key, other) and _overlap(here, exposures[other], camera_matrix)
+        ]
+        rays = np.concatenate([patches.pixels, np.ones((len(patches.pixels), 1))], axis=1) @ np.linalg.inv(camera_matrix).T
+        return (rays / patches.inverse_depth[:, :1] - here.pose[:, 3]) @ here.pose[:, :3], found
+
+    points: list[FloatArray] = []
+    parts: list[tuple[NDArray[np.intp], NDArray[np.intp], FloatArray, FloatArray]] = []
+    first = 0
+    for places, found in pool.map(sought, keys):
+        for other, each in found:
+            parts.append((each.patches + first, np.full(len(each.patches), other), each.pixels, each.covariance))
+        points.append(places)
+        first += len(places)
+    if sum(len(part[0]) for part in parts) < _LEAST_SIGHTINGS:
+        raise LocationError(
+            f"of {len(exposures)} exposures, no patch of one was found in another along the poses of the averages; they are "
+            "wrong, or the exposures too dark: choose a larger pose.with.group_size"
+        )
+    sightings = Sightings(*(np.concatenate([part[k] for part in parts]) for k in range(4)))
+    return _seen_often(np.concatenate(points), sightings)
+
+
+def interpolate(
+    groups: Sequence[Group],
+    exposures: Sequence[PosedExposure],
+    points: FloatArray,
+    sightings: Sightings,
+    scene: Scene,
+    camera_matrix: FloatArray,
+) -> PosedLevel:
+    """Adjust exposures and points to the sightings, and fit a path to the poses of the exposures."""
+    located = np.bincount(sightings.views, minlength=len(exposures)) >= _LEAST_SIGHTINGS
+    sightings = sightings.kept(located[sightings.views])
+    points, sightings = _seen_often(points, sightings)
+    number = np.cumsum(located) - 1
+    sightings = Sightings(sightings.points, number[sightings.views], sightings.pixels, sightings.covariance)
+    poses = np.array([exposure.pose for exposure in exposures])[located]
+    adjusted = adjust(poses, points, sightings, camera_matrix)
+    kept = [group for group, is_located in zip(groups, located, strict=True) if is_located]
+    instants = np.array([group.reference for group in kept])
+    path = CorrectedPath(scene.path, _borders(kept), instants, adjusted.poses)
+    return PosedLevel(groups, located, adjusted, sightings, exposures, path)
+
+
+def _borders(groups: Sequence[Group]) -> FloatArray:
+    """Return where groups begin and end in time, in frames; where some are left out between them, halfway."""
+    between = [(before.span.stop + after.span.start - 1) / 2 for before, after in pairwise(groups)]
+    return np.array([groups[0].span.start - 0.5, *between, groups[-1].span.stop - 0.5])
+
+
+def _near(key: int, other: int) -> bool:
+    return abs(other - key) <= _NEIGHBOURS or (other - key) % _FURTHER == 0
+
+
+def _overlap(here: PosedExposure, there: PosedExposure, camera_matrix: FloatArray) -> bool:
+    """Return whether the middle of an exposure lies in another one, or not far outside."""
+    turn, shift = between(here.pose, there.pose, camera_matrix)
+    height, width = here.inverse_depth.shape
+    middle = np.array([(width - 1) / 2, (height - 1) / 2, 1.0])
+    x, y, depth = turn @ middle + shift * float(np.median(here.inverse_depth))
+    away = np.abs(np.array([x / depth, y / depth]) - middle[:2]) if depth > 0 else np.inf
+    return bool((away < _OUT_OF_SIGHT * np.array([width, height])).all())
+
+
+def _seen_often(points: FloatArray, sightings: Sightings) -> tuple[FloatArray, Sightings]:
+    """Leave out points that few exposures see, and number the others anew."""
+    seen = np.bincount(sightings.points, minlength=len(points)) >= _SEEN_BY
+    kept = sightings.kept(seen[sightings.points])
+    number = np.cumsum(seen) - 1
+    return points[seen], Sightings(number[kept.points], kept.views, kept.pixels, kept.covariance)

@@ -1,0 +1,182 @@
+"""Pose estimator `stratified-pose`: the loop of the paper with six degrees of freedom (section 6, the first open direction)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from photonpano import (
+    CameraGuess,
+    FloatArray,
+    FluxImage,
+    LocationError,
+    LostFrames,
+    PosedView,
+    PoseEstimate,
+    Progress,
+    ScenePoints,
+    Source,
+    StageContext,
+)
+from photonpano_colmap.averages import AveragesEstimator
+from photonpano_colmap.configs import StratifiedPoseConfig
+from photonpano_colmap.pose_spline import PoseSpline, positions_of
+from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
+from photonpano_colmap.posing.merging import PosedExposure
+
+_DENSER = 1.5
+"""Exposures of a level, relative to the one before."""
+_MISSED = 0.5
+"""Share of the last change of a frame's pose, beyond that of its exposures, that the next level would change it by."""
+
+
+class StratifiedEstimator:
+    """Begins with the poses of averages, and locates denser and denser exposures."""
+
+    def __init__(self, config: StratifiedPoseConfig, context: StageContext) -> None:
+        self._config = config
+        self._context = context
+
+    def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
+        """Estimate the poses of a capture: see `photonpano.PoseEstimator`.
+
+        Raises:
+            LocationError: the averages have no poses, or a lens distorts, through which exposures are not merged.
+        """
+        if any(camera.distortion):
+            raise LocationError(
+                "stratified-pose merges no frames through a lens that distorts; leave out camera.distortion, or take "
+                "pose: {use: colmap-averages}"
+            )
+        first = AveragesEstimator(self._config, self._context).estimate(source, camera, progress)
+        if not first.located.all():
+            return replace(first, doubts=(*first.doubts, _NOT_REFINED))
+        instants = np.array([view.instant for view in first.views])
+        path = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
+        scene, levels = Scene(path, first.points.positions), list(first.levels)
+        size, before, level = float(levels[0]["group_frames"] or 1), path.at(_frames(source)), None
+        with ThreadPoolExecutor(self._context.threads) as pool:
+            for number in range(2, self._config.levels + 1):
+                size /= 1 if number == 2 else _DENSER
+                if size < self._config.min_group_size and level is not None:
+                    break
+                if level is not None:
+                    before = level.path.at(_frames(source))
+                with progress.stage(f"level {number}: merge and locate", 1, "level") as advance:
+                    level = refine(source, scene, max(1, round(size)), first.camera_matrix, pool)
+                    advance(1)
+                scene = level.scene
+                levels.append(_record(level, scene))
+        assert level is not None
+        return _Assembly(source, first, level, before, tuple(levels)).estimate()
+
+
+_NOT_REFINED = (
+    "some frames have no pose, so that the poses of the averages were not refined; choose a smaller pose.with.step, or a part "
+    "of the capture with source.with.frames"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Assembly:
+    """Makes the estimate of all frames from the exposures of the last level."""
+
+    source: Source
+    first: PoseEstimate
+    level: PosedLevel
+    before: FloatArray
+    levels: tuple[Mapping[str, float | int | str | None], ...]
+
+    def estimate(self) -> PoseEstimate:
+        level, frames = self.level, _frames(self.source)
+        poses = level.path.at(frames)
+        instants = np.array([group.reference for group in level.groups])[level.located]
+        stds = [np.interp(frames, instants, std) for std in (level.adjusted.std_position, level.adjusted.std_rotation)]
+        moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)
+        turned = _left(_turns(self.before, poses), frames, instants)
+        located = np.ones(len(frames), np.bool_)
+        lost = self._lost()
+        for each in lost:
+            located[each.span.start : each.span.stop] = False
+        poses[~located] = np.nan
+        std_position, std_rotation = (
+            np.where(located, np.hypot(std, _MISSED * missed), np.nan)
+            for std, missed in zip(stds, (moved, turned), strict=True)
+        )
+        views = self._views()
+        return replace(
+            self.first,
+            camera_from_world=poses,
+            located=located,
+            std_position=std_position,
+            std_rotation_deg=np.rad2deg(std_rotation),
+            points=ScenePoints(level.adjusted.points, self._flux(views)),
+            views=views,
+            lost=lost,
+            levels=self.levels,
+        )
+
+    def _lost(self) -> tuple[LostFrames, ...]:
+        reason = "too few patches of other exposures were found in theirs"
+        groups = zip(self.level.groups, self.level.located, strict=True)
+        return tuple(LostFrames(group.span, reason) for group, kept in groups if not kept)
+
+    def _views(self) -> tuple[PosedView, ...]:
+        level, views = self.level, []
+        kept = [each for each, located in zip(level.exposures, level.located, strict=True) if located]
+        for number, (posed, pose) in enumerate(zip(kept, level.adjusted.poses, strict=True)):
+            seen = level.sightings.views == number
+            # A point is sought from several key exposures, but is one point of one of them: it is seen once.
+            points, pixels = level.sightings.points[seen], level.sightings.pixels[seen]
+            group = posed.exposure.group
+            views.append(PosedView(group.span, group.reference, pose, points, pixels, _flux_of(posed)))
+        return tuple(views)
+
+    def _flux(self, views: tuple[PosedView, ...]) -> FluxImage:
+        """Return the mean flux of the pixels in which exposures show each point: (N,)."""
+        number = len(self.level.adjusted.points)
+        total, times = np.zeros(number), np.zeros(number)
+        for view in views:
+            flux = view.flux()
+            column, row = (np.clip(np.rint(view.xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
+            known = np.isfinite(flux[row, column])
+            np.add.at(total, view.points[known], flux[row, column][known])
+            np.add.at(times, view.points[known], 1)
+        return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
+
+
+def _flux_of(posed: PosedExposure) -> Callable[[], FluxImage]:
+    return lambda: posed.exposure.flux
+
+
+def _frames(source: Source) -> FloatArray:
+    return np.arange(source.info.n_frames, dtype=np.float64)
+
+
+def _turns(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return small rotations from some poses to others, as rotation vectors in radians: (T, 3)."""
+    between = after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2)
+    return np.stack([between[:, j, i] - between[:, i, j] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1) / 2
+
+
+def _left(changes: FloatArray, frames: FloatArray, instants: FloatArray) -> float:
+    """Return the root mean square length of (T, 3) changes, beyond what is linear between some instants."""
+    at = changes[np.rint(instants).astype(int)]
+    linear = np.stack([np.interp(frames, instants, at[:, axis]) for axis in range(3)], axis=1)
+    return float(np.sqrt(np.mean(np.sum((changes - linear) ** 2, axis=1))))
+
+
+def _record(level: PosedLevel, scene: Scene) -> dict[str, float | int | str | None]:
+    places = positions_of(level.adjusted.poses)
+    length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    return {
+        "group_frames": len(level.groups[0].span),
+        "averages": len(level.groups),
+        "located": int(level.located.sum()),
+        "points": len(scene.points),
+        "residual_px": level.adjusted.residual_px,
+        "std_position": float(np.sqrt(np.mean(level.adjusted.std_position**2))) / length if length else None,
+    }

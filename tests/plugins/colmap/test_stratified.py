@@ -1,0 +1,168 @@
+"""Poses through the depth of the scene: each step against known truth."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
+from photonpano.context import Quiet
+from photonpano.geometry import camera_matrix, rotation_matrices
+from photonpano.testing import MemorySource
+from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
+
+pytest.importorskip("pycolmap")
+pytest.importorskip("gtsam")
+
+from photonpano_colmap.configs import StratifiedPoseConfig
+from photonpano_colmap.pose_spline import PoseSpline, positions_of
+from photonpano_colmap.posing.adjustment import Sightings, adjust
+from photonpano_colmap.posing.depth import inverse_depth_of
+from photonpano_colmap.posing.levels import Scene, locate, merge, resample
+from photonpano_colmap.posing.merging import merge_through_depth
+from photonpano_colmap.posing.path import CorrectedPath, between, posed, projected
+from photonpano_colmap.stratified import StratifiedEstimator
+
+MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
+TRUE = PoseSpline(np.arange(N_FRAMES, dtype=float), true_poses())
+
+
+def points_on_planes(number: int, seed: int = 0) -> np.ndarray:
+    """Return points at depths of 3 to 6 m: (number, 3)."""
+    return np.random.default_rng(seed).uniform([-2, -1.5, 3], [2, 1.5, 6], (number, 3))
+
+
+def test_between_maps_pixels_as_the_two_cameras_do() -> None:
+    points, (here, there) = points_on_planes(50), true_poses()[[0, -1]]
+    turn, shift = between(here, there, MATRIX)
+    pixels = projected(np.repeat(here[None], 50, axis=0), points, MATRIX)
+    inverse_depth = 1 / (points @ here[:, :3].T + here[:, 3])[:, 2:]
+    mapped = np.concatenate([pixels, np.ones((50, 1))], axis=1) @ turn.T + inverse_depth * shift
+    expected = projected(np.repeat(there[None], 50, axis=0), points, MATRIX)
+    np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], expected, atol=1e-9)
+
+
+def test_inverse_depth_of_a_plane_is_exact_between_points() -> None:
+    normal, pose = np.array([0.1, -0.05, 0.25]), true_poses()[40]
+    rays = np.concatenate([np.random.default_rng(0).uniform(-0.6, 0.6, (300, 2)), np.ones((300, 1))], axis=1)
+    points = (rays / (rays @ normal)[:, None] - pose[:, 3]) @ pose[:, :3]
+    found = inverse_depth_of(pose, points, MATRIX, SHAPE)
+    y, x = np.mgrid[20:108, 20:140]
+    expected = ((x - 79.5) * normal[0] + (y - 63.5) * normal[1]) / FOCAL_PX + normal[2]
+    assert found is not None
+    np.testing.assert_allclose(found[20:108, 20:140], expected, rtol=0.02)
+    assert inverse_depth_of(pose, points[:3], MATRIX, SHAPE) is None
+
+
+def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
+    # At the true depth, the average of frames from many places is as sharp as a frame.
+    source, group, instant = capture(), Group(FrameSpan(0, 320), 159.5), TRUE.at([159.5])[0]
+    edges = {}
+    for name, depth in (("true", 3.0), ("wrong", 5.0)):
+        plane = np.full(SHAPE, 1 / depth, np.float32)
+        found = merge_through_depth(source, group, TRUE, plane, MATRIX)
+        assert found.exposure.weight.max() == pytest.approx(320, rel=1e-3)
+        np.testing.assert_array_equal(found.pose, instant)
+        # The rectangle at 3 m lies about here.
+        edges[name] = float(np.nanstd(found.exposure.flux[80:100, 75:115]))
+    assert edges["true"] > 1.5 * edges["wrong"], edges
+
+
+def test_corrected_path_has_the_means_at_which_its_groups_were_located() -> None:
+    borders = np.linspace(0, 320, 17)
+    instants = (borders[:-1] + borders[1:] - 1) / 2
+    frames = np.arange(320)
+    turns = 0.01 * np.stack([np.sin(frames / 15), np.cos(frames / 19), np.sin(frames / 16)], axis=1)
+    moves = 0.02 * np.stack([np.cos(frames / 17), np.sin(frames / 18), np.sin(frames / 14)], axis=1)
+    means = [each.reshape(16, 20, 3).mean(axis=1) for each in (turns, moves)]
+    before = TRUE.at(instants)
+    located = posed(rotation_matrices(means[0]) @ before[:, :, :3], positions_of(before) + means[1])
+    expected = posed(rotation_matrices(turns) @ true_poses()[:, :, :3], positions_of(true_poses()) + moves)
+    errors = [
+        np.linalg.norm(positions_of(path.at(frames)) - positions_of(expected), axis=1)[40:-40].max()
+        for path in (CorrectedPath(TRUE, borders - 0.5, instants, located), PoseSpline(instants, located))
+    ]
+    # A spline through the means as if they were instants loses some of the motion.
+    assert errors[0] < 0.4 * errors[1], errors
+
+
+def test_adjustment_finds_poses_and_knows_its_errors() -> None:
+    rng = np.random.default_rng(1)
+    true, points = true_poses()[::16], points_on_planes(150, seed=2)
+    errors, expected = [], []
+    for _ in range(3):
+        views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
+        pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.1, (3000, 2))
+        sightings = Sightings(numbers, views, pixels, np.tile(0.1**2 * np.eye(2), (3000, 1, 1)))
+        start = posed(rotation_matrices(rng.normal(0, 0.003, (20, 3))) @ true[:, :, :3], positions_of(true))
+        found = adjust(start, points + rng.normal(0, 0.02, points.shape), sightings, MATRIX)
+        errors.append(_after_similarity(positions_of(found.poses), positions_of(true)))
+        expected.append(found.std_position)
+        assert found.confirmed.mean() > 0.95
+        assert found.residual_px == pytest.approx(0.1 * np.sqrt(2 * np.log(2)), rel=0.1)
+    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(expected)))
+    assert 0.5 < ratio < 1.5, ratio
+
+
+def test_patches_at_edges_of_things_count_less() -> None:
+    # Sightings of a tenth of the points wander with the view, as those of two depths at once do.
+    rng = np.random.default_rng(3)
+    true, points = true_poses()[::16], points_on_planes(150, seed=2)
+    views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
+    pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.05, (3000, 2))
+    pixels[numbers < 15, 0] += 0.15 * (views[numbers < 15] - 10)
+    sightings = Sightings(numbers, views, pixels, np.tile(0.05**2 * np.eye(2), (3000, 1, 1)))
+    found = adjust(true, points, sightings, MATRIX)
+    error = _after_similarity(positions_of(found.poses), positions_of(true))
+    assert np.sqrt(np.mean(error**2)) < 0.003, error
+    assert found.confirmed[15:].mean() > 0.9
+
+
+def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
+    source, groups = capture(), resample(N_FRAMES, 40)
+    with ThreadPoolExecutor(2) as pool:
+        exposures = merge(source, groups, Scene(TRUE, _seen_points()), MATRIX, pool)
+        points, sightings = locate(exposures, MATRIX, pool)
+    poses = TRUE.at([group.reference for group in groups])
+    away = sightings.pixels - projected(poses[sightings.views], points[sightings.points], MATRIX)
+    assert len(sightings.points) > 500
+    assert np.median(np.linalg.norm(away, axis=1)) < 0.5
+
+
+def test_exposures_without_anything_in_common_are_an_error() -> None:
+    source = MemorySource(np.random.default_rng(0).integers(0, 2, (80, *SHAPE)))
+    with ThreadPoolExecutor(2) as pool:
+        exposures = merge(source, resample(80, 20), Scene(TRUE, _seen_points()), MATRIX, pool)
+        with pytest.raises(LocationError, match="no patch of one was found in another"):
+            locate(exposures, MATRIX, pool)
+
+
+def test_lens_that_distorts_is_refused() -> None:
+    source = MemorySource(np.zeros((N_FRAMES, *SHAPE)))
+    context = StageContext(source.info, source.response, 0, 2)
+    estimator = StratifiedEstimator(StratifiedPoseConfig(group_size=20), context)
+    with pytest.raises(LocationError, match="through a lens that distorts; leave out"):
+        estimator.estimate(source, CameraGuess(FOCAL_PX, distortion=(-0.1, 0, 0, 0)), Quiet())
+
+
+def _seen_points() -> np.ndarray:
+    """Return points on the planes of the capture: (N, 3)."""
+    rng, parts = np.random.default_rng(0), []
+    for depth, (left, top, right, bottom) in (
+        (6.0, (-4, -4, 4, 4)),
+        (3.5, (-1.6, -1.0, -0.5, 0.6)),
+        (3.0, (-0.3, 0.2, 1.0, 1.1)),
+    ):
+        parts.append(rng.uniform([left, top, depth], [right, bottom, depth], (150, 3)))
+    return np.concatenate(parts)
+
+
+def _after_similarity(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the distances of places after the best similarity (Umeyama 1991)."""
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    left, values, right = np.linalg.svd(b.T @ a)
+    signs = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    scale = np.trace(np.diag(values) @ signs) / (a**2).sum()
+    return np.linalg.norm(scale * a @ (left @ signs @ right).T - b, axis=1)
