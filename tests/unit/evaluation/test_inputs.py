@@ -63,8 +63,7 @@ def test_evaluate_refuses_truth_of_a_scene_with_depth(capture):
     del capture.true["homographies"]
     capture.write()
     assert failure(capture) == (
-        "truth.npz is the truth of a camera that travelled through a scene with depth, where no homography maps a frame to the "
-        "scene: evaluate compares homographies and rotations; photonpano_simulator.travel.truth tells what frames saw"
+        "truth.npz is the truth of a camera that travels, which has poses and no homographies; score a run with `pose` by it"
     )
 
 

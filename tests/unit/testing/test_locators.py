@@ -16,8 +16,8 @@ DIRECT = discover().find("locator", "direct").contribution
 class Honest:
     """A locator of photonpano, for others to break."""
 
-    def __init__(self, context):
-        self.locator = DIRECT.build(DIRECT.config(), context)
+    def __init__(self, context, locator=None):
+        self.locator = locator or DIRECT.build(DIRECT.config(), context)
 
     def describe(self, exposure):
         return self.locator.describe(exposure)
@@ -60,6 +60,16 @@ class TrustsItsStart(Honest):
 class NeedsAStart(Honest):
     def register(self, moving, fixed, initial):
         return NotLocated("there is no start") if initial is None else super().register(moving, fixed, initial)
+
+
+class TurnsTheOtherWay(Honest):
+    def turning(self, camera_matrix):
+        return Inverse(None, self.locator)
+
+
+class TurnsAnything(Honest):
+    def turning(self, camera_matrix):
+        return StandsStill(None, self.locator)
 
 
 class SeesHolesAsBlack(Honest):
@@ -207,6 +217,8 @@ BROKEN = [
     ),
     ("test_image_without_texture_is_not_located", SaysNothing, "NotLocated needs a reason"),
     ("test_different_places_are_not_located", StandsStill, "images of different places must not be located; without a"),
+    ("test_turning_locates_turns_and_nothing_else", TurnsTheOtherWay, r"a turn is \d+\.\d+ px off"),
+    ("test_turning_locates_turns_and_nothing_else", TurnsAnything, "must not be located as a turn"),
     (
         "test_very_small_image_does_not_raise",
         NeedsALargeImage,
