@@ -88,7 +88,7 @@ RUNS: dict[str, dict[str, Any]] = {
 """Specs to run, with overrides that make them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
-NEEDS = {"colmap": "pycolmap", "poses": "pycolmap", "high-speed-video": "av", "kornia": "kornia"}
+NEEDS = {"colmap": "pycolmap", "poses": "pycolmap", "stratified-poses": "gtsam", "high-speed-video": "av", "kornia": "kornia"}
 """Optional libraries of specs, which run only if the library is installed."""
 REPORTS = {"scan", "revisits", "high-speed-video"}
 """Specs whose reports are drawn; those of others show no more."""
@@ -135,7 +135,7 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
 
 
 def test_every_example_spec_is_in_this_file():
-    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, "poses"}
+    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, "poses", "stratified-poses"}
 
 
 def test_examples_readme_links_every_spec():
@@ -175,13 +175,14 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
     assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
 
 
-def test_example_of_poses_runs(examples, tmp_path, without_report):
-    pytest.importorskip(NEEDS["poses"])
-    printed = photonpano("run", examples / "poses.yaml", "--output", tmp_path / "run")
+@pytest.mark.parametrize(("name", "pictures", "std"), [("poses", 16, 0.02), ("stratified-poses", 0, 0.005)])
+def test_example_of_poses_runs(examples, tmp_path, without_report, name, pictures, std):
+    pytest.importorskip(NEEDS[name])
+    printed = photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run")
     assert "located   480 of 480 frames" in printed
-    assert len(list((tmp_path / "run" / "images").glob("*.png"))) == 16
+    assert len(list((tmp_path / "run" / "images").glob("*.png"))) == pictures
     record = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert record["poses"]["std_position"] < 0.02
+    assert record["poses"]["std_position"] < std
 
 
 def test_tutorial_specs_equal_example_specs():
