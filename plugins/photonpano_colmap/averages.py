@@ -34,6 +34,7 @@ from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.pose_spline import PoseSpline, left_out, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
+from photonpano_colmap.reversal import Readings
 
 _PHOTONS = 60.0
 """Photons of a pixel in an average: with fewer, keypoints are noise."""
@@ -127,7 +128,21 @@ class AveragesEstimator:
                 f"{self._config.min_parallax_deg:g}, so that depth cannot be told from noise. If the camera only turns, leave "
                 "out `pose` and set motion: {model: rotation}; otherwise move farther, or lower pose.with.min_parallax_deg"
             )
+        self._require_one_reading(piece.readings)
         return piece
+
+    def _require_one_reading(self, readings: Readings) -> None:
+        """Refuse poses whose depth may as well be reversed, and record where it was."""
+        figures = (
+            f"points are {readings.found_px:.2f} px from where averages show them as COLMAP found them, and "
+            f"{readings.reversed_px:.2f} px with near and far exchanged"
+        )
+        if readings.is_unsure:
+            raise LocationError(
+                f"the depth of the scene may be reversed: {figures}. Move farther, so that perspective tells them apart"
+            )
+        if readings.is_reversed:
+            self._context.decide("depth_reversed", True, figures)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -79,7 +79,7 @@ def pose_noise(
             own, cross = np.append(own, size - 1), np.concatenate([cross, sum(each[_POSE:] for each in cross_of.values())])
         information[np.ix_(own, own)] -= cross @ np.linalg.pinv(of_points[index]) @ cross.T
     freedom = max(1, count - size - 3 * len(points) + 7)
-    covariance = squares / freedom * _without_gauge(information, poses)
+    covariance = squares / freedom * without_gauge(information, poses)
     variances = np.diag(covariance)
     per_pose = variances[: _POSE * n_poses].reshape(n_poses, 2, 3).sum(axis=2)
     return PoseNoise(
@@ -109,8 +109,13 @@ def _linearised(
     return residuals, by_camera, by_seen @ rotation
 
 
-def _without_gauge(information: FloatArray, poses: FloatArray) -> FloatArray:
-    """Invert an information matrix, and project the covariance as the best alignment of the positions does."""
+def without_gauge(information: FloatArray, poses: FloatArray) -> FloatArray:
+    """Invert an information matrix, and project the covariance as the best alignment of the positions does.
+
+    Args:
+        information: (6 N, 6 N) of poses, or with one more unknown; see the convention of this module.
+        poses: (N, 3, 4).
+    """
     values, vectors = np.linalg.eigh(information)
     inverted = np.where(values > _SMALLEST * values[-1], 1 / np.where(values > 0, values, 1), 0)
     covariance = (vectors * inverted) @ vectors.T

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from photonpano import CameraGuess, FloatArray
 from photonpano_colmap.configs import ColmapAveragesConfig
+from photonpano_colmap.reversal import Readings, likelier_reading
 
 _FIRST_CENTRE = 0.5
 """Position of the first pixel's centre in COLMAP; ours is 0."""
@@ -40,6 +41,7 @@ class Piece:
         points: (M, 3) positions in the world.
         observed: for each image the indices of K points, and where it shows them, (K, 2).
         focal_px: focal length.
+        readings: how well this reading of the depth, and the other one, explain the images.
     """
 
     images: NDArray[np.intp]
@@ -47,6 +49,7 @@ class Piece:
     points: FloatArray
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...]
     focal_px: float
+    readings: Readings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +99,7 @@ def reconstruct(
         _match(database, config, seed)
         keypoints, matches = _counts(database, len(images))
         found = _map(database, folder, camera, config, seed)
-        pieces = sorted((_piece(each) for each in found), key=lambda piece: -len(piece.images))
+        pieces = sorted((_piece(each, camera.focal_px is None) for each in found), key=lambda piece: -len(piece.images))
     return Reconstruction(tuple(pieces), keypoints, matches)
 
 
@@ -167,8 +170,9 @@ def _map(
     return list(pycolmap.incremental_mapping(database, *place, options=options).values())
 
 
-def _piece(found: pycolmap.Reconstruction) -> Piece:
-    """Return poses and points of a reconstruction in numpy."""
+def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:
+    """Return poses and points of the likelier reading of a reconstruction in numpy."""
+    found, readings = likelier_reading(found, finds_focal)
     images = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
     numbers = {identifier: number for number, identifier in enumerate(sorted(found.points3D))}
     observed = []
@@ -184,6 +188,7 @@ def _piece(found: pycolmap.Reconstruction) -> Piece:
         np.array([found.points3D[identifier].xyz for identifier in sorted(found.points3D)]).reshape(-1, 3),
         tuple(observed),
         float(camera.params[0]),
+        readings,
     )
 
 

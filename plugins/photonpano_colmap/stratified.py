@@ -26,12 +26,9 @@ from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.merging import PosedExposure
-from photonpano_colmap.posing.reversal import agree, readings
 
 _DENSER = 1.5
 """Exposures of a level, relative to the one before."""
-_ALIKE = 0.9
-"""Two readings of the depth explain the averages alike if residuals of the better one are above this share of the other's."""
 _MISSED = 0.5
 """Share of the last change of a frame's pose, beyond that of its exposures, that the next level would change it by."""
 
@@ -57,49 +54,23 @@ class StratifiedEstimator:
         first = AveragesEstimator(self._config, self._context).estimate(source, camera, progress)
         if not first.located.all():
             return replace(first, doubts=(*first.doubts, _NOT_REFINED))
-        scene, levels = self._start(first), list(first.levels)
-        path = scene.path
-        size, before, level = float(levels[0]["group_frames"] or 1), path.at(_frames(source)), None
+        instants = np.array([view.instant for view in first.views])
+        path = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
+        scene, levels = Scene(path, first.points.positions), list(first.levels)
         with ThreadPoolExecutor(self._context.threads) as pool:
-            for number in range(2, self._config.levels + 1):
-                size /= 1 if number == 2 else _DENSER
-                if size < self._config.min_group_size and level is not None:
-                    break
-                if level is not None:
-                    before = level.path.at(_frames(source))
-                with progress.stage(f"level {number}: merge and locate", 1, "level") as advance:
-                    level = refine(source, scene, max(1, round(size)), first.camera_matrix, pool)
+            for number, size in enumerate(self._sizes(len(first.views[0].span)), start=2):
+                before = scene.path.at(_frames(source))
+                with progress.stage(f"level {number}: merge, locate, adjust", 1, "level") as advance:
+                    level = refine(source, scene, size, first.camera_matrix, pool)
                     advance(1)
                 scene = level.scene
                 levels.append(_record(level, scene))
-        assert level is not None
         return _Assembly(source, first, level, before, tuple(levels)).estimate()
 
-    def _start(self, first: PoseEstimate) -> Scene:
-        """Return the scene as the averages have it, or with its depth reversed if that explains them better.
-
-        Raises:
-            LocationError: both explain them alike.
-        """
-        instants = np.array([view.instant for view in first.views])
-        found, reverse = readings(first)
-        better, worse = sorted((found.residual_px, reverse.residual_px))
-        if better > _ALIKE * worse and not agree(found, reverse):
-            raise LocationError(
-                f"the depth of the scene may be reversed: points are {found.residual_px:.2f} px from where averages show "
-                f"them, and {reverse.residual_px:.2f} px with near and far exchanged. Move farther, so that perspective tells "
-                "them apart"
-            )
-        if better > _ALIKE * worse or found.residual_px == better:
-            poses = np.array([view.camera_from_world for view in first.views])
-            return Scene(PoseSpline(instants, poses), first.points.positions)
-        self._context.decide(
-            "depth_reversed",
-            True,
-            f"with near and far exchanged, points are {better:.2f} px from where averages show them, and {worse:.2f} px as "
-            "COLMAP found them",
-        )
-        return Scene(PoseSpline(instants, reverse.poses), reverse.points[reverse.confirmed])
+    def _sizes(self, first: int) -> list[int]:
+        """Return the group sizes of the levels after the averages: the same frames, now merged sharp; then fewer and fewer."""
+        sizes = [round(first / _DENSER**index) for index in range(self._config.levels - 1)]
+        return [first, *(size for size in sizes[1:] if size >= self._config.min_group_size)]
 
 
 _NOT_REFINED = (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from photonpano import FloatArray
+from photonpano_colmap.pose_noise import without_gauge
 from photonpano_colmap.pose_spline import positions_of
 from photonpano_colmap.posing.path import posed, projected
 
@@ -67,8 +68,8 @@ class Adjusted:
         poses: (V, 3, 4).
         points: (N, 3).
         confirmed: (N,) points that at least 3 exposures see where they should be.
-        std_position: (V,) expected distance of a camera from its true place, after the best similarity of all.
-        std_rotation: (V,) expected angle in radians, after the best rotation of all.
+        std_position: (V,) expected distance of a camera from its true place, after the best alignment of all.
+        std_rotation: (V,) expected angle in radians, after that alignment.
         residual_px: median distance of a sighting from where its point is seen.
     """
 
@@ -158,18 +159,14 @@ def _uncertainty(
     order = gtsam.Ordering()
     for view in range(n_views):
         order.push_back(POSE(view))
-    covariance = np.linalg.inv(of_poses.hessian(order)[0]).reshape(n_views, 6, n_views, 6)
-    # Of each pose, the rotation comes first, and both are in the frame of the camera.
-    to_world = np.swapaxes(poses[:, :, :3], 1, 2)
-    turned, moved = (
-        np.einsum("vij,vjwk,wlk->viwl", to_world, covariance[:, part, :, part], to_world).reshape(3 * n_views, 3 * n_views)
-        for part in (slice(3), slice(3, 6))
-    )
-    centres = positions_of(poses)
-    centres = centres - centres.mean(axis=0)
-    everywhere = np.tile(np.eye(3), (n_views, 1))
-    similarity = np.concatenate([everywhere, -_crosses(centres).reshape(-1, 3), centres.reshape(-1, 1)], axis=1)
-    return _left(moved, similarity), _left(turned, everywhere)
+    information = of_poses.hessian(order)[0]
+    # GTSAM perturbs the camera in the world by (w, t) in its own axes: R exp(-w), and a shift by R^T t.
+    to_own = np.zeros_like(information)
+    for view, rotation in enumerate(poses[:, :, :3]):
+        turn, move = slice(6 * view, 6 * view + 3), slice(6 * view + 3, 6 * view + 6)
+        to_own[turn, turn], to_own[move, move] = -np.eye(3), rotation
+    variances = np.diag(without_gauge(to_own.T @ information @ to_own, poses)).reshape(n_views, 2, 3).sum(axis=2)
+    return np.sqrt(variances[:, 1]), np.sqrt(variances[:, 0])
 
 
 def _shared(sightings: Sightings) -> FloatArray:
@@ -188,23 +185,3 @@ def _median_by(group: NDArray[np.intp], values: FloatArray, number: int) -> Floa
     counts = np.bincount(group, minlength=number)
     middle = np.cumsum(counts) - counts + counts // 2
     return np.asarray(values[order][np.minimum(middle, len(values) - 1)])
-
-
-def _left(covariance: FloatArray, free: FloatArray) -> FloatArray:
-    """Return the expected lengths of vectors, (V,), once what is free is fitted and removed.
-
-    Args:
-        covariance: (3 V, 3 V).
-        free: (3 V, K) directions in which all vectors may move together.
-    """
-    basis, _ = np.linalg.qr(free)
-    keeps = np.eye(len(covariance)) - basis @ basis.T
-    variances = np.einsum("ij,ij->i", keeps @ covariance, keeps)
-    return np.asarray(np.sqrt(np.maximum(variances.reshape(-1, 3).sum(axis=1), 0)))
-
-
-def _crosses(vectors: FloatArray) -> FloatArray:
-    """Return the matrices of cross products with (N, 3) vectors: (N, 3, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -29,6 +29,8 @@ _SEEN_BY = 4
 """A point must be seen by so many exposures."""
 _LEAST_SIGHTINGS = 20
 """An exposure with fewer sightings is not located."""
+_LEAST_LOCATED = 5
+"""Exposures that a path needs at least."""
 _OUT_OF_SIGHT = 0.8
 """Exposures are not compared if the middle of one lies further than this from that of the other, in sides of a frame."""
 
@@ -155,8 +157,17 @@ def interpolate(
     scene: Scene,
     camera_matrix: FloatArray,
 ) -> PosedLevel:
-    """Adjust exposures and points to the sightings, and fit a path to the poses of the exposures."""
+    """Adjust exposures and points to the sightings, and correct the path by the poses of the exposures.
+
+    Raises:
+        LocationError: few exposures show points of others.
+    """
     located = np.bincount(sightings.views, minlength=len(exposures)) >= _LEAST_SIGHTINGS
+    if located.sum() < _LEAST_LOCATED:
+        raise LocationError(
+            f"of {len(exposures)} exposures, {located.sum()} show {_LEAST_SIGHTINGS} points of others or more; choose a larger "
+            "pose.with.group_size"
+        )
     sightings = sightings.kept(located[sightings.views])
     points, sightings = _seen_often(points, sightings)
     number = np.cumsum(located) - 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,6 +25,7 @@ from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.pose_noise import pose_noise
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction
+from photonpano_colmap.reversal import Readings
 
 SIZE = 20
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
@@ -68,12 +70,14 @@ def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let COLMAP find the poses of the averages 0 to 7 and 9 to 14 apart from each other, and none of 8 and 15."""
     poses, points = true_poses()[::SIZE], np.random.default_rng(0).uniform([-2, -1, 3], [2, 1, 6], (80, 3))
 
+    readings = Readings(found_px=0.3, reversed_px=0.9)
+
     def piece(images: range) -> Piece:
         observed = []
         for pose in poses[list(images)]:
             seen = (points @ pose[:, :3].T + pose[:, 3]) @ MATRIX.T
             observed.append((np.arange(len(points)), seen[:, :2] / seen[:, 2:]))
-        return Piece(np.array(images), poses[list(images)], points, tuple(observed), FOCAL_PX)
+        return Piece(np.array(images), poses[list(images)], points, tuple(observed), FOCAL_PX, readings)
 
     found = Reconstruction((piece(range(8)), piece(range(9, 15))), np.full(16, 300), np.full(16, 40))
     monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
@@ -102,6 +106,28 @@ def test_pieces_are_named_or_the_largest_is_kept() -> None:
 def test_little_parallax_is_refused() -> None:
     with pytest.raises(LocationError, match=r"the camera travels too little: the views of a point differ by .* less than 60"):
         estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))), disconnected="largest", min_parallax_deg=60)
+
+
+@pytest.mark.usefixtures("pieces")
+@pytest.mark.parametrize("is_unsure", [True, False])
+def test_reversed_depth_is_refused_or_recorded(is_unsure: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    from photonpano_colmap import averages
+
+    found = averages.reconstruct(None)
+    readings = Readings(0.8, 0.78 if is_unsure else 0.5, is_reversed=not is_unsure, is_unsure=is_unsure)
+    pieces = tuple(replace(piece, readings=readings) for piece in found.pieces)
+    monkeypatch.setattr(averages, "reconstruct", lambda *_: replace(found, pieces=pieces))
+    source = MemorySource(np.zeros((N_FRAMES, *SHAPE)))
+    if is_unsure:
+        with pytest.raises(LocationError) as caught:
+            estimated(source, disconnected="largest")
+        assert str(caught.value) == (
+            "the depth of the scene may be reversed: points are 0.80 px from where averages show them as COLMAP found them, "
+            "and 0.78 px with near and far exchanged. Move farther, so that perspective tells them apart"
+        )
+        return
+    _, [decision] = estimated(source, disconnected="largest")
+    assert decision[:2] == ("depth_reversed", True)
 
 
 @pytest.mark.usefixtures("pieces")

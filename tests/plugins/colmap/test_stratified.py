@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from photonpano import CameraGuess, FrameSpan, Group, LocationError, PosedView, PoseEstimate, ScenePoints, StageContext
+from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
 from photonpano.context import Quiet
 from photonpano.geometry import camera_matrix, rotation_matrices
 from photonpano.testing import MemorySource
@@ -18,12 +18,11 @@ pytest.importorskip("gtsam")
 
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
-from photonpano_colmap.posing.adjustment import Adjusted, Sightings, adjust
+from photonpano_colmap.posing.adjustment import Sightings, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.levels import Scene, locate, merge, resample
 from photonpano_colmap.posing.merging import merge_through_depth
 from photonpano_colmap.posing.path import CorrectedPath, between, posed, projected
-from photonpano_colmap.posing.reversal import agree, readings, reversed_in_depth
 from photonpano_colmap.stratified import StratifiedEstimator
 
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
@@ -138,39 +137,6 @@ def test_exposures_without_anything_in_common_are_an_error() -> None:
         exposures = merge(source, resample(80, 20), Scene(TRUE, _seen_points()), MATRIX, pool)
         with pytest.raises(LocationError, match="no patch of one was found in another"):
             locate(exposures, MATRIX, pool)
-
-
-@pytest.mark.parametrize(
-    ("focal_px", "width", "noise_px", "outcome"),
-    [(150.0, 2.0, 0.3, "agree"), (1500.0, 0.2, 0.1, "recognised"), (1500.0, 0.2, 0.3, "alike")],
-)
-def test_reversed_depth_is_recognised_by_its_residuals(focal_px: float, width: float, noise_px: float, outcome: str) -> None:
-    matrix = camera_matrix(focal_px, (79.5, 63.5))
-    points = points_on_planes(150, seed=6) * (width / 2, width / 2, 1)
-    true = true_poses()[::20]
-    rng = np.random.default_rng(5)
-    pixels = [
-        projected(np.repeat(pose[None], 150, axis=0), points, matrix) + rng.normal(0, noise_px, (150, 2)) for pose in true
-    ]
-    empty = np.zeros(N_FRAMES)
-
-    def both(poses: np.ndarray, places: np.ndarray) -> tuple[Adjusted, Adjusted]:
-        views = tuple(
-            PosedView(FrameSpan(k, k + 1), float(k), pose, np.arange(150), pixels[k], lambda: np.zeros(SHAPE))
-            for k, pose in enumerate(poses)
-        )
-        scene = ScenePoints(places, np.ones(150))
-        return readings(PoseEstimate(matrix, np.zeros(4), 0.0, true_poses(), empty == 0, empty, empty, scene, views))
-
-    for wrong_way, start in ((False, (true, points)), (True, reversed_in_depth(true, points))):
-        found, reverse = both(*start)
-        better, worse = (reverse, found) if wrong_way else (found, reverse)
-        if outcome == "agree":  # with much perspective, adjustment leads from the wrong reading to the right one
-            assert agree(found, reverse)
-        else:
-            assert not agree(found, reverse)
-            assert (better.residual_px < 0.8 * worse.residual_px) == (outcome == "recognised")
-        assert better.residual_px < 0.5
 
 
 def test_lens_that_distorts_is_refused() -> None:

@@ -1,0 +1,116 @@
+"""Two readings of one scene: as COLMAP found it, and with near and far exchanged.
+
+From afar, a scene and its mirror image in depth look alike while the camera turns the other way (the reversal of Necker's
+cube). A reconstruction may end in either; only perspective tells them apart, by the residuals that the wrong one leaves.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from photonpano import FloatArray
+from photonpano_colmap.pose_spline import positions_of
+
+_NEAREST = 0.1
+"""Reversed points are at least this far away, as a share of the median depth."""
+_FARTHEST_OFF_PX = 4.0
+"""Points further than this from where images show them are left out of a reversed reading, as COLMAP leaves them out."""
+_SAME = 0.2
+"""Two readings agree if turns of the camera differ by less than this share of them."""
+_ALIKE = 0.9
+"""Neither reading is likelier if the residuals of the better one are above this share of the other's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """How well two readings of the depth explain the images.
+
+    Attributes:
+        found_px: median distance of a point from where images show it, adjusted from the reading that COLMAP found.
+        reversed_px: the same, adjusted from near and far exchanged.
+        is_reversed: whether the likelier one is not what COLMAP found.
+        is_unsure: whether both differ, and explain the images alike.
+    """
+
+    found_px: float
+    reversed_px: float
+    is_reversed: bool = False
+    is_unsure: bool = False
+
+
+def likelier_reading(found: pycolmap.Reconstruction, finds_focal: bool) -> tuple[pycolmap.Reconstruction, Readings]:
+    """Return a reconstruction as it is, or with its depth reversed if that explains the images better; and how well each does.
+
+    Args:
+        found: poses and points; it is not changed.
+        finds_focal: whether the focal length was found with them.
+    """
+    adjusted, other = copy.deepcopy(found), _reversed(found)
+    found_px, reversed_px = _adjust(adjusted, finds_focal), _adjust(other, finds_focal)
+    # Where perspective is strong, adjustment leads from the wrong reading to the right one.
+    is_unsure = not _agree(adjusted, other) and min(found_px, reversed_px) > _ALIKE * max(found_px, reversed_px)
+    likelier = adjusted if found_px <= reversed_px else other
+    is_reversed = not is_unsure and not _agree(found, likelier)
+    readings = Readings(found_px, reversed_px, is_reversed, is_unsure)
+    if not is_reversed:
+        return found, readings
+    for identifier, point in list(likelier.points3D.items()):
+        if point.error > _FARTHEST_OFF_PX:
+            likelier.delete_point3D(identifier)
+    return likelier, readings
+
+
+def reversed_in_depth(poses: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mirror (N, 3, 4) poses and (M, 3) points at the plane of the median depth; to first order, images stay as they are."""
+    towards = Rotation.from_matrix(poses[:, :, :3]).mean().as_matrix()
+    middle = positions_of(poses).mean(axis=0)
+    seen = (points - middle) @ towards.T
+    depth = float(np.median(seen[:, 2]))
+    seen[:, 2] = np.maximum(2 * depth - seen[:, 2], _NEAREST * depth)
+    rotations = poses[:, :, :3] @ towards.T
+    target = np.array([0.0, 0.0, depth])
+    # The camera pans and tilts the other way, and goes on to see the middle of the scene where it saw it.
+    turned = Rotation.from_rotvec(Rotation.from_matrix(rotations).as_rotvec() * (-1, -1, 1)).as_matrix()
+    looked = np.einsum("nij,nj->ni", rotations, target - (positions_of(poses) - middle) @ towards.T)
+    return np.concatenate([turned, (looked - turned @ target)[:, :, None]], axis=2), seen
+
+
+def _reversed(found: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    other = copy.deepcopy(found)
+    images = [image for image in other.images.values() if image.has_pose]
+    identifiers = sorted(other.points3D)
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    points = np.array([other.points3D[identifier].xyz for identifier in identifiers])
+    poses, points = reversed_in_depth(poses, points)
+    for image, pose in zip(images, poses, strict=True):
+        image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+    for identifier, point in zip(identifiers, points, strict=True):
+        other.points3D[identifier].xyz = point
+    return other
+
+
+def _adjust(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
+    """Adjust a reconstruction to its images, and return the median distance of a point from where they show it, px."""
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.refine_focal_length = finds_focal
+    options.refine_principal_point = options.refine_extra_params = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    return float(np.median([point.error for point in model.points3D.values()]))
+
+
+def _agree(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction) -> bool:
+    """Return whether the camera turns alike in two reconstructions from the same images."""
+    poses = [
+        np.array([each.cam_from_world().matrix() for each in model.images.values() if each.has_pose])
+        for model in (first, second)
+    ]
+    turns = [Rotation.from_matrix(each[1:, :, :3] @ each[0, :, :3].T) for each in poses]
+    return bool(np.median((turns[0] * turns[1].inv()).magnitude()) < _SAME * np.median(turns[0].magnitude()))
