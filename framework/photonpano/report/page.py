@@ -76,6 +76,7 @@ def head_of(record: RunRecord) -> dict[str, Any]:
     """Return what the pages of all runs show."""
     return {
         "record": record,
+        "warnings": record["warnings"],
         "title": _title(record),
         "created": datetime.fromisoformat(record["created"]).strftime("%d %B %Y, %H:%M %Z").strip(),
         "capture_seconds": _capture_seconds(record),

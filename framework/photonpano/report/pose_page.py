@@ -20,7 +20,7 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
         environment_of()
         .get_template("poses.html")
         .render(
-            **head_of(record),
+            head_of(record),
             poses=record["poses"],
             warnings=[each for each in record["warnings"] if not each.startswith(DOUBTFUL)],
             path=pose_figures.path(estimate),
