@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photonpano import Bayer, Config, FrameSpan, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
+from photonpano import Bayer, Config, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinarySumResponse
-from photonpano.reading import Closing, look_first, missing_file, read_start, reading
+from photonpano.reading import SingleFrameSource, look_first, missing_file, read_start, reading
 
 _SUFFIX = ".ubi.h5"
 _HDF = b"\x89HDF\r\n\x1a\n"
@@ -32,7 +32,7 @@ class UbiceptConfig(Config):
     )
 
 
-class UbiceptSource(Closing):
+class UbiceptSource(SingleFrameSource):
     """Sums of binary frames. The HDF5 library reads one at a time, whatever the number of threads.
 
     Raises:
@@ -90,23 +90,8 @@ class UbiceptSource(Closing):
             )
         return found
 
-    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
-        """Sum the frames of a span: (H, W) uint32."""
-        self.info.require(span)
-        counts = np.zeros(self.info.frame_shape, np.uint32)
-        for index in range(span.start, span.stop):
-            counts += self._frame(index)
-        return counts
-
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Return the frames of a span: (n, H, W), each the sum of binary frames."""
-        self.info.require(span)
-        frames = np.empty((len(span), *self.info.frame_shape), self._dtype)
-        for place, index in enumerate(range(span.start, span.stop)):
-            frames[place] = self._frame(index)
-        return frames
-
-    def _frame(self, index: int) -> NDArray[Any]:
+    def frame(self, index: int) -> NDArray[Any]:
+        """Return a frame: (H, W), the sum of binary frames."""
         name = self._names[index]
         with reading(self._path, _DAMAGED):
             values: NDArray[Any] = self._group[name][()].reshape(self.info.frame_shape)

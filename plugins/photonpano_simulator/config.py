@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from photonpano import Bayer, Config, SpecPath
+from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats
 
 
 class StreetScene(Config):
@@ -46,7 +47,6 @@ class PhotoScene(Config):
 
 Frequency = Annotated[float, Field(gt=0, le=1e6)]
 Rate = Annotated[float, Field(gt=0, le=100)]
-Side = Annotated[int, Field(ge=8, le=8192)]
 Size = Annotated[float, Field(gt=0, le=10)]
 Place = Annotated[float, Field(ge=-10, le=10)]
 Speed = Annotated[float, Field(ge=-100, le=100)]
@@ -287,13 +287,6 @@ class Lamp(Config):
     )
 
 
-class FrameRange(Config):
-    """Successive frames, counted before any are dropped or repeated."""
-
-    at: int = Field(ge=0, description="index of the first frame, counted before any are dropped or repeated")
-    frames: int = Field(1, ge=1, le=10_000_000, description="number of frames")
-
-
 class SimulationConfig(Config):
     """What simulations of all cameras share."""
 
@@ -324,30 +317,23 @@ class SimulationConfig(Config):
         description="incident photons per pixel per frame, averaged over the scene; the sensor detects "
         "quantum_efficiency times as many",
     )
-    drift: float = Field(
-        1.0,
-        ge=1e-3,
-        le=1e3,
-        description="light of the last frame divided by that of the first; between them it changes exponentially",
-    )
+    drift: Drift = 1.0
     lamps: tuple[Lamp, ...] = Field(
         (),
         max_length=16,
         description="lamps that flicker; the rest of the light is steady, and so is the mean light of each place",
     )
-    n_frames: int = Field(2000, ge=1, le=10_000_000, description="number of frames that the camera takes")
-    frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")
-    frame_rate_hz: float = Field(96_800.0, gt=0, le=1e9, description="frames a second, in Hz")
+    n_frames: FrameCount = 2000
+    frame_shape: FrameShape = (254, 496)
+    frame_rate_hz: FrameRate = 96_800.0
     focal_length_px: float = Field(4464.0, ge=50, le=1e6, description="focal length of the camera, in px")
     lens: Lens = Field(Lens(), description="the lens of the camera")
     distortion: Distortion = Field(
         Distortion(), description="distortion of the lens by OpenCV's model, in place of k1 and k2 of `lens`"
     )
     objects: tuple[FrameObject, ...] = Field((), max_length=100, description="rectangles and discs in front of the scene")
-    drops: tuple[FrameRange, ...] = Field((), description="frames that are missing in the capture")
-    repeats: tuple[FrameRange, ...] = Field(
-        (), description="frames that the capture holds twice: all of the range, and then all of it again"
-    )
+    drops: Drops = ()
+    repeats: Repeats = ()
     seed: int | None = Field(None, ge=0, description="seed of photons, pixels and shake; by default the seed of the run")
 
     @model_validator(mode="after")
@@ -373,6 +359,6 @@ class CameraSimulatorConfig(SimulationConfig):
         description="incident photons per pixel per frame, averaged over the scene; the sensor detects "
         "quantum_efficiency times as many",
     )
-    n_frames: int = Field(200, ge=1, le=10_000_000, description="number of frames that the camera takes")
-    frame_rate_hz: float = Field(500.0, gt=0, le=1e9, description="frames a second, in Hz")
+    n_frames: FrameCount = 200
+    frame_rate_hz: FrameRate = 500.0
     sensor: IntensitySensor = Field(IntensitySensor(), description="the camera")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import InputError
-from photonpano_simulator.config import FrameRange
+from photonpano_simulator.recording import FrameRange
 
 
 def delivered(n_frames: int, drops: tuple[FrameRange, ...], repeats: tuple[FrameRange, ...]) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, corners, inverse
-from photonpano.reading import Closing
+from photonpano.reading import SingleFrameSource
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig, TurnPath
 from photonpano_simulator.delivery import delivered
 from photonpano_simulator.intensity import IntensityCamera
@@ -20,7 +20,7 @@ from photonpano_simulator.sensor import Draw, SpadSensor, bayer_of, filter_array
 from photonpano_simulator.views import Views
 
 
-class SimulatorSource(Closing):
+class SimulatorSource(SingleFrameSource):
     """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
 
     A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread.
@@ -66,23 +66,13 @@ class SimulatorSource(Closing):
         self.valid: NDArray[np.bool_] = self._sensor.valid
         self.valid.flags.writeable = False
 
-    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
-        """Sum the frames of a span: (H, W) uint32."""
-        self.info.require(span)
-        counts = np.zeros(self.info.frame_shape, np.uint32)
-        for index in range(span.start, span.stop):
-            counts += self._frame(index)
-        return counts
-
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Return the frames of a span: (n, H, W) of zeros and ones, or of grey levels."""
-        self.info.require(span)
-        shape = len(span), *self.info.frame_shape
-        frames: NDArray[np.uint8] | NDArray[np.uint16]
-        frames = np.empty(shape, np.uint8) if self.info.bit_depth <= 8 else np.empty(shape, np.uint16)
-        for place, index in enumerate(range(span.start, span.stop)):
-            frames[place] = self._frame(index)
-        return frames
+    def frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
+        """Return a frame: (H, W) of zeros and ones, or of grey levels."""
+        taken = int(self._taken[index])
+        flux = self._flux(taken)
+        if not self._is_uniform:
+            flux *= self._gains * np.float32(self._light[taken])
+        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the frames.
@@ -152,13 +142,6 @@ class SimulatorSource(Closing):
         for each in self._objects:
             each.draw(flux, taken)
         return flux
-
-    def _frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
-        taken = int(self._taken[index])
-        flux = self._flux(taken)
-        if not self._is_uniform:
-            flux *= self._gains * np.float32(self._light[taken])
-        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
 
     def _lit_view(self, index: int, homography: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the flux of the scene in a frame, in the light of the lamps: (H, W)."""

@@ -23,6 +23,7 @@ from photonpano.reading.packed_files import FrameFile, PackedFileSource
 from photonpano.reading.packed_layout import FrameLayout
 from photonpano.reading.pixel_order import OtherOrder, PixelOrder, other_order
 from photonpano.reading.sampling import sampled_frames, sampled_spans
+from photonpano.reading.single_frame_source import SingleFrameSource
 from photonpano.source_wrapper import Closing
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "OtherOrder",
     "PackedFileSource",
     "PixelOrder",
+    "SingleFrameSource",
     "bayer_array",
     "files_in",
     "frames_are_last",

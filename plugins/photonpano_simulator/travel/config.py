@@ -7,7 +7,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from photonpano import Config, SpecPath
-from photonpano_simulator.config import FrameRange, Sensor, Shake, Side
+from photonpano_simulator.config import Sensor, Shake
+from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats
 
 Metres = Annotated[float, Field(ge=-1000, le=1000)]
 Point = tuple[Metres, Metres, Metres]
@@ -123,15 +124,10 @@ class TravelConfig(Config):
         description="incident photons per pixel per frame, averaged over frames all along the path; the sensor detects "
         "quantum_efficiency times as many",
     )
-    drift: float = Field(
-        1.0,
-        ge=1e-3,
-        le=1e3,
-        description="light of the last frame divided by that of the first; between them it changes exponentially",
-    )
-    n_frames: int = Field(5000, ge=1, le=10_000_000, description="number of frames that the camera takes")
-    frame_shape: tuple[Side, Side] = Field((254, 496), description="height and width of a frame, in px")
-    frame_rate_hz: float = Field(10_000.0, gt=0, le=1e9, description="frames a second, in Hz")
+    drift: Drift = 1.0
+    n_frames: FrameCount = 5000
+    frame_shape: FrameShape = (254, 496)
+    frame_rate_hz: FrameRate = 10_000.0
     focal_px: float = Field(
         400.0,
         gt=0,
@@ -142,10 +138,8 @@ class TravelConfig(Config):
     centre_px: tuple[float, float] | None = Field(
         None, description="(x, y) of the principal point, in px; by default the middle of the frame"
     )
-    drops: tuple[FrameRange, ...] = Field((), description="frames that are missing in the capture")
-    repeats: tuple[FrameRange, ...] = Field(
-        (), description="frames that the capture holds twice: all of the range, and then all of it again"
-    )
+    drops: Drops = ()
+    repeats: Repeats = ()
     seed: int | None = Field(None, ge=0, description="seed of photons, pixels and tremor; by default the seed of the run")
     sensor: Sensor = Field(Sensor(), description="the single-photon camera")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FrameSpan, InputError, SourceContext, StreamInfo
-from photonpano.reading import Closing
+from photonpano import InputError, SourceContext, StreamInfo
+from photonpano.reading import SingleFrameSource
 from photonpano_simulator.delivery import delivered
 from photonpano_simulator.sensor import Draw, SpadSensor, generator
 from photonpano_simulator.travel.config import TravelConfig
@@ -19,7 +19,7 @@ _METERED = 9
 """Frames along the path over which the mean flux is taken."""
 
 
-class TravelSource(Closing):
+class TravelSource(SingleFrameSource):
     """A single-photon camera that travels through a scene with depth.
 
     A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread.
@@ -57,21 +57,10 @@ class TravelSource(Closing):
         self.valid: NDArray[np.bool_] = self._sensor.valid
         self.valid.flags.writeable = False
 
-    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
-        """Sum the frames of a span: (H, W) uint32."""
-        self.info.require(span)
-        counts = np.zeros(self.info.frame_shape, np.uint32)
-        for index in range(span.start, span.stop):
-            counts += self._frame(index)
-        return counts
-
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
-        """Return the frames of a span: (n, H, W) of zeros and ones."""
-        self.info.require(span)
-        frames = np.empty((len(span), *self.info.frame_shape), np.uint8)
-        for place, index in enumerate(range(span.start, span.stop)):
-            frames[place] = self._frame(index)
-        return frames
+    def frame(self, index: int) -> NDArray[np.bool_]:
+        """Return a frame: (H, W) of zeros and ones."""
+        flux = sharp_view(self._truth, index) * self._sensor.gains
+        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, int(self._truth.taken[index])))
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the frames.
@@ -105,10 +94,6 @@ class TravelSource(Closing):
             InputError: there is no such frame.
         """
         return sharp_view(self._truth, frame)
-
-    def _frame(self, index: int) -> NDArray[np.bool_]:
-        flux = sharp_view(self._truth, index) * self._sensor.gains
-        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, int(self._truth.taken[index])))
 
 
 def problems_of(config: TravelConfig) -> list[str]:
