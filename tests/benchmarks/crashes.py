@@ -295,7 +295,7 @@ def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
 
 COSTS = {
     "fingerprint of the capture": ("photonpano.pipeline.run.run_fingerprint",),
-    "lock, run folder and work folder": ("photonpano.pipeline.run.run_folder", "photonpano.pipeline.run.work_folder"),
+    "lock, run folder and work folder": ("photonpano.pipeline.run_steps.run_folder", "photonpano.pipeline.run.work_folder"),
     "checkpoints": (
         "photonpano.pipeline.checkpoints.store.Store.save",
         "photonpano.pipeline.checkpoints.store.Store.load",

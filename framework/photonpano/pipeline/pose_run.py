@@ -2,35 +2,24 @@
 
 from __future__ import annotations
 
-import logging
-import time
-from functools import partial
-
 from photonpano.captures.fingerprint import fingerprint
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.captures.order import order_warning
-from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Progress, Quiet
-from photonpano.corrections import CorrectedSource, FilteredSource
 from photonpano.errors import InputError
 from photonpano.motion.attribution import attributing
-from photonpano.pipeline.components import build_pose_estimator, open_source
+from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_checks import require_estimate
 from photonpano.pipeline.pose_files import write_pose_files
-from photonpano.pipeline.run_folder import run_folder
-from photonpano.pipeline.run_steps import COMPILING, read_files, require_centre, require_photons_of, with_report
+from photonpano.pipeline.run_steps import begun_run, first_decisions, require_centre, with_report
 from photonpano.poses import in_standard_world
 from photonpano.protocols import Source
 from photonpano.record.pose_record import poses_record, poses_warnings
 from photonpano.record.run_json import started_record
 from photonpano.record.schema import RunRecord
-from photonpano.report import loading_figures, render_pose_report
+from photonpano.report import render_pose_report
 from photonpano.specs.plan import Plan
-from photonpano.threads import one_thread_inside
 from photonpano.values import CameraGuess, Decision, PoseEstimate
-
-logger = logging.getLogger(__name__)
 
 
 def run_poses(
@@ -60,32 +49,22 @@ def run_poses(
     if resume:
         progress.note("a run with `pose` keeps no work: it begins anew")
     observers = Observers(plan.observers, plan.output.directory)
-    with (
-        observers.watching(plan.document) as finished,
-        open_source(plan) as source,
-        run_folder(plan.output.directory, overwrite=overwrite, inputs=read_files(plan)) as folder,
-        loading_figures(),
-        one_thread_inside(),
-        notify_on_first_compile(partial(progress.note, COMPILING)),
-    ):
-        start = time.perf_counter()
-        require_photons_of(plan, source)
-        if warning := order_warning(source):
-            logger.warning(warning)
-        decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource | FilteredSource) else ())]
+    with begun_run(plan, observers, progress, overwrite=overwrite) as begun:
+        source, folder = begun.source, begun.folder
+        decisions = first_decisions(plan, source)
         capture = fingerprint(plan, source)
         with naming_obstacles(source, decisions):
             estimate = _estimated(plan, source, decisions, progress)
         warnings = [*poses_warnings(estimate), *write_pose_files(folder.staging, estimate, source.info, plan.output.exposures)]
         record = folder.commit(
             {
-                **started_record(plan, source.info, decisions, time.perf_counter() - start, capture),
+                **started_record(plan, source.info, decisions, begun.seconds, capture),
                 "poses": poses_record(estimate),
                 "warnings": warnings,
             }
         )
         record = with_report(folder, record, lambda record: render_pose_report(record, estimate))
-        finished(record)
+        begun.finished(record)
     return record
 
 

@@ -2,38 +2,29 @@
 
 from __future__ import annotations
 
-import logging
-import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.captures.order import order_warning
-from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress, Quiet
-from photonpano.corrections import CorrectedSource, FilteredSource
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
-from photonpano.pipeline.components import build_refiners, open_source
+from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_run import run_poses
 from photonpano.pipeline.rendering import render_into
-from photonpano.pipeline.run_folder import run_folder
-from photonpano.pipeline.run_steps import COMPILING, read_files, require_photons_of, with_report
+from photonpano.pipeline.run_steps import begun_run, first_decisions, with_report
 from photonpano.protocols import light_of
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
-from photonpano.report import loading_figures, render_report
+from photonpano.report import render_report
 from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
-from photonpano.threads import one_thread_inside, thread_count
-
-logger = logging.getLogger(__name__)
+from photonpano.threads import thread_count
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,24 +80,13 @@ def run(
         )
     observers = Observers(plan.observers, plan.output.directory)
     context = Context(thread_count(plan.run.threads), progress or Quiet(), observers.level_finished)
-    with (
-        observers.watching(plan.document) as finished,
-        open_source(plan) as source,
-        run_folder(plan.output.directory, overwrite=overwrite, inputs=read_files(plan)) as folder,
-        loading_figures(),
-        one_thread_inside(),
-        notify_on_first_compile(partial(context.progress.note, COMPILING)),
-        ExitStack() as stack,
-    ):
-        start, memory = time.perf_counter(), int(plan.run.memory)
-        require_photons_of(plan, source)
+    with begun_run(plan, observers, context.progress, overwrite=overwrite) as begun, ExitStack() as stack:
+        source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
         depends_on = run_fingerprint(plan, source)
         if resume and (done := finished_run(plan, depends_on)) is not None:
-            finished(done[0])
+            begun.finished(done[0])
             return RunResult(plan.output.directory, *done, was_finished=True)
-        if warning := order_warning(source):
-            logger.warning(warning)
-        decisions = [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource | FilteredSource) else ())]
+        decisions = first_decisions(plan, source)
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
         context = replace(context, checkpoints=work.checkpoints)
@@ -120,15 +100,14 @@ def run(
         rendering = render_into(folder, plan, source, found.vignette, motion, context, (explained.canvas, explained.panorama))
         panorama, rendered = rendering.panorama, rendering.decisions
         observers.rendered(panorama.canvas, panorama.seconds)
-        seconds = time.perf_counter() - start
         record = folder.commit(
             record_of(
-                *(plan, source.info, decisions, found.results, explained, verdict, panorama, rendered, seconds),
+                *(plan, source.info, decisions, found.results, explained, verdict, panorama, rendered, begun.seconds),
                 depends_on["capture"],
             )
         )
         work.finish()
         light = light_of(source)
         record = with_report(folder, record, lambda record: render_report(record, explained, panorama, light))
-        finished(record)
+        begun.finished(record)
     return RunResult(plan.output.directory, record, verdict)
