@@ -12,18 +12,10 @@ from photonpano.registry.kinds import KINDS
 from photonpano.registry.schema_text import TolerantJsonSchema
 from photonpano.specs.aliases import LocatorAlias
 from photonpano.specs.checks import STAGES
+from photonpano.specs.components import DEFAULT_FALLBACK, DEFAULT_REFINER, DEFAULTS
 from photonpano.specs.corrections import AUTO
-from photonpano.specs.resolution import (
-    DEFAULT_FALLBACK,
-    DEFAULT_REFINER,
-    DEFAULTS,
-    LEVELS,
-    MAX_LEVELS,
-    PANORAMA_ONLY,
-    SETTINGS,
-    UNTIL_CONVERGED,
-    VERSION,
-)
+from photonpano.specs.pose import PANORAMA_ONLY
+from photonpano.specs.resolution import LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
 from photonpano.specs.settings import LevelSettings, LightSettings, OutputSettings, RenderSettings
 
 if TYPE_CHECKING:
