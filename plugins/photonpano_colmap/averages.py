@@ -47,6 +47,9 @@ _FEWEST = 24
 _SHORTEST = 4
 _TEXTURE = 60, 15
 """Keypoints of an average, and matches with another one, below which it shows too little texture."""
+_FEW_MATCH = 0.25
+"""Share of keypoints that match another average, below which noise or blur, and not the path, is why there are no poses."""
+_ANOTHER_SIZE = "choose a larger pose.with.group_size for less noise, or a smaller one for less blur"
 _FOCAL_SHARE = 0.02
 """Expected error of a focal length that was found, relative to it, above which the poses are doubtful."""
 _FOCAL_BIAS = 0.01
@@ -108,11 +111,14 @@ class AveragesEstimator:
         """Return the piece of the poses to go on with."""
         _require_texture(found)
         if not found.pieces or len(found.pieces[0].images) < MIN_AVERAGES:
+            keypoints, matches = (int(np.median(each)) for each in (found.n_keypoints, found.n_matches))
+            figures = f"of {keypoints} keypoints in an average (the median) {matches} match another average"
+            if matches < _FEW_MATCH * keypoints:
+                raise LocationError(f"COLMAP found no poses: {figures}, so noise or blur hides the scene; {_ANOTHER_SIZE}")
             raise LocationError(
-                f"COLMAP found no poses: no two averages share enough of the scene from places that lie far enough apart; of "
-                f"{int(np.median(found.n_keypoints))} keypoints in an average, {int(np.median(found.n_matches))} match. If the "
-                "camera only turns, leave out `pose` and set motion: {model: rotation}; otherwise try another "
-                "pose.with.group_size, or move farther"
+                "COLMAP found no poses: no two averages share enough of the scene from places that lie far enough apart; "
+                f"{figures}. If the camera only turns, leave out `pose` and set motion: {{model: rotation}}; otherwise move "
+                "farther, or try another pose.with.group_size"
             )
         piece = found.pieces[0]
         if len(found.pieces) > 1 and self._config.disconnected == "error":
@@ -337,8 +343,7 @@ def _require_texture(found: Reconstruction) -> None:
     if keypoints < _TEXTURE[0] or matches < _TEXTURE[1]:
         raise LocationError(
             f"the averages show too little texture, or too much noise: of {keypoints:.0f} keypoints in an average (the median) "
-            f"{matches:.0f} match another average; choose a larger pose.with.group_size for less noise, or a smaller one for "
-            "less blur"
+            f"{matches:.0f} match another average; {_ANOTHER_SIZE}"
         )
 
 

@@ -72,5 +72,9 @@ def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> l
     step = config.group_size if config.step == "auto" else config.step
     number = 1 + (stream.n_frames - config.group_size) // step
     if number < MIN_AVERAGES:
-        return [f"the capture has {stream.n_frames} frames, {max(0, number)} averages; at least {MIN_AVERAGES} are needed"]
+        averages = "1 average" if number == 1 else f"{max(0, number)} averages"
+        return [
+            f"{stream.n_frames} frames are {averages} of {config.group_size}; at least {MIN_AVERAGES} are needed: choose a "
+            "smaller pose.with.group_size, or record longer"
+        ]
     return []

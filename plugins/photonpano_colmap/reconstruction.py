@@ -57,7 +57,8 @@ class Reconstruction:
     """What COLMAP found.
 
     Attributes:
-        pieces: the largest first; empty if no pair of images was enough to begin with.
+        pieces: the largest first, each with an image that no larger one has; empty if no pair of images was enough to begin
+            with.
         n_keypoints: (N,) keypoints of each image.
         n_matches: (N,) keypoints of each image that match those of another one, in agreement with a motion: the most of any.
     """
@@ -99,7 +100,7 @@ def reconstruct(
         _match(database, config, seed)
         keypoints, matches = _counts(database, len(images))
         found = _map(database, folder, camera, config, seed)
-        pieces = sorted((_piece(each, camera.focal_px is None) for each in found), key=lambda piece: -len(piece.images))
+        pieces = [_piece(each, camera.focal_px is None) for each in _apart(found)]
     return Reconstruction(tuple(pieces), keypoints, matches)
 
 
@@ -168,6 +169,21 @@ def _map(
     options.ba_refine_principal_point = options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
     options.mapper.init_min_tri_angle = _START_ANGLE_DEG
     return list(pycolmap.incremental_mapping(database, *place, options=options).values())
+
+
+def _apart(found: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """Return reconstructions, the largest first, without those whose images all belong to larger ones.
+
+    The mapper begins several times, and a later model may grow over the images of an earlier one.
+    """
+    kept: list[pycolmap.Reconstruction] = []
+    seen: set[int] = set()
+    for each in sorted(found, key=lambda model: -model.num_reg_images()):
+        images = set(each.reg_image_ids())
+        if not images <= seen:
+            kept.append(each)
+            seen |= images
+    return kept
 
 
 def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:

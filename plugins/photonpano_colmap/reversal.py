@@ -101,7 +101,13 @@ def _adjust(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
     options.refine_principal_point = options.refine_extra_params = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
+    # This is what `pycolmap.bundle_adjustment` does, which prints a heading and its time whatever the level of its log.
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
     return float(np.median([point.error for point in model.points3D.values()]))
 

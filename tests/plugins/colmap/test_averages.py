@@ -24,7 +24,7 @@ from photonpano_colmap.averages import AveragesEstimator, chosen_size
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.pose_noise import pose_noise
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
-from photonpano_colmap.reconstruction import Piece, Reconstruction
+from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart
 from photonpano_colmap.reversal import Readings
 
 SIZE = 20
@@ -55,8 +55,25 @@ def test_camera_that_only_turns_is_offered_rotations(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
     with pytest.raises(LocationError) as caught:
         estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))))
-    assert "of 300 keypoints in an average, 100 match" in str(caught.value)
+    assert "of 300 keypoints in an average (the median) 100 match another average" in str(caught.value)
     assert "motion: {model: rotation}" in str(caught.value)
+
+
+def test_noise_that_hides_the_scene_is_not_taken_for_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Reconstruction((), np.full(16, 300), np.full(16, 40))
+    monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
+    with pytest.raises(
+        LocationError, match=r"40 match another average, so noise or blur hides the scene; choose a larger pose"
+    ):
+        estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))))
+
+
+def test_model_whose_images_belong_to_a_larger_one_is_no_piece() -> None:
+    whole, part, other = (
+        SimpleNamespace(num_reg_images=images.__len__, reg_image_ids=lambda images=images: images)
+        for images in ([1, 2, 3, 4], [2, 3], [4, 5])
+    )
+    assert _apart([part, other, whole]) == [whole, other]
 
 
 def test_scene_without_texture_is_refused() -> None:
@@ -141,8 +158,9 @@ def test_few_averages_are_refused() -> None:
     contribution = discover().find("pose-estimator", "colmap-averages").contribution
     config = ColmapAveragesConfig(group_size=40)
     [problem] = contribution.check(config, StreamInfo(160, *SHAPE, None))
-    assert problem == "the capture has 160 frames, 4 averages; at least 5 are needed"
-    with pytest.raises(LocationError, match="160 frames are 4 averages of 40; at least 5 are needed: choose a smaller"):
+    words = "160 frames are 4 averages of 40; at least 5 are needed: choose a smaller pose.with.group_size, or record longer"
+    assert problem == words
+    with pytest.raises(LocationError, match=words):
         AveragesEstimator(config, SimpleNamespace()).estimate(MemorySource(np.zeros((160, 8, 8))), CameraGuess(), Quiet())
 
 

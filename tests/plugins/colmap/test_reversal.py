@@ -39,7 +39,9 @@ def orbit(distance: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("focal_px", "distance", "outcome"), [(150.0, 4.5, "reversed"), (1000.0, 30.0, "unsure")])
-def test_reversed_depth_is_recognised_by_its_residuals(focal_px: float, distance: float, outcome: str) -> None:
+def test_reversed_depth_is_recognised_by_its_residuals(
+    focal_px: float, distance: float, outcome: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     rng, poses = np.random.default_rng(5), orbit(distance)
     points = np.random.default_rng(6).uniform([-1.5, -1.5, distance - 1.5], [1.5, 1.5, distance + 1.5], (SEEN, 3))
     seen = np.einsum("nij,mj->nmi", poses[:, :, :3], points) + poses[:, None, :, 3]
@@ -55,6 +57,7 @@ def test_reversed_depth_is_recognised_by_its_residuals(focal_px: float, distance
         first, last = (chosen.images[number].cam_from_world().matrix()[:, :3] for number in (1, len(poses)))
         away = (last @ first.T) @ (poses[-1, :, :3] @ poses[0, :, :3].T).T
         assert np.degrees(np.linalg.norm(rotation_vectors(away))) < 1
+    assert capfd.readouterr().err == ""
 
 
 @pytest.fixture(autouse=True)
