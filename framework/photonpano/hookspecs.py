@@ -410,14 +410,16 @@ def photonpano_stage_finished(
 ) -> None:
     """Watch a stage end. Merging and locating alternate, so the hook is called for all four stages when the level is done.
 
+    A run with `pose` has the stage "pose" only: levels belong to the pose estimator.
+
     Args:
         directory: the run folder, by which runs can be distinguished.
-        level: from 1; None for the panorama.
-        stage: "resample", "merge", "locate" or "interpolate"; at the end of the run "render".
+        level: from 1; None for the panorama and for poses.
+        stage: "resample", "merge", "locate" or "interpolate"; at the end of the run "render"; with `pose` only "pose".
         seconds: how long it took.
         summary: its results. resample: `groups`; merge: `exposures`; locate: `pairs`, `failed` pairs and `located`
             exposures; interpolate: `change_px` (None at level 1) and `std_px` (None if not known), as in `run.json`; render:
-            `height` and `width` of the panorama.
+            `height` and `width` of the panorama; pose: numbers of `located` frames, of `exposures` and of `points`.
 
     Example:
         ```python

@@ -23,10 +23,14 @@ from photonpano import (
     LocatorContribution,
     MergerContribution,
     NotLocated,
+    PosedView,
+    PoseEstimate,
+    PoseEstimatorContribution,
     Refined,
     RefinerContribution,
     RendererContribution,
     ResamplerContribution,
+    ScenePoints,
     SourceContribution,
     hookimpl,
 )
@@ -53,6 +57,7 @@ KINDS: Mapping[str, tuple[str, Any, str]] = {
     "interpolator": ("interpolate", InterpolatorContribution, "smoothing-spline"),
     "refiner": ("refine", RefinerContribution, "short-spans"),
     "renderer": ("render", RendererContribution, "merge"),
+    "pose-estimator": ("pose", PoseEstimatorContribution, "known-path"),
 }
 """The section that chooses a kind, its contribution, and the component that the strange one is built around."""
 
@@ -104,6 +109,20 @@ def raising(error: BaseException) -> Callable[..., Any]:
     return fail
 
 
+class KnownPath:
+    """A pose estimator that knows the path of the camera: straight, before three points that one view shows."""
+
+    def estimate(self, *_: Any) -> PoseEstimate:
+        poses = np.tile(np.eye(3, 4), (FRAMES, 1, 1))
+        poses[:, 0, 3] = -np.linspace(0, 1, FRAMES)
+        points = ScenePoints(np.array([[0.0, 0, 4], [1, 0, 5], [0, 1, 6]]), np.full(3, 0.5, np.float32))
+        flux = np.full(SHAPE, 0.5, np.float32)
+        view = PosedView(FrameSpan(0, 40), 20, poses[20], np.arange(3), np.full((3, 2), 20.0), lambda: flux)
+        matrix, nothing = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]), np.zeros(FRAMES)
+        located = np.ones(FRAMES, np.bool_)
+        return PoseEstimate(matrix, np.zeros(4), 0.0, poses, located, nothing, nothing, points, (view,), (), ())
+
+
 @pytest.fixture(scope="module")
 def frames() -> np.ndarray:
     """(160, 48, 64) frames of a pan of 24 px."""
@@ -113,13 +132,15 @@ def frames() -> np.ndarray:
 @pytest.fixture(scope="module")
 def catalog(frames: np.ndarray) -> Catalog:
     memory = SourceContribution(name="memory", summary="Frames in memory", config=Keys, build=lambda *_: MemorySource(frames))
-    return discover().including(memory)
+    known = PoseEstimatorContribution(name="known-path", summary="A straight path", config=Keys, build=lambda *_: KnownPath())
+    return discover().including(memory).including(known)
 
 
 @pytest.fixture(autouse=True)
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the report out, which takes longer than the rest of a small run."""
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
+    monkeypatch.setattr("photonpano.pipeline.pose_run.render_pose_report", lambda *_: "")
 
 
 @dataclass(frozen=True)
@@ -138,14 +159,9 @@ def outcome_of(catalog: Catalog, tmp_path: Path, capsys: pytest.CaptureFixture[s
 
     def outcome_of(sections: Mapping[str, Any], *contributions: Any, observers: tuple[Observer, ...] = ()) -> Outcome:
         rows = (*catalog.rows, *(make_entry(each, ORIGIN) for each in contributions))
-        spec = {
-            "version": 1,
-            "source": {"use": "memory"},
-            "corrections": [],
-            "resample": {"use": "midpoint", "with": {"group_size": 40}},
-            "levels": 1,
-            "refine": [],
-        }
+        spec: dict[str, Any] = {"version": 1, "source": {"use": "memory"}, "corrections": []}
+        if "pose" not in sections:
+            spec |= {"resample": {"use": "midpoint", "with": {"group_size": 40}}, "levels": 1, "refine": []}
         code, record = 0, None
         try:
             with reported():
@@ -209,6 +225,8 @@ PLACES: Mapping[str, tuple[str, Callable[[BaseException], Callable[[Any], Any]],
     ),
     "refine": ("refiner", lambda error: instead("refine", raising(error)), "failed at round 1: "),
     "render": ("renderer", lambda error: instead("render", raising(error)), "failed at the panorama: "),
+    "build a pose estimator": ("pose-estimator", raising, "could not be built: "),
+    "estimate": ("pose-estimator", lambda error: instead("estimate", raising(error)), "failed at the capture: "),
 }
 
 
@@ -651,6 +669,87 @@ RENDERERS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
     ),
 }
 """What renderers return."""
+
+
+def poses_of(change: Callable[[Any], Mapping[str, Any]]) -> Callable[[Any], Any]:
+    """Return a pose estimator some of whose attributes are what `change` makes of a good estimate."""
+    return around("estimate", lambda found, *_: replace(found, **change(found)))
+
+
+def view_of(**changed: Any) -> Callable[[Any], Any]:
+    """Return a pose estimator some attributes of whose view are changed."""
+    return poses_of(lambda found: {"views": (replace(found.views[0], **changed),)})
+
+
+def skipped(found: Any) -> Mapping[str, Any]:
+    """Return an estimate without the frames 50 to 59, and without a reason."""
+    gone = np.zeros(FRAMES, np.bool_)
+    gone[50:60] = True
+    nan = np.where(gone, np.nan, 0.0)
+    poses = found.camera_from_world + nan[:, None, None]
+    return {"located": ~gone, "camera_from_world": poses, "std_position": nan, "std_rotation_deg": nan}
+
+
+AT_CAPTURE = "broke its contract at the capture: "
+POSE_ESTIMATORS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
+    "none": (instead("estimate", lambda *_: None), AT_CAPTURE + "expected a PoseEstimate, got a NoneType"),
+    "poses alone": (
+        around("estimate", lambda found, *_: found.camera_from_world),
+        AT_CAPTURE + "expected a PoseEstimate, got (160, 3, 4) of float64",
+    ),
+    "NaN": (
+        poses_of(lambda found: {"camera_from_world": found.camera_from_world * np.nan}),
+        AT_CAPTURE + "the pose of frame 0 must be a finite rotation and translation",
+    ),
+    "one NaN": (
+        poses_of(
+            lambda found: {"camera_from_world": holed(found.camera_from_world.reshape(FRAMES, 12), np.nan).reshape(-1, 3, 4)}
+        ),
+        AT_CAPTURE + "the pose of frame 3 must be a finite rotation and translation",
+    ),
+    "mirrored": (
+        poses_of(lambda found: {"camera_from_world": found.camera_from_world * [-1, 1, 1, 1]}),
+        AT_CAPTURE + "the pose of frame 0 must be a finite rotation and translation",
+    ),
+    "frames that are skipped": (poses_of(skipped), AT_CAPTURE + "frame 50 is not located, and no entry of lost says why"),
+    "frames that are not located with a pose": (
+        poses_of(lambda _: {"located": np.arange(FRAMES) < 100}),
+        AT_CAPTURE + "camera_from_world must be NaN where a frame is not located",
+    ),
+    "no frame": (
+        poses_of(lambda _: {"located": np.zeros(FRAMES, np.bool_)}),
+        AT_CAPTURE + "no frame is located; raise a LocationError with the reason instead",
+    ),
+    "fewer frames": (
+        poses_of(lambda found: {"camera_from_world": found.camera_from_world[1:]}),
+        AT_CAPTURE + "expected camera_from_world as float64 of the shape (160, 3, 4), got (159, 3, 4) of float64",
+    ),
+    "single precision": (
+        poses_of(lambda found: {"camera_from_world": found.camera_from_world.astype(np.float32)}),
+        AT_CAPTURE + "expected camera_from_world as float64 of the shape (160, 3, 4), got (160, 3, 4) of float32",
+    ),
+    "negative errors": (
+        poses_of(lambda found: {"std_position": found.std_position - 1}),
+        AT_CAPTURE + "std_position must be 0 or more where a frame is located, ",
+    ),
+    "a camera without a focal length": (
+        poses_of(lambda _: {"camera_matrix": np.diag([0.0, 0, 1])}),
+        AT_CAPTURE + "camera_matrix must be finite with positive focal lengths, got ",
+    ),
+    "a view beyond the end": (
+        view_of(span=FrameSpan(150, 170), instant=155),
+        AT_CAPTURE + "the view of frames 150 to 169 is seen from the instant 155, or reaches beyond the capture",
+    ),
+    "points that do not exist": (
+        view_of(points=np.arange(1, 4)),
+        AT_CAPTURE + "the view of frames 0 to 39 must show points 0 to 2, got ",
+    ),
+    "a place for every other point": (
+        view_of(xy=np.zeros((2, 2))),
+        AT_CAPTURE + "expected xy of the view of frames 0 to 39 as float64 of the shape (3, 2), got (2, 2) of float64",
+    ),
+}
+"""What pose estimators return."""
 CASES = {
     f"{kind}: {name}": (kind, *case)
     for kind, cases in {
@@ -661,6 +760,7 @@ CASES = {
         "interpolator": INTERPOLATORS,
         "refiner": REFINERS,
         "renderer": RENDERERS,
+        "pose-estimator": POSE_ESTIMATORS,
     }.items()
     for name, case in cases.items()
 }

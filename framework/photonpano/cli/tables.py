@@ -25,6 +25,7 @@ def print_written(written: WrittenCapture) -> None:
 
     from photonpano.cli.errors import warn
     from photonpano.registry.description import flow
+    from photonpano.text import counted
 
     if written.n_masked:
         mask = "mask them with `corrections`"
@@ -34,9 +35,10 @@ def print_written(written: WrittenCapture) -> None:
     if written.sharp:
         pictures = list(written.sharp.iterdir())
         size = decimal(sum(file.stat().st_size for file in pictures))
-        rows.append([str(written.sharp), size, f"{len(pictures):,} frames without noise"])
+        rows.append([str(written.sharp), size, f"{counted(len(pictures), 'frame')} without noise"])
     typer.echo(columns(rows))
     typer.echo(f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}")
-    # Runs are scored against homographies, which scenes with depth have not.
-    if written.truth and "homographies.npy" in ZipFile(written.truth).namelist():
-        typer.echo(f"\nTo score a run of it: photonpano evaluate RUN --truth {written.truth}")
+    held = ZipFile(written.truth).namelist() if written.truth else ()
+    for array, kind in (("homographies", "run"), ("camera_from_world", "run with `pose`")):
+        if f"{array}.npy" in held:
+            typer.echo(f"\nTo score a {kind} of it: photonpano evaluate RUN --truth {written.truth}")

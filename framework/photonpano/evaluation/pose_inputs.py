@@ -108,7 +108,8 @@ def load_true_poses(path: Path) -> TruePoses:
 def _poses(path: Path, arrays: Mapping[str, NDArray[Any]], others: tuple[str, ...] = ()) -> FloatArray:
     missing = [name for name in ("camera_from_world", *others) if name not in arrays]
     if missing:
-        raise InputError(f"{path} lacks {' and '.join(missing)}; it contains {', '.join(arrays) or 'nothing'}")
+        held = ", ".join(name or "an array without a name" for name in arrays) or "nothing"
+        raise InputError(f"{path} lacks {' and '.join(missing)}; it contains {held}")
     poses = arrays["camera_from_world"]
     if poses.ndim != 3 or poses.shape[1:] != (3, 4) or not len(poses) or poses.dtype.kind not in "fiu":
         raise InputError(f"{path}: camera_from_world must be numbers of the shape (frames, 3, 4), got {poses.shape}")

@@ -17,6 +17,7 @@ from photonpano.geometry import Canvas
 from photonpano.interrupts import is_interrupt
 from photonpano.motion.loop import LevelResult
 from photonpano.registry import Observer
+from photonpano.values import PoseEstimate
 
 logger = logging.getLogger(__name__)
 
@@ -61,6 +62,15 @@ class Observers:
     def rendered(self, canvas: Canvas, seconds: float) -> None:
         """Report the panorama."""
         self._stage_finished(None, "render", seconds, {"height": canvas.height, "width": canvas.width})
+
+    def posed(self, estimate: PoseEstimate, seconds: float) -> None:
+        """Report the poses."""
+        counts = {
+            "located": int(estimate.located.sum()),
+            "exposures": len(estimate.views),
+            "points": len(estimate.points.positions),
+        }
+        self._stage_finished(None, "pose", seconds, counts)
 
     def _stage_finished(self, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]) -> None:
         self._call("photonpano_stage_finished", level=level, stage=stage, seconds=seconds, summary=frozen(summary))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from photonpano.motion.attribution import BrokenContract, shown
-from photonpano.values import FloatArray, PoseEstimate, StreamInfo
+from photonpano.values import BoolArray, FloatArray, PoseEstimate, StreamInfo
 
 _ORTHONORMAL = 1e-6
 """Largest difference of R R^T from the identity."""
+_RIGID = "must be a finite rotation and translation"
 
 
 def require_estimate(estimate: object, stream: StreamInfo) -> PoseEstimate:
@@ -27,7 +28,8 @@ def require_estimate(estimate: object, stream: StreamInfo) -> PoseEstimate:
     poses = _array("camera_from_world", estimate.camera_from_world, (n_frames, 3, 4))
     if not np.isnan(poses[~located]).all():
         raise BrokenContract("camera_from_world must be NaN where a frame is not located")
-    _require_rigid("camera_from_world of the located frames", poses[located])
+    for frame in np.flatnonzero(located)[~_are_rigid(poses[located])].tolist():
+        raise BrokenContract(f"the pose of frame {frame} {_RIGID}")
     for name in ("std_position", "std_rotation_deg"):
         std = _array(name, getattr(estimate, name), (n_frames,))
         if not (std[located] >= 0).all() or not np.isnan(std[~located]).all():
@@ -51,7 +53,8 @@ def _require_scene(estimate: PoseEstimate, stream: StreamInfo) -> None:
         where = f"the view of {view.span}"
         if view.span.stop > stream.n_frames or not view.span.start <= view.instant <= view.span.stop - 1:
             raise BrokenContract(f"{where} is seen from the instant {view.instant:g}, or reaches beyond the capture")
-        _require_rigid(f"the pose of {where}", _array(f"the pose of {where}", view.camera_from_world, (3, 4))[None])
+        if not _are_rigid(_array(f"the pose of {where}", view.camera_from_world, (3, 4))[None]).all():
+            raise BrokenContract(f"the pose of {where} {_RIGID}")
         indices = np.asarray(view.points)
         if (
             indices.ndim != 1
@@ -74,8 +77,9 @@ def _array(name: str, value: object, shape: tuple[int, ...]) -> FloatArray:
     return value
 
 
-def _require_rigid(name: str, poses: FloatArray) -> None:
-    rotations = poses[:, :, :3]
-    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max()
-    if not np.isfinite(poses).all() or not off < _ORTHONORMAL or not (np.linalg.det(rotations) > 0).all():
-        raise BrokenContract(f"{name} must be finite rotations and translations")
+def _are_rigid(poses: FloatArray) -> BoolArray:
+    """Return which poses (N, 3, 4) are finite and made of a rotation and a translation: (N,)."""
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    rotations = np.where(finite[:, None, None], poses[:, :, :3], 0)
+    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2))
+    return finite & (off < _ORTHONORMAL) & (np.linalg.det(rotations) > 0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 from photonpano.captures.fingerprint import fingerprint
 from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Progress, Quiet
@@ -53,8 +55,10 @@ def run_poses(
         source, folder = begun.source, begun.folder
         decisions = first_decisions(plan, source)
         capture = fingerprint(plan, source)
+        start = time.perf_counter()
         with naming_obstacles(source, decisions):
             estimate = _estimated(plan, source, decisions, progress)
+        observers.posed(estimate, time.perf_counter() - start)
         warnings = [*poses_warnings(estimate), *write_pose_files(folder.staging, estimate, source.info, plan.output.exposures)]
         record = folder.commit(
             {

@@ -35,8 +35,7 @@ def test_sharp_frames_are_views_without_noise(here: Path, invoke: Callable[..., 
     lines = done.stdout.splitlines()
     assert lines[2].startswith("cube.sharp ")
     assert lines[2].endswith("3 frames without noise")
-    # A scene with depth has no homographies to score a run with.
-    assert "evaluate" not in done.stdout
+    assert lines[-1] == "To score a run with `pose` of it: photonpano evaluate RUN --truth cube.truth.npz"
     truth = read_truth("cube.truth.npz")
     levels = np.stack([cv2.imread(f"cube.sharp/frame_0000{n}.png", cv2.IMREAD_UNCHANGED) for n in (10, 20)])
     flux = np.stack([sharp_view(truth, n) for n in (10, 20)])

@@ -120,6 +120,12 @@ def test_truth_of_something_else_is_refused(folder: Path, tmp_path: Path, truth:
     assert message in str(caught.value)
 
 
+def test_capture_is_no_truth(folder: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.zeros((N_FRAMES, 4, 1), np.uint8))
+    with pytest.raises(InputError, match=r"cube\.npy lacks camera_from_world; it contains an array without a name$"):
+        evaluate_poses(folder, tmp_path / "cube.npy")
+
+
 def test_panorama_and_its_truth_are_kept_apart(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="which has poses and no homographies; score a run with `pose` by it"):
         load_truth(tmp_path / "truth.npz")

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,9 +28,11 @@ from photonpano import (
     PoseEstimatorContribution,
     ScenePoints,
     discover,
+    hookimpl,
     run,
 )
 from photonpano.record.contents import changed_files
+from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
 
 N_FRAMES, LOST = 300, FrameSpan(280, 300)
@@ -250,10 +252,10 @@ def test_doubts_and_lost_frames_are_in_record_report_and_warnings(plan_of: Calla
     ("change", "message"),
     [
         (lambda _: None, "expected a PoseEstimate, got a NoneType"),
-        (lambda it: replace(it, located=np.ones(N_FRAMES, bool)), "must be finite rotations and translations"),
+        (lambda it: replace(it, located=np.ones(N_FRAMES, bool)), "must be a finite rotation and translation"),
         (lambda it: replace(it, located=np.zeros(N_FRAMES, bool)), "no frame is located; raise a LocationError"),
         (lambda it: replace(it, camera_from_world=np.tile(np.eye(3, 4), (N_FRAMES, 1, 1))), "must be NaN where a frame"),
-        (lambda it: replace(it, camera_from_world=2 * it.camera_from_world), "must be finite rotations and translations"),
+        (lambda it: replace(it, camera_from_world=2 * it.camera_from_world), "must be a finite rotation and translation"),
         (lambda it: replace(it, camera_from_world=it.camera_from_world[:9]), "of the shape (300, 3, 4), got (9, 3, 4)"),
         (lambda it: replace(it, std_position=-it.std_position), "std_position must be 0 or more where a frame is located"),
         (lambda it: replace(it, lost=()), "frame 280 is not located, and no entry of lost says why"),
@@ -283,6 +285,16 @@ def test_work_is_not_kept(plan_of: Callable[..., Plan], without_report: None) ->
         with pytest.raises(InputError, match="a run with `pose` has no levels to keep"):
             run(plan_of(), **options)
     assert run(plan_of(), resume=True).was_finished is False
+
+
+def test_observers_see_the_stage_pose(plan_of: Callable[..., Plan], without_report: None) -> None:
+    told: list[Any] = []
+    watcher = ModuleType("watcher")
+    watcher.photonpano_stage_finished = hookimpl(  # type: ignore[attr-defined]
+        lambda level, stage, seconds, summary: told.append((level, stage, seconds >= 0, dict(summary)))
+    )
+    run(replace(plan_of(), observers=Catalog().including(watcher).observers))
+    assert told == [(None, "pose", True, {"located": LOST.start, "exposures": 5, "points": 60})]
 
 
 def test_other_sections_are_refused(plan_of: Callable[..., Plan], without_report: None) -> None:
