@@ -1,0 +1,198 @@
+"""The interfaces of sources: what every capture gives, and what some give besides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Camera
+
+
+class Source(Protocol):
+    """A capture that is open. Every method may be called from several threads at once."""
+
+    @property
+    def info(self) -> StreamInfo:
+        """Frames, size, rate."""
+        ...
+
+    @property
+    def response(self) -> Response:
+        """How flux becomes counts."""
+        ...
+
+    @property
+    def valid(self) -> BoolArray:
+        """(H, W) mask, False for pixels that must not be used (hot, dead, behind a colour filter)."""
+        ...
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        ...
+
+    def frames(self, span: FrameSpan) -> Frames:
+        """Return the frames of a span one by one: (n, H, W)."""
+        ...
+
+    def close(self) -> None:
+        """Release files; the source is not used afterwards."""
+        ...
+
+    def __enter__(self) -> Source: ...
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
+
+
+@runtime_checkable
+class PackedSource(Source, Protocol):
+    """Gives packed frames, so that copying and summing need no unpacking."""
+
+    def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span, eight pixels to a byte.
+
+        Returns:
+            (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width: the first pixel is the highest bit, and unused bits
+            of the last byte of a row are zero. The caller may write to it.
+        """
+        ...
+
+
+@runtime_checkable
+class LinearlyCorrectedSource(Source, Protocol):
+    """A source whose sums contain more than the flux, such as dark counts, and that can subtract it."""
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """Correct a sum of frames, so that on average it is the sum of frames of the flux alone.
+
+        Mergers correct sums of frames before they warp them. The correction is linear, so that the average is right; the result
+        may be negative.
+
+        Args:
+            counts: (H, W), from `counts`.
+            n_frames: number of frames in the sum.
+
+        Returns:
+            (H, W) float32.
+        """
+        ...
+
+
+@runtime_checkable
+class WeightedSource(Source, Protocol):
+    """A source whose pixels carry different amounts of information, as those behind filters of different colours do."""
+
+    def weights(self) -> FluxImage:
+        """Return how many frames of the best pixel a frame of each pixel is worth: (H, W) float32, from 0 to 1.
+
+        Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
+        """
+        ...
+
+
+@runtime_checkable
+class ColouredSource(Source, Protocol):
+    """A source behind a colour filter array. By itself it is grey: its corrected sums are those of pixels of one colour.
+
+    Motion is estimated from this grey source, and the panorama is rendered from the sources of its colours.
+    """
+
+    def colours(self) -> Mapping[str, Source]:
+        """Return a source for each colour: the same frames, in which only the pixels behind filters of this colour are valid.
+
+        Returns:
+            Sources of "red", "green", "blue", and if there are pixels without filter, "clear", in this order.
+        """
+        ...
+
+    def clear_mix(self) -> FloatArray:
+        """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
+        ...
+
+
+@runtime_checkable
+class LitSource(Source, Protocol):
+    """A source in changing light, which is known.
+
+    What is summed over frames counts each frame by its gain; what predicts a frame multiplies the flux by it. A source in
+    steady light does not have it.
+    """
+
+    @property
+    def light(self) -> Light:
+        """The gain of each frame."""
+        ...
+
+
+def light_of(source: Source) -> Light | None:
+    """Return the changing light of a capture; None if it is steady, or not known."""
+    return source.light if isinstance(source, LitSource) else None
+
+
+@runtime_checkable
+class LensedSource(Source, Protocol):
+    """A source whose camera is known.
+
+    Frames are warped through its lens: homographies then map ideal pixels, those without distortion, to ideal pixels.
+    """
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all frames."""
+        ...
+
+
+def camera_of(source: Source) -> Camera | None:
+    """Return the camera of a capture; None if it is not known."""
+    return source.camera if isinstance(source, LensedSource) else None
+
+
+@runtime_checkable
+class KnowsTruth(Protocol):
+    """A source with ground truth, such as a simulator: a `Source` with one more method.
+
+    `photonpano simulate` stores the truth as an .npz archive, for `photonpano evaluate`.
+    """
+
+    def truth(self) -> Mapping[str, NDArray[np.generic]]:
+        """Return the ground truth as named arrays; there may be more than the following ones.
+
+        Convention:
+            Homographies map pixels of a frame to pixels of the scene; points are (x, y), integers are pixel centres. Directions
+            are x right, y down, z ahead.
+
+        Returns:
+            `homographies` (T, 3, 3) float64, one for each frame, h33 = 1; `scene` (Hs, Ws) float32, the flux that is detected,
+            in photons per pixel per frame, without dark counts, or (Hs, Ws, 3) of red, green and blue pixels; `frame_shape`
+            (2,), height and width of a frame. If the camera only turned, also `rotations` (T, 3, 3), directions of a frame to
+            those of one camera, and `camera_matrix` (3, 3). If `scene_projection` is "spherical", the scene is an
+            equirectangular panorama, 360 degrees wide, whose middle that camera looks at; homographies are then K R K^-1 with
+            determinant 1. If the camera travelled through a scene with depth, there are no homographies but
+            `camera_from_world` (T, 3, 4), which maps points of the world to points of the camera, X_c = R X_w + t, and
+            `camera_matrix`.
+        """
+        ...
+
+
+@runtime_checkable
+class KnowsSharpViews(KnowsTruth, Protocol):
+    """A source that can return its frames without noise, such as a simulator.
+
+    `photonpano simulate --sharp-every` stores them as pictures.
+    """
+
+    def sharp_view(self, frame: int) -> FluxImage:
+        """Return the flux of a frame of the capture: (H, W) float32, photons that are detected per pixel per frame.
+
+        There are no dark counts in it, and no differences between pixels.
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        ...
