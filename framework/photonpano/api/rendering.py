@@ -14,7 +14,8 @@ from photonpano.context import Context, Progress, Quiet
 from photonpano.errors import InputError
 from photonpano.pipeline.rendering import Rendering, render_into
 from photonpano.pipeline.run_folder import run_folder as writing_run_folder
-from photonpano.record.run_json import decision_records, library_versions, panorama_record, peak_memory_bytes, plugin_records
+from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
+from photonpano.record.run_json import decision_records, panorama_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
 from photonpano.threads import one_thread_inside, thread_count

@@ -17,7 +17,7 @@ from photonpano.motion.loop import LevelResult, estimate_motion, resample
 from photonpano.pipeline.components import build_levels, build_renderer
 from photonpano.pipeline.estimate import model_of
 from photonpano.protocols import Source, camera_of_motion
-from photonpano.record.run_json import peak_memory_bytes
+from photonpano.record.environment import peak_memory_bytes
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan

@@ -22,7 +22,7 @@ from photonpano.pipeline.components import open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
 from photonpano.protocols import Source
-from photonpano.record.run_json import peak_memory_bytes
+from photonpano.record.environment import peak_memory_bytes
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures
 from photonpano.specs.plan import Plan

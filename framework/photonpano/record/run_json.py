@@ -5,10 +5,7 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import json
-import re
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -17,9 +14,10 @@ import numpy as np
 from photonpano.captures.fingerprint import CaptureRecord
 from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
-from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.graph import Evidence
 from photonpano.motion.loop import LevelResult
+from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
+from photonpano.record.run_warnings import level_warnings, motion_warnings, refinement_warnings
 from photonpano.record.schema import (
     CameraRecord,
     DecisionRecord,
@@ -29,7 +27,6 @@ from photonpano.record.schema import (
     MotionRecord,
     PairRecord,
     PanoramaRecord,
-    PluginRecord,
     ReasonRecord,
     RefinementRecord,
     RescuedRecord,
@@ -38,14 +35,8 @@ from photonpano.record.schema import (
 )
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.residuals.verdict import Reason, Verdict
-from photonpano.specs.plan import Choice, Plan
-from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, StreamInfo, true_spans
-
-UNCERTAIN_PX = 0.5
-"""A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible."""
-SHOWN_SPANS = 4
-"""Spans of uncertain frames that a warning names, the worst first."""
-_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "scipy", "pydantic", "pluggy", "tifffile")
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, StreamInfo
 
 
 def record_of(
@@ -148,41 +139,6 @@ def read_record(run_folder: Path) -> RunRecord:
             f"{file}: cannot be read as the record of a run ({error}); give the folder of a finished run"
         ) from error
     return record
-
-
-def plugin_records(plan: Plan) -> list[PluginRecord]:
-    """List the components of a plan, each once."""
-    seen: dict[tuple[str, str], PluginRecord] = {}
-    for stage, choice in _choices(plan):
-        name = choice.contribution.name
-        seen[stage, name] = {"stage": stage, "use": name, "plugin": choice.origin.plugin, "version": choice.origin.version}
-    return list(seen.values())
-
-
-def library_versions(plan: Plan) -> dict[str, str]:
-    """Return the versions of Python and of the libraries that the result depends on."""
-    versions = {"python": sys.version.split()[0]}
-    required = [requirement.module for _, choice in _choices(plan) for requirement in choice.contribution.requires]
-    for name in dict.fromkeys((*_LIBRARIES, *required)):
-        # The distribution may have another name than the module.
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
-
-
-def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
-    """Yield the sections of a spec with the component that each chooses, level by level."""
-    yield "source", plan.source
-    if plan.pose is not None:
-        yield "pose", plan.pose
-        return
-    for level in plan.levels:
-        yield from (("resample", level.resample), ("merge", level.merge), ("locate", level.locate))
-        yield from (("locate", choice) for choice in level.fallbacks)
-        yield "interpolate", level.interpolate
-    yield from (("refine", choice) for choice in plan.refine)
-    yield "render", plan.renderer
-    yield from (("output", choice) for choice in plan.formats)
 
 
 def level_record(result: LevelResult) -> LevelRecord:
@@ -320,15 +276,6 @@ def refinement_record(refinement: Refinement) -> RefinementRecord:
     }
 
 
-def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
-    """Warn of refiners whose motion was not used."""
-    return [
-        f"the motion of the refiner {each.name!r} is not used, since it explains the photons worse: {each.kept_out}"
-        for each in refinements
-        if each.kept_out
-    ]
-
-
 def levels_decision(results: Sequence[LevelResult]) -> Decision:
     """Return the number of levels after which the motion converged, and why."""
     last = results[-1]
@@ -341,80 +288,6 @@ def levels_decision(results: Sequence[LevelResult]) -> Decision:
             f"{last.uncertainty.mean_px:.2g} px"
         )
     return Decision("levels", len(results), reason)
-
-
-def level_warnings(results: Sequence[LevelResult]) -> list[str]:
-    """Warn of exposures that were not located, and of pairs that were dropped as outliers."""
-    warnings = []
-    for result in results:
-        located, groups = result.located, result.groups
-        lost = [group for group, tied in zip(groups, located.solution.located, strict=True) if not tied]
-        if lost:
-            between = [group for group in lost if located.instants[0] < group.reference < located.instants[-1]]
-            across = f"; the motion is interpolated across {len(between)} of them" if between else ""
-            warnings.append(
-                f"level {result.level.number}: {len(lost)} of {len(groups)} exposures are not located "
-                f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
-            )
-        if ambiguity := located.ambiguity:
-            moving, fixed = ambiguity.pairs[0]
-            warnings.append(
-                f"level {result.level.number}: {len(ambiguity.pairs)} of {len(located.edges)} pairs fit the scene as well "
-                f"{ambiguity.alternative_px:.0f} px away, since it repeats ({groups[moving]} onto {groups[fixed]}"
-                f"{' and others' if len(ambiguity.pairs) > 1 else ''}); the slower motion was taken"
-            )
-        if located.solution.outliers:
-            dropped = [located.edges[index] for index in located.solution.outliers]
-            first = f"{groups[dropped[0].moving]} onto {groups[dropped[0].fixed]}"
-            warnings.append(
-                f"level {result.level.number}: {len(dropped)} of {len(located.edges)} pairs contradict the others and were "
-                f"dropped ({first}{' and others' if len(dropped) > 1 else ''})"
-            )
-    return warnings
-
-
-def motion_warnings(motion: FrameMotion) -> list[str]:
-    """Warn of frames whose motion is uncertain, and of frames that are left out."""
-    warnings = uncertain_frames(motion.std_px)
-    if not motion.located.all():
-        n_left_out, n_frames = int(np.sum(~motion.located)), len(motion.located)
-        warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
-    return warnings
-
-
-def uncertain_frames(std_px: FloatArray) -> list[str]:
-    """Warn of the frames whose expected error exceeds `UNCERTAIN_PX`.
-
-    Args:
-        std_px: (T,) expected corner error, infinite where nothing was located.
-    """
-    if not np.isfinite(std_px).any():
-        return ["only one exposure was located, so no motion is known: its frames are summed without motion compensation"]
-    uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
-    if not uncertain.any():
-        return []
-    worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
-    spans = sorted(worst_px, key=lambda span: -worst_px[span])
-    named = [f"{span} (up to {worst_px[span]:.1f} px)" for span in spans[:SHOWN_SPANS]]
-    more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
-    return [
-        f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "
-        f"{UNCERTAIN_PX:g} px in {', '.join(named)}{more}"
-    ]
-
-
-def peak_memory_bytes() -> int | None:
-    """Return the largest resident size of this process so far; None where the system does not report it."""
-    status = Path("/proc/self/status")
-    # On Linux, getrusage returns the size of the parent process if that was larger.
-    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="ascii", errors="replace"))):
-        return 1024 * int(found[1])
-    try:
-        import resource
-    except ImportError:
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _pair(groups: Sequence[Group], edge: Edge) -> PairRecord:

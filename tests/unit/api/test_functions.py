@@ -13,7 +13,7 @@ import typer
 import photonpano
 from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, info, parse_spec, simulate
 from photonpano.cli.app import app
-from photonpano.record.run_json import plugin_records
+from photonpano.record.environment import plugin_records
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ from photonpano import FrameSpan, PluginError, Refined
 from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, inverse, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.record.run_json import refinement_record, refinement_warnings
+from photonpano.record.run_json import refinement_record
+from photonpano.record.run_warnings import refinement_warnings
 from photonpano.residuals.refinement import Explained, Look, NamedRefiner, refine
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene

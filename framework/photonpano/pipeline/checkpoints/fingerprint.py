@@ -15,7 +15,7 @@ import photonpano
 from photonpano.captures.fingerprint import changes, fingerprint
 from photonpano.pipeline.components import scale_of
 from photonpano.protocols import Source
-from photonpano.record.run_json import library_versions
+from photonpano.record.environment import library_versions
 from photonpano.specs.plan import Choice, Plan
 
 Fingerprint = dict[str, Any]

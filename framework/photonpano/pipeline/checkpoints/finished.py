@@ -11,7 +11,8 @@ from photonpano.captures.fingerprint import changes
 from photonpano.errors import InputError
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint
 from photonpano.record.contents import changed_files
-from photonpano.record.run_json import library_versions, plugin_records, read_record, verdict_of
+from photonpano.record.environment import library_versions, plugin_records
+from photonpano.record.run_json import read_record, verdict_of
 from photonpano.record.schema import RunRecord
 from photonpano.residuals.verdict import Verdict
 from photonpano.specs.plan import Plan

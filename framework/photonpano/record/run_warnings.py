@@ -1,0 +1,86 @@
+"""Warn of what is weak in a run: exposures that were not located, outliers, frames whose motion is uncertain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.residuals.refinement import Refinement
+from photonpano.values import FloatArray, true_spans
+
+UNCERTAIN_PX = 0.5
+"""A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible."""
+SHOWN_SPANS = 4
+"""Spans of uncertain frames that a warning names, the worst first."""
+
+
+def level_warnings(results: Sequence[LevelResult]) -> list[str]:
+    """Warn of exposures that were not located, and of pairs that were dropped as outliers."""
+    warnings = []
+    for result in results:
+        located, groups = result.located, result.groups
+        lost = [group for group, tied in zip(groups, located.solution.located, strict=True) if not tied]
+        if lost:
+            between = [group for group in lost if located.instants[0] < group.reference < located.instants[-1]]
+            across = f"; the motion is interpolated across {len(between)} of them" if between else ""
+            warnings.append(
+                f"level {result.level.number}: {len(lost)} of {len(groups)} exposures are not located "
+                f"({lost[0]}{' and others' if len(lost) > 1 else ''}){across}"
+            )
+        if ambiguity := located.ambiguity:
+            moving, fixed = ambiguity.pairs[0]
+            warnings.append(
+                f"level {result.level.number}: {len(ambiguity.pairs)} of {len(located.edges)} pairs fit the scene as well "
+                f"{ambiguity.alternative_px:.0f} px away, since it repeats ({groups[moving]} onto {groups[fixed]}"
+                f"{' and others' if len(ambiguity.pairs) > 1 else ''}); the slower motion was taken"
+            )
+        if located.solution.outliers:
+            dropped = [located.edges[index] for index in located.solution.outliers]
+            first = f"{groups[dropped[0].moving]} onto {groups[dropped[0].fixed]}"
+            warnings.append(
+                f"level {result.level.number}: {len(dropped)} of {len(located.edges)} pairs contradict the others and were "
+                f"dropped ({first}{' and others' if len(dropped) > 1 else ''})"
+            )
+    return warnings
+
+
+def motion_warnings(motion: FrameMotion) -> list[str]:
+    """Warn of frames whose motion is uncertain, and of frames that are left out."""
+    warnings = uncertain_frames(motion.std_px)
+    if not motion.located.all():
+        n_left_out, n_frames = int(np.sum(~motion.located)), len(motion.located)
+        warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
+    return warnings
+
+
+def uncertain_frames(std_px: FloatArray) -> list[str]:
+    """Warn of the frames whose expected error exceeds `UNCERTAIN_PX`.
+
+    Args:
+        std_px: (T,) expected corner error, infinite where nothing was located.
+    """
+    if not np.isfinite(std_px).any():
+        return ["only one exposure was located, so no motion is known: its frames are summed without motion compensation"]
+    uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
+    if not uncertain.any():
+        return []
+    worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
+    spans = sorted(worst_px, key=lambda span: -worst_px[span])
+    named = [f"{span} (up to {worst_px[span]:.1f} px)" for span in spans[:SHOWN_SPANS]]
+    more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
+    return [
+        f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "
+        f"{UNCERTAIN_PX:g} px in {', '.join(named)}{more}"
+    ]
+
+
+def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
+    """Warn of refiners whose motion was not used."""
+    return [
+        f"the motion of the refiner {each.name!r} is not used, since it explains the photons worse: {each.kept_out}"
+        for each in refinements
+        if each.kept_out
+    ]
