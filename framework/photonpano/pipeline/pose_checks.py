@@ -79,7 +79,8 @@ def _array(name: str, value: object, shape: tuple[int, ...]) -> FloatArray:
 
 def _are_rigid(poses: FloatArray) -> BoolArray:
     """Return which poses (N, 3, 4) are finite and made of a rotation and a translation: (N,)."""
-    finite: BoolArray = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     rotations = np.where(finite[:, None, None], poses[:, :, :3], 0)
     off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2))
-    return finite & (off < _ORTHONORMAL) & (np.linalg.det(rotations) > 0)
+    rigid: BoolArray = finite & (off < _ORTHONORMAL) & (np.linalg.det(rotations) > 0)
+    return rigid
