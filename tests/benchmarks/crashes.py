@@ -3,11 +3,9 @@
     python tests/benchmarks/crashes.py kills --number 100 --seed 0
     python tests/benchmarks/crashes.py disks --number 20
     python tests/benchmarks/crashes.py races --number 50 --at-once 2
-    python tests/benchmarks/crashes.py cost --spec scan.yaml
 
-Every trial but the last works on a simulated capture of 48x64 px in a temporary folder. `disks` mounts file systems in memory,
-which takes the rights of root; without them, it limits the size of files only. `cost` runs a spec of your own, and prints what
-share of the run hashes, checkpoints, locks and the step of the run folder take. The exit code is 1 if a trial fails.
+Every trial works on a simulated capture of 48x64 px in a temporary folder. `disks` mounts file systems in memory, which takes
+the rights of root; without them, it limits the size of files only. The exit code is 1 if a trial fails.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ import importlib
 import json
 import multiprocessing
 import os
-import pkgutil
 import random
 import resource
 import shutil
@@ -25,14 +22,12 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 SPEC = """version: 1
 source: {{use: packed-npy, with: {{path: cube.npy, frame_rate_hz: 96800}}}}
@@ -171,7 +166,7 @@ def state(folder: Path) -> tuple[int | None, list[str]]:
     record = json.loads((directory / "run.json").read_text())
     missing = [name for name in record["files"] if not (directory / name).exists()]
     other = sorted({path.name for path in directory.iterdir()} - {*record["files"], "run.json"})
-    lacking = sorted(RESULTS - {"report.html", "run.json", "light.npz", *record["files"]})
+    lacking = sorted(RESULTS - {"report.html", "run.json", "light.npz", "vignette.npz", *record["files"]})
     return record["seed"], [*changed, *missing, *(f"more: {name}" for name in other), *(f"lacks {name}" for name in lacking)]
 
 
@@ -293,105 +288,13 @@ def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
     return wrong
 
 
-COSTS = {
-    "fingerprint of the capture": ("photonpano.pipeline.run.run_fingerprint",),
-    "lock, run folder and work folder": ("photonpano.pipeline.run_steps.run_folder", "photonpano.pipeline.run.work_folder"),
-    "checkpoints": (
-        "photonpano.pipeline.checkpoints.store.Store.save",
-        "photonpano.pipeline.checkpoints.store.Store.load",
-        "photonpano.pipeline.checkpoints.kept.Kept._name",
-    ),
-    "hashes of results": ("photonpano.pipeline.run_folder.contents_of",),
-    "flushes, and the step": (
-        "photonpano.pipeline.run_folder.replace_folder",
-        "photonpano.pipeline.run_folder.RunFolder.reopen",
-    ),
-}
-"""Functions whose time is the cost of safety."""
-
-
-_fsync = os.fsync
-
-
-class Stopwatch:
-    """Adds up the processor's time of functions, and their waits for the disk; of nested ones, the outermost counts.
-
-    Other programs on the machine change neither much.
-    """
-
-    def __init__(self) -> None:
-        self.seconds = Counter[str]()
-        self._running = threading.local()
-
-    @contextmanager
-    def running(self, what: str) -> Iterator[None]:
-        if getattr(self._running, "what", None):
-            yield
-            return
-        self._running.what, start = what, time.thread_time()
-        try:
-            yield
-        finally:
-            self._running.what = None
-            self.seconds[what] += time.thread_time() - start
-
-    def flush(self, descriptor: int) -> None:
-        """Wait for the disk."""
-        start = time.perf_counter()
-        _fsync(descriptor)
-        self.seconds["waits for the disk"] += time.perf_counter() - start
-
-    def timed(self, function: Callable[..., Any], what: str) -> Callable[..., Any]:
-        """Return a function, or one that returns a context, whose time is added up; that of the block is not."""
-
-        def call(*args: Any, **keys: Any) -> Any:
-            with self.running(what):
-                found = function(*args, **keys)
-            return self._entered(found, what) if isinstance(found, AbstractContextManager) else found
-
-        return call
-
-    @contextmanager
-    def _entered(self, context: AbstractContextManager[Any], what: str) -> Iterator[Any]:
-        with ExitStack() as stack:
-            with self.running(what):
-                found = stack.enter_context(context)
-            yield found
-            with self.running(what):
-                stack.close()
-
-
-def cost(folder: Path, number: int, seed: int, spec: Path) -> list[str]:
-    """Print what a run spends on hashes, checkpoints, locks and the step."""
-    del number, seed
-    from photonpano import load_spec, run
-
-    plan, watch = load_spec(spec, output=folder / "run", overrides=["run.threads=2"]), Stopwatch()
-    with ExitStack() as stack:
-        stack.enter_context(mock.patch("os.fsync", watch.flush))
-        for what, names in COSTS.items():
-            for name in names:
-                stack.enter_context(mock.patch(name, watch.timed(pkgutil.resolve_name(name), what)))
-        start, used = time.perf_counter(), time.process_time()
-        run(plan)
-        whole_s, used_s = time.perf_counter() - start, time.process_time() - used
-    least_s = used_s / 2
-    for what, seconds in watch.seconds.items():
-        print(f"{what}: {seconds:.2f} s, {seconds / least_s:.2%}")
-    share = watch.seconds.total() / least_s
-    print(f"together {watch.seconds.total():.2f} s, {share:.2%} of the {least_s:.1f} s that two cores need at least")
-    print(f"the run took {whole_s:.1f} s")
-    return [] if share < 0.03 else ["more than 3 %"]
-
-
 def main() -> int:
     """Run one trial."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trial", choices=["kills", "disks", "races", "cost"])
+    parser.add_argument("trial", choices=["kills", "disks", "races"])
     parser.add_argument("--number", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--at-once", type=int, default=2)
-    parser.add_argument("--spec", type=Path, help="of the run that `cost` measures")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -402,7 +305,7 @@ def main() -> int:
         simulation.start()  # in a process of its own: a forked process keeps the locks of threads that it has not got
         simulation.join()
         warm_up(folder)
-        more = {"races": {"at_once": options.at_once}, "cost": {"spec": options.spec}}.get(options.trial, {})
+        more = {"at_once": options.at_once} if options.trial == "races" else {}
         wrong: list[str] = globals()[options.trial](folder, options.number, options.seed, **more)
     print(*wrong, sep="\n")
     return bool(wrong)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,8 +24,9 @@ N = 240  # all of which align the planes
 def trust() -> ModuleType:
     spec = importlib.util.spec_from_file_location("trust_benchmark", SCRIPT)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # as dataclasses look it up
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPT.parent))  # as Python does for a script
+        spec.loader.exec_module(module)
     return module
 
 
