@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
 from photonpano import Config
+
+Tolerance: TypeAlias = Annotated[
+    float,
+    Field(gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"),
+]
 
 
 class GroupedConfig(Config):
@@ -56,9 +61,7 @@ class StratifiedConfig(MidpointConfig):
 class PhotonMleConfig(Config):
     """Keys of `photon-mle`."""
 
-    tolerance_px: float = Field(
-        1.0, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
-    )
+    tolerance_px: Tolerance = 1.0
     compensate: bool = Field(
         True,
         description="warp along the motion known so far; false averages frames as they are, the paper's baseline",
@@ -88,9 +91,7 @@ class RobustMergeConfig(Config):
     tolerated_px: float = Field(
         0.5, ge=0, le=8, description="error of the motion, in px of a frame, whose effect costs no weight either"
     )
-    tolerance_px: float = Field(
-        0.5, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
-    )
+    tolerance_px: Tolerance = 0.5
 
 
 class LocalFlowConfig(Config):
@@ -110,9 +111,7 @@ class LocalFlowConfig(Config):
     tolerated_px: float = Field(
         0.2, ge=0, le=8, description="error of the global motion, in px of a frame, that does not count as such a difference"
     )
-    tolerance_px: float = Field(
-        0.5, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
-    )
+    tolerance_px: Tolerance = 0.5
 
 
 class BurstConfig(Config):
@@ -122,9 +121,7 @@ class BurstConfig(Config):
         100, ge=1, le=100_000, description="frames of a block; each block is aligned with the one around the reference instant"
     )
     patch_px: Literal[16, 32] = Field(16, description="side of a patch that moves as a whole, in px of a frame")
-    tolerance_px: float = Field(
-        0.5, gt=0, le=8, description="motion within which frames are summed before they are warped, in px of a frame"
-    )
+    tolerance_px: Tolerance = 0.5
 
 
 class ShortSpansConfig(Config):

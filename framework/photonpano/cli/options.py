@@ -55,6 +55,9 @@ Corrections = Annotated[
         show_default=False,
     ),
 ]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Write beside other files, which stay, or replace a run of another capture.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
 

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from photonpano.cli.options import Overwrite
+
 
 def render(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", show_default=False)],
@@ -39,10 +41,7 @@ def render(
             show_default=False,
         ),
     ] = None,
-    overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", help="Write beside other files, which stay, or replace a run of another capture."),
-    ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render a finished run again, with other settings.
 

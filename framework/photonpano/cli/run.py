@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from photonpano.cli.options import Overrides, SpecPath
+from photonpano.cli.options import Overrides, Overwrite, SpecPath
 from photonpano.cli.verdict import Strict
 
 if TYPE_CHECKING:
@@ -21,10 +21,7 @@ def run(
         ),
     ] = None,
     overrides: Overrides = None,
-    overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", help="Write beside other files, which stay, or replace a run of another capture."),
-    ] = False,
+    overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run of this spec that was interrupted.")] = False,
     from_level: Annotated[
         int | None,

@@ -121,11 +121,10 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     """
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
-    threads = thread_count(plan.run.threads)
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
-    capture = cache(lambda: replace(summarise(source, threads), period_frames=period))
-    context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
+    capture = cache(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
+    context = _stage_context(plan, source, decisions, capture)
     made: list[tuple[Choice, Any]] = []
 
     def component(choice: Choice) -> Any:
@@ -162,9 +161,7 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
     """
     from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
 
-    context = StageContext(
-        source.info, source.response, plan.run.seed, thread_count(plan.run.threads), decide=_recorder(decisions)
-    )
+    context = _stage_context(plan, source, decisions)
     return tuple(NamedRefiner(choice.contribution.name, _built(choice, context), choice.label) for choice in plan.refine)
 
 
@@ -179,9 +176,7 @@ def build_renderer(plan: Plan, source: Source, decisions: list[Decision]) -> Att
     from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
 
     choice, contribution = plan.renderer, plan.renderer.contribution
-    context = StageContext(
-        source.info, source.response, plan.run.seed, thread_count(plan.run.threads), decide=_recorder(decisions)
-    )
+    context = _stage_context(plan, source, decisions)
     assert isinstance(contribution, RendererContribution)
     if light_of(source) is not None and not contribution.divides_by_light:
         logger.warning(
@@ -202,8 +197,7 @@ def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tu
     """
     from photonpano.pipeline.exports import AttributedExporter  # imports tifffile, which is not needed to check a spec
 
-    threads = thread_count(plan.run.threads)
-    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_recorder(decisions))
+    context = _stage_context(plan, source, decisions)
     exporters = []
     for choice in plan.formats:
         assert isinstance(choice.contribution, ExporterContribution)
@@ -222,10 +216,8 @@ def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) 
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     assert plan.pose is not None
-    threads = thread_count(plan.run.threads)
-    capture = cache(lambda: summarise(source, threads))
-    context = StageContext(source.info, source.response, plan.run.seed, threads, capture, _recorder(decisions))
-    estimator: PoseEstimator = _built(plan.pose, context)
+    capture = cache(lambda: summarise(source, thread_count(plan.run.threads)))
+    estimator: PoseEstimator = _built(plan.pose, _stage_context(plan, source, decisions, capture))
     return estimator
 
 
@@ -269,12 +261,26 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     """
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
-    threads = thread_count(plan.run.threads)
-    context = StageContext(source.info, source.response, plan.run.seed, threads, lambda: capture, _recorder(decisions))
-    resampler: Resampler = _built(choice, context)
+    resampler: Resampler = _built(choice, _stage_context(plan, source, decisions, lambda: capture))
     with attributing(choice.label, "level 1"):
         require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
     return decisions
+
+
+def _stage_context(
+    plan: Plan, source: Source, decisions: list[Decision], capture: Callable[[], CaptureSummary] | None = None
+) -> StageContext:
+    """Return the run for which components are built.
+
+    Args:
+        plan: has seed and threads.
+        source: the capture.
+        decisions: receives the decisions that components take.
+        capture: returns the flux and the speed of the capture; None for components that cannot ask for them.
+    """
+    threads = thread_count(plan.run.threads)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_recorder(decisions))
+    return context if capture is None else replace(context, capture=capture)
 
 
 def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], None]:
