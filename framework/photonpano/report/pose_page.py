@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from photonpano.record.pose_record import DOUBTFUL
 from photonpano.record.schema import RunRecord
-from photonpano.report import pose_figures
 from photonpano.report.page import environment_of, head_of
+from photonpano.report.pose_figures import errors_over_time
+from photonpano.report.pose_views import path_views, scene_views
 from photonpano.values import PoseEstimate
 
 
@@ -16,6 +17,7 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
         record: the content of `run.json`.
         estimate: the poses, in a world in which the path has the length 1.
     """
+    shape = record["source"]["height"], record["source"]["width"]
     page: str = (
         environment_of()
         .get_template("poses.html")
@@ -23,9 +25,9 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
             head_of(record),
             poses=record["poses"],
             warnings=[each for each in record["warnings"] if not each.startswith(DOUBTFUL)],
-            path=pose_figures.path(estimate),
-            path_and_points=pose_figures.path_and_points(estimate),
-            errors_over_time=pose_figures.errors_over_time(estimate, record["source"]["frame_rate_hz"]),
+            path_views=path_views(estimate, shape),
+            scene_views=scene_views(estimate, shape) if len(estimate.points.positions) else (),
+            errors_over_time=errors_over_time(estimate, record["source"]["frame_rate_hz"]),
         )
     )
     return page
