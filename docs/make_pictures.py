@@ -16,15 +16,14 @@ import av
 import cv2
 import numpy as np
 import tifffile
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from interpolation_picture import interpolation
 from matplotlib.figure import Figure
+from picture_parts import GAP, beside, drawn, labelled, picture, stacked
 
 from photonpano import (
     FrameSpan,
     Group,
     StageContext,
-    StreamInfo,
-    discover,
     evaluate,
     load_spec,
     open_source,
@@ -37,20 +36,9 @@ from photonpano.context import Context
 from photonpano.evaluation.images import true_panorama
 from photonpano.evaluation.inputs import load_run_trajectory, load_truth
 from photonpano.evaluation.trajectory import corner_errors
-from photonpano.geometry import (
-    Canvas,
-    FrameTrajectory,
-    corner_displacements,
-    corners,
-    from_parameters,
-    inverse,
-    jacobian,
-    normalised,
-    parameters,
-    translation,
-)
+from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.merging.panorama import plan_canvas, render
-from photonpano.photometry import BinaryResponse, Tone, picture_of, tone_mapped
+from photonpano.photometry import BinaryResponse, Tone, picture_of
 from photonpano.report.residual_figures import spectrum_over_noise
 from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
@@ -59,19 +47,12 @@ from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.travel.truth import depth, sharp_view, truth_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from matplotlib.axes import Axes
-    from numpy.typing import NDArray
+    from picture_parts import Picture
 
     from photonpano import Plan
 
-    Picture = NDArray[np.uint8]
-
 IMAGES = Path(__file__).parent / "images"
 EXAMPLES = Path(__file__).parents[1] / "examples" / "pipelines"
-GAP, LABEL = 8, 26
-"""Pixels between pictures, and above a picture for its label."""
 
 STREET = {
     "version": 1,
@@ -146,18 +127,9 @@ WAYS = ("scan", "constant groups", "naive average")
 """Specs of examples/pipelines, for the capture beside them."""
 PLACE = (235, 85)
 """Centre of the compared place, in pixels of the reference frame, which is the same for all specs."""
-INTERPOLATORS = {
-    "geodesic": ("tab:green", "-"),
-    "lucas-kanade": ("black", "-"),
-    "lie": ("tab:orange", "--"),
-    "smoothing-spline": ("tab:blue", "-"),
-}
-"""Interpolators, with the colour and style of their lines."""
 NIGHT_FLUX = 12.0
 """Flux of the brightest lamp in the night scene, photons per pixel per frame."""
 NIGHT_FRAMES = 100_000
-SPACINGS = (125, 31)
-"""Frames between knots at the first and at the third level of `street_spec`."""
 
 
 def main() -> None:
@@ -229,12 +201,16 @@ def filmed(plan: Plan, path: Path) -> Path:
     return path
 
 
+def done(plan: Plan) -> Path:
+    """Run a plan, unless it was run, and return its run folder."""
+    if not (plan.output.directory / "run.json").exists():
+        run(plan)
+    return plan.output.directory
+
+
 def finish(plan: Plan, name: str, cube: Path) -> None:
     """Run a plan, and print its scores."""
-    directory = plan.output.directory
-    if not (directory / "run.json").exists():
-        run(plan)
-    scores = evaluate(directory, truth_path(cube))
+    scores = evaluate(done(plan), truth_path(cube))
     assert scores.panorama is not None
     print(
         f"{name:16} corner error mean {scores.trajectory.mean_px:.2f} px, worst {scores.trajectory.max_px:.2f} px, "
@@ -242,13 +218,15 @@ def finish(plan: Plan, name: str, cube: Path) -> None:
     )
 
 
+def spec_of(cube: Path, **sections: Any) -> dict[str, Any]:
+    """Return the spec of a capture of single photons."""
+    source = {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96_800}}
+    return {"version": 1, "source": source, **sections}
+
+
 def street_spec(cube: Path) -> dict[str, Any]:
     """Return the spec of the street."""
-    return {
-        "version": 1,
-        "source": {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96_800}},
-        "resample": {"use": "midpoint", "with": {"group_size": GROUP_SIZE}},
-    }
+    return spec_of(cube, resample={"use": "midpoint", "with": {"group_size": GROUP_SIZE}})
 
 
 def readme(folder: Path, cube: Path) -> Picture:
@@ -328,12 +306,9 @@ def hot_pixels(folder: Path) -> Picture:
     """Return a place of two panoramas of a sensor with hot pixels, magnified three times: uncorrected and corrected."""
     pictures = []
     for name, corrections in {"hot pixels": "[]", "hot pixels masked": "[hot-pixels]"}.items():
-        directory = in_folder(folder, name)
         overrides = [f"corrections={corrections}", "source.with.sensor.hot_rate=[0.5, 2]"]
-        plan = load_spec(EXAMPLES / "hot-pixels.yaml", overrides=overrides, output=directory)
-        if not (directory / "run.json").exists():
-            run(plan)
-        flux = tifffile.imread(directory / "panorama.tiff")
+        plan = load_spec(EXAMPLES / "hot-pixels.yaml", overrides=overrides, output=in_folder(folder, name))
+        flux = tifffile.imread(done(plan) / "panorama.tiff")
         y, x = flux.shape[0] // 2, flux.shape[1] // 2
         crop = picture(flux[y - 54 : y + 54, x - 72 : x + 72], 0.67)
         large = cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
@@ -341,36 +316,9 @@ def hot_pixels(folder: Path) -> Picture:
     return beside(pictures)
 
 
-def interpolation(cube: Path) -> Picture:
-    """Return a plot of the errors between knots on the true motion of a capture, and print their means."""
-    with np.load(truth_path(cube)) as file:
-        truth, shape = file["homographies"], tuple(file["frame_shape"])
-    truth = normalised(inverse(truth[len(truth) // 2]) @ truth)
-    rolling = normalised(truth @ turned(np.linspace(0, 16 * np.pi, len(truth)), shape))
-    cases = {
-        f"{what}, {spacing} frames apart": (motion, spacing, error_px)
-        for what, motion, error_px in (("exact", truth, 0.0), ("off by 0.1 px", truth, 0.1), ("exact, rolled", rolling, 0.0))
-        for spacing in SPACINGS
-    }
-    figure = Figure(figsize=(10, 5.2), dpi=100, layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, sharey=True).T.ravel()
-    for place, (label, case) in enumerate(cases.items()):
-        errors = {name: between_knots(name, *case, shape) for name in INTERPOLATORS}
-        print(f"{label:32}", *(f"{name} {error.mean():.4f} px, worst {error.max():.3f} px;" for name, error in errors.items()))
-        if place < len(panels):
-            draw_errors(panels[place], f"knots {label}", case[1], errors)
-    panels[0].legend(fontsize=8, ncols=2, loc="lower right")
-    figure.supxlabel("frame", fontsize=9)
-    figure.supylabel("corner error, px", fontsize=9)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., 2::-1]
-
-
 def tremor_spec(cube: Path) -> dict[str, Any]:
     """Return a spec whose groups are longer than the periods of the tremor."""
-    source = {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96800}}
-    return {"version": 1, "source": source, "resample": {"with": {"group_size": 180}}}
+    return spec_of(cube, resample={"with": {"group_size": 180}})
 
 
 def tremor(folder: Path, cube: Path) -> Picture:
@@ -383,7 +331,7 @@ def tremor(folder: Path, cube: Path) -> Picture:
             trajectory = motion(in_folder(folder, f"tremor {name}"))
             canvas = plan_canvas(trajectory, span, shape, 1.0, 2**30)
             panorama = render(source, trajectory, span, canvas, 0.25, Context())
-            residuals = measure(span, Predictions.of(source, panorama, trajectory, shape), Context())
+            residuals = measure(span, Predictions.of(source, panorama, canvas, trajectory, shape), Context())
             frequencies, power = spectrum_over_noise(residuals)
             panel.semilogy(96_800 * frequencies, power, color=colour, linewidth=1.2, label=f"{name} the refiner short-spans")
     panel.axhline(1, color="0.5", linewidth=0.8, linestyle="--")
@@ -392,9 +340,7 @@ def tremor(folder: Path, cube: Path) -> Picture:
     panel.set_ylabel("power / noise", fontsize=9)
     panel.tick_params(labelsize=8)
     panel.legend(fontsize=8)
-    drawn = FigureCanvasAgg(figure)
-    drawn.draw()
-    return np.asarray(drawn.buffer_rgba())[..., 2::-1]
+    return drawn(figure)[..., 2::-1]
 
 
 def video_pictures(run_folder: Path, folder: Path) -> Picture:
@@ -415,8 +361,7 @@ def video_pictures(run_folder: Path, folder: Path) -> Picture:
 
 def fine_spec(cube: Path, renderer: str, scale: float = 2.0) -> dict[str, Any]:
     """Return the spec of the capture whose scene is finer than the sensor."""
-    source = {"use": "packed-npy", "with": {"path": str(cube.absolute()), "frame_rate_hz": 96_800}}
-    return {"version": 1, "source": source, "render": {"use": renderer, "scale": scale}}
+    return spec_of(cube, render={"use": renderer, "scale": scale})
 
 
 def super_resolution(folder: Path, cube: Path) -> Picture:
@@ -441,45 +386,6 @@ def super_resolution(folder: Path, cube: Path) -> Picture:
     names = {"scale 1, interpolated": bicubic, "merge": merged, "super-resolution": flux, "true scene": scene}
     shown = {name: np.repeat(np.repeat(picture(image[part], white), 2, 0), 2, 1) for name, image in names.items()}
     return beside([labelled(image, name) for name, image in shown.items()])
-
-
-def between_knots(
-    name: str, motion: NDArray[np.float64], spacing: int, error_px: float, shape: tuple[int, int]
-) -> NDArray[np.float64]:
-    """Return the mean corner error of each frame; the corners of knots have normal errors of `error_px` per coordinate."""
-    instants = np.arange(spacing // 2, len(motion), spacing)
-    noise = np.random.default_rng(0).normal(0, error_px, (len(instants), 8))
-    to_corners = np.array([jacobian(knot, corners(shape)).reshape(8, 8) for knot in motion[instants]])
-    knots = from_parameters(parameters(motion[instants]) + np.linalg.solve(to_corners, noise[..., None])[..., 0])
-    contribution = discover().find("interpolator", name).contribution
-    context = StageContext(StreamInfo(len(motion), *shape, None), BinaryResponse())
-    trajectory = contribution.build(contribution.config(), context).fit(instants.astype(float), knots, None)
-    frames = np.arange(instants[0], instants[-1] + 1)
-    return corner_displacements(trajectory.at(frames), motion[frames], shape).mean(axis=1)
-
-
-def draw_errors(panel: Axes, title: str, spacing: int, errors: dict[str, NDArray[np.float64]]) -> None:
-    """Draw the errors of 1,000 frames, and the positions of knots."""
-    start = len(errors["lie"]) // 2
-    frames = np.arange(start, start + 1000)
-    for knot in frames[frames % spacing == 0]:
-        panel.axvline(knot + spacing // 2, color="0.9", linewidth=0.8)
-    for name, (colour, style) in INTERPOLATORS.items():
-        panel.semilogy(frames + spacing // 2, errors[name][frames], style, color=colour, linewidth=1.2, label=name)
-    panel.set_title(title, fontsize=9)
-    panel.set_ylim(1e-4, 5)
-    panel.tick_params(labelsize=8)
-
-
-def turned(angles: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the maps that rotate a frame about its centre."""
-    height, width = shape
-    centred = translation((width - 1) / 2, (height - 1) / 2)
-    turns = np.tile(np.eye(3), (len(angles), 1, 1))
-    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
-    turns[:, 1, 0] = np.sin(angles)
-    turns[:, 0, 1] = -turns[:, 1, 0]
-    return centred @ turns @ inverse(centred)
 
 
 def motion(directory: Path) -> FrameTrajectory:
@@ -528,32 +434,6 @@ def depths() -> Picture:
             )
         )
     return stacked(rows)
-
-
-def picture(flux: NDArray[np.float32], white: float) -> Picture:
-    """Return flux as 8-bit sRGB; unknown pixels are white, as is the page."""
-    return np.where(np.isfinite(flux), tone_mapped(flux, white), np.uint8(255))
-
-
-def labelled(image: Picture, label: str) -> Picture:
-    """Write a line above a picture."""
-    strip = Figure(figsize=(image.shape[1] / 100, LABEL / 100), dpi=100)
-    strip.text(2 / image.shape[1], 0.35, label, fontsize=10, color="0.25")
-    canvas = FigureCanvasAgg(strip)
-    canvas.draw()
-    grey = np.asarray(canvas.buffer_rgba())[..., 0]
-    return np.vstack([grey[:LABEL, : image.shape[1]], image])
-
-
-def beside(pictures: Sequence[Picture]) -> Picture:
-    """Put pictures of one height side by side."""
-    gap = np.full((pictures[0].shape[0], GAP), 255, np.uint8)
-    return np.hstack([part for each in pictures for part in (each, gap)][:-1])
-
-
-def stacked(pictures: Sequence[Picture]) -> Picture:
-    """Put pictures of one width below each other."""
-    return np.vstack(pictures)
 
 
 def save(name: str, image: Picture) -> None:
