@@ -19,6 +19,7 @@ import tifffile
 from interpolation_picture import interpolation
 from matplotlib.figure import Figure
 from picture_parts import GAP, beside, drawn, labelled, picture, stacked
+from room_picture import room
 
 from photonpano import (
     FrameSpan,
@@ -164,6 +165,7 @@ def main() -> None:
 
     save("night.png", night())
     save("depth.png", depths())
+    save("room.png", room(in_folder(folder, "room")))
 
     fine = written(parse_spec(FINE), folder / "fine.npy")
     finish(parse_spec(fine_spec(fine, "super-resolution"), output=in_folder(folder, "fine")), "super-resolution", fine)
