@@ -18,7 +18,6 @@ from photonpano import (
     Group,
     InputError,
     LensedSource,
-    LinearlyCorrectedSource,
     LitSource,
     Response,
     Source,
@@ -27,9 +26,10 @@ from photonpano import (
 )
 from photonpano.merging import PhotonSum, divided
 from photonpano_core.configs import BurstConfig
+from photonpano_core.dense_motion.frames import WeightedFrames
 from photonpano_core.dense_motion.patches import Image, PatchGrid, add_patches, search
 from photonpano_core.dense_motion.rescaled import rescaled
-from photonpano_core.dense_motion.sub_exposures import smoothed, worth_of
+from photonpano_core.dense_motion.sub_exposures import smoothed
 from photonpano_core.photon_mle import exposure_of
 
 _DETAIL_PX = 1.0
@@ -77,7 +77,8 @@ class _Burst:
 
     def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
         self._source, self._group, self._config = source, group, config
-        self._worth = worth_of(source) if worth_of(source).size else np.ones(source.info.frame_shape, np.float32)
+        self._counts = WeightedFrames(source)
+        self._worth = self._counts.worth if self._counts.worth.size else np.ones(source.info.frame_shape, np.float32)
         start = group.span.start
         parts = divided(len(group.span), max(1, round(len(group.span) / config.block_frames)))
         self._spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
@@ -102,19 +103,12 @@ class _Burst:
 
     def _image(self, span: FrameSpan) -> tuple[Image, float]:
         """Return a block as it lies, on the scale of uniform noise, and its variance there."""
-        counts = self._counts(span)
-        photons = PhotonSum(counts * self._worth, self._worth * np.float32(len(span)))
+        photons = PhotonSum(self._counts(span), self._worth * np.float32(len(span)))
         image = smoothed(photons, self._source.response, _DETAIL_PX, 1.0, 0.0)
         seen = image.frames > 0
         values = np.where(seen, image.values, image.values[seen].mean() if seen.any() else 0).astype(np.float32)
         frames = float(np.median(image.frames[seen])) if seen.any() else 1.0
         return values, float(self._source.response.stabilised_std(frames)) ** 2
-
-    def _counts(self, span: FrameSpan) -> Image:
-        counts = self._source.counts(span)
-        if isinstance(self._source, LinearlyCorrectedSource):
-            return np.asarray(self._source.corrected(counts, len(span)), np.float32)
-        return counts.astype(np.float32)
 
     def merged(self, motion: FloatArray) -> PhotonSum:
         """Merge the blocks along the motion of their patches."""
@@ -129,8 +123,9 @@ class _Burst:
             for part in divided(len(span), max(1, math.ceil(way_px / self._config.tolerance_px))):
                 chunk = FrameSpan(span.start + part.start, span.start + part.stop)
                 shifts = at_instant(middles, motion, chunk.centre) - there
-                lit = self._counts(chunk) * self._worth
-                add_patches(lit, self._worth, float(len(chunk)), shifts, self._grid.step, counts[place], weight[place])
+                add_patches(
+                    self._counts(chunk), self._worth, float(len(chunk)), shifts, self._grid.step, counts[place], weight[place]
+                )
         mean = wiener_mean(counts, weight, self._reference, self._source.response)
         frames = weight.sum(axis=0)
         return PhotonSum(self._grid.joined(mean * frames), self._grid.joined(frames))

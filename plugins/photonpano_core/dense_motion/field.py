@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano import BoolArray
+
 Image = NDArray[np.float32]
 
 _STEPS = 8
@@ -17,7 +19,7 @@ _STEPS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionField:
-    """Motion of each pixel of an exposure beyond the global motion, as a polynomial of time that is 0 at the reference instant.
+    """Motion of each pixel of a grid beyond the global motion, as a polynomial of time that is 0 at the reference instant.
 
     Convention:
         What lies at the pixel p at the reference instant lies at `p + at(elapsed)` a time later, if both are seen along the
@@ -25,7 +27,7 @@ class MotionField:
         after the reference instant.
 
     Attributes:
-        coefficients: (D, 2, H, W) float32, in px of the exposure: the displacement is `sum_d coefficients[d] elapsed^(d + 1)`.
+        coefficients: (D, H, W, 2) float32, in px of the grid: the displacement is `sum_d coefficients[d] elapsed^(d + 1)`.
     """
 
     coefficients: Image
@@ -33,24 +35,30 @@ class MotionField:
     @classmethod
     def zero(cls, shape: tuple[int, int]) -> MotionField:
         """Return a field without motion."""
-        return cls(np.zeros((1, 2, *shape), np.float32))
+        return cls(np.zeros((1, *shape, 2), np.float32))
 
     def at(self, elapsed: float) -> Image:
-        """Return the displacement at a time: (2, H, W), x and y in px of the exposure."""
-        powers = np.float32(elapsed) ** np.arange(1, len(self.coefficients) + 1, dtype=np.float32)
-        return np.asarray(np.tensordot(powers, self.coefficients, axes=1), np.float32)
+        """Return the displacement at a time: (H, W, 2), x and y in px of the grid."""
+        time = np.float32(elapsed)
+        displacement: Image = time * self.coefficients[-1]
+        for each in self.coefficients[-2::-1]:
+            displacement += each
+            displacement *= time
+        return displacement
 
     @property
     def way_px(self) -> Image:
-        """How far each pixel moves in a unit of time, on average over two: (H, W), in px of the exposure."""
+        """How far each pixel moves in a unit of time, on average over two: (H, W), in px of the grid."""
         places = [self.at(elapsed) for elapsed in np.linspace(-1, 1, _STEPS + 1)]
-        return np.asarray(sum(np.hypot(*(after - before)) for before, after in pairwise(places)) / 2, np.float32)
+        ways = (after - before for before, after in pairwise(places))
+        return np.asarray(sum(np.sqrt(way[..., 0] ** 2 + way[..., 1] ** 2) for way in ways) / 2, np.float32)
 
-    def filled(self, known: NDArray[np.bool_]) -> MotionField:
+    def filled(self, known: BoolArray) -> MotionField:
         """Return the field in which each pixel moves as the nearest one that is known, (H, W)."""
         _, labels = cv2.distanceTransformWithLabels(
             (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
         )
         places = np.zeros(int(labels.max()) + 1, np.int64)
         places[labels[known]] = np.flatnonzero(known)
-        return MotionField(self.coefficients.reshape(-1, known.size)[:, places[labels]].reshape(self.coefficients.shape))
+        degree = len(self.coefficients)
+        return MotionField(self.coefficients.reshape(degree, -1, 2)[:, places[labels]].reshape(self.coefficients.shape))

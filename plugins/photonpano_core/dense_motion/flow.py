@@ -10,21 +10,24 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
-from photonpano_core.dense_motion.field import MotionField
-from photonpano_core.dense_motion.sub_exposures import Image, Smoothed, SubExposures, blurred
+from photonpano_core.dense_motion.field import Image, MotionField
+from photonpano_core.dense_motion.polynomials import fit_each
+from photonpano_core.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures, blurred
 
-_ROUNDS = 3, 5, 9
-"""Sub-exposures of each round; each later one has one more between every two, as levels of the loop do."""
-_DEGREE = 4
-"""Highest degree of the motion in time: parallax of a camera in the hand turns back within a group."""
+_ROUNDS = 3, 9, 17
+"""Sub-exposures of each round. Parallax of a camera in the hand changes its speed too often for fewer in the last."""
+_DEGREE = 8
+"""Highest degree of the motion in time."""
 _DETAIL_PX = 1.2
 """Blur of sub-exposures before they are compared, in px of a frame."""
 _AGREEMENT_PX = 2.0
 """Window over which displaced sub-exposures are compared, in px of a frame."""
-_SMOOTHING_PX = 3.0
+_SMOOTHING_PX = 5.0
 """Window over which the motion is fitted, in px of a frame."""
-_TOLERANCE_PX = 2.0
-"""Motion within which frames are summed before they are warped, in px of a frame, while the field is estimated."""
+_FINEST = {17: 0}
+"""Level of the pyramid at which optical flow of a round ends: 0 is the grid itself; 1, half of it, by default."""
+_PATCH_STEP_PX, _DESCENT_STEPS = 4, 12
+"""Distance of the patches of optical flow, and steps of each: as exact as more of them, in half the time."""
 _PRIOR = 1e-4
 """Weight of no motion, relative to that of a sub-exposure at an end of the group."""
 _CLIPPED = 0.2, 99.8
@@ -34,7 +37,7 @@ _CLIPPED = 0.2, 99.8
 def estimate_field(parts: SubExposures, moving: BoolArray) -> MotionField:
     """Estimate how pixels move beyond the global motion.
 
-    In each round, sub-exposures are merged along the field so far, and joined to 3, then 5, then 9 longer ones. The flow from
+    In each round, sub-exposures are merged along the field so far, and joined to 3, then 9, then 17 longer ones. The flow from
     the reference to each of these is added to the field, which is fitted by polynomials of time. So each round has less motion
     that is still unknown, and less of it within a sub-exposure.
 
@@ -47,12 +50,12 @@ def estimate_field(parts: SubExposures, moving: BoolArray) -> MotionField:
         if n > len(parts.spans):
             break
         if n > _ROUNDS[0]:
-            sums = parts.along(field, moving, _TOLERANCE_PX)
+            sums = parts.along(field, moving)
         field = _refined(parts, sums, field, n, moving)
     return field
 
 
-def _refined(parts: SubExposures, sums: list[PhotonSum], field: MotionField, n: int, moving: BoolArray) -> MotionField:
+def _refined(parts: SubExposures, sums: Sequence[PhotonSum], field: MotionField, n: int, moving: BoolArray) -> MotionField:
     """Return the field after a round.
 
     Args:
@@ -69,13 +72,11 @@ def _refined(parts: SubExposures, sums: list[PhotonSum], field: MotionField, n: 
     times, flows, trusts = [], [], []
     for place, elapsed in enumerate(joined.times):
         if place != fixed:
-            flow = _dense_flow(shades[fixed], shades[place])
+            flow = _dense_flow(shades[fixed], shades[place], _FINEST.get(n, 1))
             times.append(elapsed)
             flows.append(flow + _displaced(field.at(elapsed), flow))
             trusts.append(_agreement(images[fixed], images[place], flow, parts))
-    degree = min(_DEGREE, n // 2)
-    coefficients = _fitted(times, flows, trusts, degree, _SMOOTHING_PX * parts.scale)
-    return MotionField(np.where(moving, coefficients, np.float32(0)))
+    return MotionField(_fitted(times, flows, trusts, min(_DEGREE, n // 2), moving))
 
 
 def _in_8_bits(images: Sequence[Image]) -> list[NDArray[np.uint8]]:
@@ -84,45 +85,45 @@ def _in_8_bits(images: Sequence[Image]) -> list[NDArray[np.uint8]]:
     return [np.clip((each - low) * (255 / max(high - low, 1e-6)), 0, 255).astype(np.uint8) for each in images]
 
 
-def _dense_flow(fixed: NDArray[np.uint8], moving: NDArray[np.uint8]) -> Image:
-    """Return where pixels of `fixed` lie in `moving`, as a displacement: (2, H, W), x and y."""
+def _dense_flow(fixed: NDArray[np.uint8], moving: NDArray[np.uint8], finest: int) -> Image:
+    """Return where pixels of `fixed` lie in `moving`, as a displacement: (H, W, 2), x and y."""
     # Filled, since a flow that is given is where the search starts.
     start = np.zeros((*fixed.shape, 2), np.float32)
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.ascontiguousarray(np.moveaxis(search.calc(fixed, moving, start), -1, 0), np.float32)
+    search.setFinestScale(finest)
+    search.setPatchStride(_PATCH_STEP_PX)
+    search.setGradientDescentIterations(_DESCENT_STEPS)
+    search.setVariationalRefinementIterations(0)
+    return np.asarray(search.calc(fixed, moving, start), np.float32)
 
 
 def _displaced(image: Image, flow: Image) -> Image:
-    """Return an image, (H, W) or (2, H, W), at displaced pixels."""
-    if image.ndim == 3:
-        return np.array([_displaced(each, flow) for each in image])
-    rows, columns = np.indices(image.shape, np.float32)
-    return np.asarray(
-        cv2.remap(image, columns + flow[0], rows + flow[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
-    )
+    """Return an image, (H, W) or (H, W, 2), at displaced pixels."""
+    rows, columns = np.indices(image.shape[:2], np.float32)
+    displaced = cv2.remap(image, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(displaced, np.float32)
 
 
 def _agreement(fixed: Smoothed, moving: Smoothed, flow: Image, parts: SubExposures) -> Image:
     """Return how well a displaced sub-exposure agrees with the reference: (H, W), 1 up to photon noise, 0 where unseen."""
     there = Smoothed(_displaced(moving.values, flow), _displaced(moving.frames, flow))
-    error = blurred(there.squared_difference(fixed, parts.response), _AGREEMENT_PX * parts.scale)
+    error = blurred(there.squared_difference(fixed, parts.response), _AGREEMENT_PX * SCALE)
     seen = (there.frames > 0) & (fixed.frames > 0)
     return np.where(seen, 1 / np.maximum(error, 1) ** 2, 0).astype(np.float32)
 
 
-def _fitted(times: list[float], flows: list[Image], trusts: list[Image], degree: int, blur_px: float) -> Image:
-    """Fit polynomials of time by weighted least squares, over windows: (degree, 2, H, W)."""
-    shape = trusts[0].shape
-    squares = {power: np.zeros(shape, np.float32) for power in range(2, 2 * degree + 1)}
-    right = np.zeros((degree, 2, *shape), np.float32)
+def _fitted(times: list[float], flows: list[Image], trusts: list[Image], degree: int, moving: BoolArray) -> Image:
+    """Fit polynomials of time by weighted least squares, over windows, to some pixels: (degree, H, W, 2)."""
+    moments = np.zeros((2 * degree - 1, *moving.shape), np.float32)
+    right = np.zeros((degree, *moving.shape, 2), np.float32)
     for time, flow, trust in zip(times, flows, trusts, strict=True):
-        for power, total in squares.items():
-            total += np.float32(time**power) * trust
+        for d in range(len(moments)):
+            moments[d] += np.float32(time ** (d + 2)) * trust
+        trusted = trust[..., None] * flow
         for d in range(degree):
-            right[d] += np.float32(time ** (d + 1)) * trust * flow
-    squares = {power: blurred(total, blur_px) for power, total in squares.items()}
-    right = np.array([[blurred(each, blur_px) for each in both] for both in right])
-    rows = [np.stack([squares[i + j + 2] for j in range(degree)], axis=-1) for i in range(degree)]
-    system = np.stack(rows, axis=-2) + np.float32(_PRIOR) * np.eye(degree, dtype=np.float32)
-    found = np.linalg.solve(system, np.moveaxis(right, (0, 1), (-2, -1)))
-    return np.asarray(np.moveaxis(found, (-2, -1), (0, 1)), np.float32)
+            right[d] += np.float32(time ** (d + 1)) * trusted
+    for each in (*moments, *right):
+        each[...] = blurred(each, _SMOOTHING_PX * SCALE)
+    coefficients = np.zeros_like(right)
+    fit_each(moments, right, _PRIOR, moving, coefficients)
+    return coefficients

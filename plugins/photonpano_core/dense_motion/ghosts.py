@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from photonpano import BoolArray
-from photonpano_core.dense_motion.sub_exposures import Image, SubExposures, blurred
+from photonpano_core.dense_motion.field import Image
+from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred
 
 _DETAIL_PX = 1.2
 """Blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame."""
@@ -50,25 +51,25 @@ def compared(parts: SubExposures, n: int, threshold: float, tolerated_px: float)
         threshold: significance from which on a pixel moves.
         tolerated_px: error of the global motion whose effect is not significant, in px of a frame.
     """
-    scale, response = parts.scale, parts.response
+    response = parts.response
     images = [parts.smoothed(each, _DETAIL_PX) for each in parts.joined(parts.sums, n).sums]
     seen = np.maximum(sum(each.frames for each in images), np.float32(1))
     mean = np.asarray(sum(each.frames * each.values for each in images) / seen, np.float32)
-    tolerated = (np.float32(tolerated_px * scale) * np.hypot(*np.gradient(mean))) ** 2
+    tolerated = (np.float32(tolerated_px * SCALE) * np.hypot(*np.gradient(mean))) ** 2
     energy, freedom = np.zeros_like(mean), np.full_like(mean, -1)
     for each in images:
         variance = response.stabilised_std(np.maximum(each.frames, 1)) ** 2
         energy += np.where(each.frames > 0, ((each.values - mean) ** 2 - tolerated) / variance, np.float32(0))
         freedom += each.frames > 0
-    freedom = np.maximum(blurred(np.maximum(freedom, 0), _WINDOW_PX * scale), np.float32(1e-6))
-    ratio = np.maximum(blurred(energy, _WINDOW_PX * scale) / freedom, 0)
+    freedom = np.maximum(blurred(np.maximum(freedom, 0), _WINDOW_PX * SCALE), np.float32(1e-6))
+    ratio = np.maximum(blurred(energy, _WINDOW_PX * SCALE) / freedom, 0)
     # Squares of neighbouring pixels are correlated, since their blurs overlap.
-    detail = _DETAIL_PX**2 + parts.blur_px2
+    detail = _DETAIL_PX**2 + parts.noise_px2
     correlated = detail / (2 * _WINDOW_PX**2 + detail)
     spread = np.float32(2 / 9 * correlated) / freedom
     significance = np.maximum((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread), 0)
     significance = np.where(freedom > _FEWEST, significance, np.float32(0)).astype(np.float32)
-    return GhostMap(significance, _without_specks(significance > threshold, _SMALLEST_PX * scale**2))
+    return GhostMap(significance, _without_specks(significance > threshold, _SMALLEST_PX * SCALE**2))
 
 
 def _without_specks(found: BoolArray, smallest: float) -> BoolArray:

@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import BoolArray, FrameSpan, Group, InputError, LensedSource, LitSource, Source, Trajectory, VirtualExposure
-from photonpano.merging import PhotonSum
+from photonpano.geometry import inverse
+from photonpano.merging import PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import LocalFlowConfig
 from photonpano_core.dense_motion.flow import estimate_field
+from photonpano_core.dense_motion.frames import WeightedFrames
 from photonpano_core.dense_motion.ghosts import GhostMap, compared
 from photonpano_core.dense_motion.rescaled import rescaled
-from photonpano_core.dense_motion.robust_sum import best_sum
-from photonpano_core.dense_motion.sub_exposures import SubExposures, total_of
-from photonpano_core.photon_mle import exposure_of, unwarped_sum
+from photonpano_core.dense_motion.robust_sum import weighted
+from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures
+from photonpano_core.dense_motion.warping import add_along
+from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
 _NUMBERS = {33: 8.0, 17: 8.0, 9: 2.0, 5: 2.0, 3: 2.0}
 """Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have."""
+_USUAL = 17
+"""Sub-exposures, at most, unless something moves fast."""
 _COMPARED = 9
 """Sub-exposures, at most, whose differences show what moves: fewer have more light each."""
 _SAMPLED = 16
 """Frames from which the light of a group is measured."""
 _AROUND_PX = 6
 """Surroundings of what moves that are merged along the field as well, in px of a frame."""
+_SWEPT_PX = 6.0
+"""Way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted."""
 _MARGIN_PX = 32
 """Surroundings of these in which flow is estimated, in px of a frame."""
 
@@ -30,10 +40,10 @@ _MARGIN_PX = 32
 class LocalFlowMerger:
     """Warps the counts of a group along the global motion, and where they contradict it, along a dense field beyond it.
 
-    A group is divided into sub-exposures. Where these agree, as everywhere in a still scene, all frames are merged as
-    `photon-mle` does, to the same flux. Elsewhere optical flow is estimated in rounds, and counts are warped along the sum of
-    both motions, in one interpolation. Sub-exposures that still differ from the one around the reference instant, such as those
-    in which a pixel is occluded, get less weight.
+    A group is divided into sub-exposures of half the size. Where these agree, as everywhere in a still scene, all frames are
+    merged as `photon-mle` does, to the same flux. Elsewhere optical flow is estimated in rounds. Sub-exposures that still
+    differ from the one around the reference instant, such as those in which a pixel is occluded, get less weight. Then counts
+    are warped along the sum of both motions, in one interpolation, at full size.
 
     In a group with too few photons, and while no motion is known, frames are merged as `photon-mle` does.
     """
@@ -49,7 +59,7 @@ class LocalFlowMerger:
         """
         if trajectory is None:
             return exposure_of(unwarped_sum(source, group, scale), source, group, scale)
-        photons = self._merged(self._divided(source, group, trajectory, max(scale, 1.0)))
+        photons = self._merged(source, group, trajectory, max(scale, 1.0))
         return exposure_of(rescaled(photons, scale) if scale < 1 else photons, source, group, scale)
 
     def ghost_map(self, source: Source, group: Group, trajectory: Trajectory) -> GhostMap:
@@ -58,32 +68,59 @@ class LocalFlowMerger:
         Raises:
             InputError: the lens of the source distorts, or its light changes.
         """
-        return self._ghosts(self._divided(source, group, trajectory, 1.0))
+        found = self._ghosts(self._divided(source, group, trajectory))
+        shape = source.info.frame_shape
+        return GhostMap(enlarged(found.significance, shape), enlarged(found.moving, shape))
 
-    def _divided(self, source: Source, group: Group, trajectory: Trajectory, scale: float) -> SubExposures:
+    def _divided(self, source: Source, group: Group, trajectory: Trajectory) -> SubExposures:
         if isinstance(source, LensedSource) and source.camera.distorts:
             raise InputError("merge.use: local-flow does not warp through a lens that distorts; use robust-merge or photon-mle")
         if isinstance(source, LitSource):
             raise InputError("merge.use: local-flow does not divide by light that changes; use robust-merge or photon-mle")
         wanted = self._config.sub_exposures
-        number = number_of(source, group) if wanted == "auto" else wanted
-        return SubExposures(source, group, trajectory, scale, number, self._config.tolerance_px)
+        number = min(number_of(source, group), _USUAL) if wanted == "auto" else wanted
+        return SubExposures(source, group, trajectory, number)
 
     def _ghosts(self, parts: SubExposures) -> GhostMap:
         config = self._config
         return compared(parts, min(_COMPARED, len(parts.spans)), config.significance, config.tolerated_px)
 
-    def _merged(self, parts: SubExposures) -> PhotonSum:
-        total, moving = total_of(parts.sums), self._ghosts(parts).moving
-        if moving.any():
-            side = 2 * round(_AROUND_PX * parts.scale) + 1
-            around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-            where = cv2.dilate(moving.astype(np.uint8), around).astype(bool)
-            box = box_around(where, round(_MARGIN_PX * parts.scale))
-            crop, there = parts.cropped(box), where[box]
-            found = best_sum(crop, estimate_field(crop, there), there, self._config.tolerance_px)
-            total.counts[box], total.weight[box] = found.counts, found.weight
-        return total
+    def _merged(self, source: Source, group: Group, trajectory: Trajectory, scale: float) -> PhotonSum:
+        parts, tolerance_px = self._divided(source, group, trajectory), self._config.tolerance_px
+        chunks = chunks_of(group.span, trajectory, source.info.frame_shape, tolerance_px)
+        onto = to_exposure(group, trajectory, scale)
+        total = accumulate(source, chunks, onto, exposure_shape(source, scale))
+        moving = self._ghosts(parts).moving
+        if not moving.any():
+            return total
+        side = 2 * round(_AROUND_PX * SCALE) + 1
+        where = cv2.dilate(moving.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))).astype(bool)
+        box = box_around(where, round(_MARGIN_PX * SCALE))
+        there = where[box]
+        field = estimate_field(parts.cropped(box), there)
+        if self._config.sub_exposures == "auto" and 2 * parts.fastest_px(field, there) > _SWEPT_PX * len(parts.spans):
+            parts = parts.divided(number_of(source, group))
+        parts = parts.cropped(box)
+        best = weighted(parts, field, there)
+        fastest_px = parts.fastest_px(best.field, there)
+        inside = enlarged(where, total.counts.shape, scale)
+        counts, weight = (np.where(inside, np.float32(0), each) for each in (total.counts, total.weight))
+        frames, cells = WeightedFrames(source), (SCALE / scale, box[0].start, box[1].start)
+        for span, trust in zip(parts.spans, best.trusts, strict=True):
+            for chunk, motion in parts.moving(clipped(chunks, span, trajectory), best.field, fastest_px, tolerance_px):
+                to_image = inverse(onto @ chunk.homography)
+                lit, n_frames = frames(chunk.span), float(len(chunk.span))
+                add_along(lit, frames.worth, n_frames, to_image, inside, cells, motion, trust, counts, weight)
+        return PhotonSum(counts, weight)
+
+
+def enlarged(image: NDArray[Any], shape: tuple[int, int], scale: float = 1.0) -> NDArray[Any]:
+    """Return an image of the grid of `SubExposures`, (h, w), on a grid of another scale, (H, W), without interpolation."""
+    rows, columns = (
+        np.minimum(((np.arange(length) + 0.5) * (SCALE / scale)).astype(int), size - 1)
+        for length, size in zip(shape, image.shape, strict=True)
+    )
+    return image[np.ix_(rows, columns)]
 
 
 def box_around(where: BoolArray, margin: int) -> tuple[slice, slice]:

@@ -1,4 +1,4 @@
-"""Add sub-exposures up with weights that leave out what contradicts the reference sub-exposure."""
+"""Weights of sub-exposures that leave out what contradicts the reference sub-exposure, along whichever motion explains most."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
-from photonpano_core.dense_motion.field import MotionField
-from photonpano_core.dense_motion.sub_exposures import Image, SubExposures, blurred
+from photonpano_core.dense_motion.field import Image, MotionField
+from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred
 
-_DETAIL_PX, _WINDOW_PX = 0.9, 1.2
+_DETAIL_PX, _WINDOW_PX = 1.2, 2.0
 """Blur of sub-exposures, and the window over which their differences are averaged, in px of a frame."""
 _TOLERATED = 1.5
 """Squared difference, in units of the photon noise, that costs no weight."""
@@ -24,31 +23,31 @@ _MOVES_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobustSum:
-    """Weighted sum of sub-exposures.
+class Weighted:
+    """Motion of each pixel, and weights of the sub-exposures along it.
 
     Attributes:
-        photons: counts and weights.
-        explained: (H, W) float32, share of the frames of a pixel that are in the sum.
+        field: the motion.
+        trusts: (K, H, W) float32, weights from 0 to 1.
+        explained: (H, W) float32, share of the frames of a pixel that remain.
     """
 
-    photons: PhotonSum
+    field: MotionField
+    trusts: Image
     explained: Image
 
-    def improved(self, other: RobustSum, where: BoolArray) -> RobustSum:
-        """Return the sum that takes, within `where`, each pixel from the one that explains more frames."""
+    def improved(self, other: Weighted, where: BoolArray) -> Weighted:
+        """Return what takes, within `where`, each pixel from the one that explains more frames."""
         better = where & (other.explained > self.explained)
-        return RobustSum(
-            PhotonSum(
-                np.where(better, other.photons.counts, self.photons.counts),
-                np.where(better, other.photons.weight, self.photons.weight),
-            ),
+        return Weighted(
+            MotionField(np.where(better[..., None], other.field.coefficients, self.field.coefficients)),
+            np.where(better, other.trusts, self.trusts),
             np.where(better, other.explained, self.explained),
         )
 
 
-def best_sum(parts: SubExposures, field: MotionField, where: BoolArray, tolerance_px: float) -> PhotonSum:
-    """Merge a group along whichever motion explains the most frames of each pixel.
+def weighted(parts: SubExposures, field: MotionField, where: BoolArray) -> Weighted:
+    """Find, for each pixel, a motion that explains most of its frames.
 
     A field is smooth, but the motion jumps at the border of an object. Where the field explains too few frames, a pixel may
     move as its nearest neighbour that moves and is explained, or not at all beyond the global motion.
@@ -56,38 +55,36 @@ def best_sum(parts: SubExposures, field: MotionField, where: BoolArray, toleranc
     Args:
         parts: the sub-exposures, along the global motion.
         field: the motion beyond it.
-        where: (H, W) pixels that may move; elsewhere all frames count.
-        tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
+        where: (H, W) pixels that may move.
     """
-    sums = parts.along(field, where, tolerance_px)
-    best = _robust_sum(parts, sums, where)
+    sums = parts.along(field, where)
+    best = _weighted(parts, field, sums)
     poor = where & (best.explained < _EXPLAINED)
-    movers = where & ~poor & (field.way_px > _MOVES_PX * parts.scale)
-    if poor.any() and movers.any():
-        again = parts.along(field.filled(movers), poor, 2 * tolerance_px)
-        mixed = [_replaced(each, other, poor) for each, other in zip(sums, again, strict=True)]
-        best = best.improved(_robust_sum(parts, mixed, where), poor)
-    return best.improved(_robust_sum(parts, parts.sums, where), where).photons
+    if not poor.any():
+        return best
+    movers = where & ~poor & (field.way_px > _MOVES_PX * SCALE)
+    if movers.any():
+        nearest = field.filled(movers)
+        best = best.improved(_weighted(parts, nearest, parts.along(nearest, poor, sums)), poor)
+    still = MotionField(np.zeros_like(field.coefficients))
+    return best.improved(_weighted(parts, still, parts.sums), poor)
 
 
-def _robust_sum(parts: SubExposures, sums: Sequence[PhotonSum], where: BoolArray) -> RobustSum:
+def _weighted(parts: SubExposures, field: MotionField, sums: Sequence[PhotonSum]) -> Weighted:
     """Weight sub-exposures where they differ from the reference by more than photon noise.
 
     D^2 is the squared difference in units of its variance, averaged over a window. Above what noise explains, by e, the weight
     is `1 / (1 + e)`: the gain of a Wiener filter. Pixels that one of both did not see keep their weight.
     """
-    response, scale, reference = parts.response, parts.scale, sums[parts.reference]
-    fixed = parts.smoothed(reference, _DETAIL_PX)
-    counts, weight, frames = reference.counts.copy(), reference.weight.copy(), reference.weight.copy()
-    for each in (*sums[: parts.reference], *sums[parts.reference + 1 :]):
+    fixed = parts.smoothed(sums[parts.reference], _DETAIL_PX)
+    trusts = np.ones((len(sums), *parts.shape), np.float32)
+    weight, frames = sums[parts.reference].weight.copy(), sums[parts.reference].weight.copy()
+    for place, each in enumerate(sums):
+        if place == parts.reference:
+            continue
         image = parts.smoothed(each, _DETAIL_PX)
-        error = blurred(image.squared_difference(fixed, response), _WINDOW_PX * scale)
-        trust = np.where(where, 1 / (1 + np.maximum(error - np.float32(_TOLERATED), 0)), np.float32(1))
-        counts += trust * each.counts
-        weight += trust * each.weight
+        error = blurred(image.squared_difference(fixed, parts.response), _WINDOW_PX * SCALE)
+        trusts[place] = 1 / (1 + np.maximum(error - np.float32(_TOLERATED), 0))
+        weight += trusts[place] * each.weight
         frames += each.weight
-    return RobustSum(PhotonSum(counts, weight), np.asarray(weight / np.maximum(frames, np.float32(1e-3)), np.float32))
-
-
-def _replaced(photons: PhotonSum, other: PhotonSum, where: NDArray[np.bool_]) -> PhotonSum:
-    return PhotonSum(np.where(where, other.counts, photons.counts), np.where(where, other.weight, photons.weight))
+    return Weighted(field, trusts, np.asarray(weight / np.maximum(frames, np.float32(1e-3)), np.float32))

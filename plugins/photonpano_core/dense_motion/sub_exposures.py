@@ -1,38 +1,34 @@
-"""Sub-exposures of a group: short parts of it, merged along the global motion or along a field beyond it."""
+"""Sub-exposures of a group: short parts of it, merged along the global motion or along a field beyond it, at half the size."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano import (
-    FloatArray,
-    FrameSpan,
-    Group,
-    LinearlyCorrectedSource,
-    Response,
-    Source,
-    Trajectory,
-    WeightedSource,
-)
-from photonpano.geometry import apply, inverse, translation
-from photonpano.merging import Chunk, CountsCache, PhotonSum, accumulate, chunks_of, clipped, divided
-from photonpano_core.dense_motion.field import MotionField
-from photonpano_core.dense_motion.warping import add_along
-from photonpano_core.photon_mle import exposure_shape, to_exposure
+from photonpano import BoolArray, FloatArray, FrameSpan, Group, Response, Source, Trajectory
+from photonpano.geometry import apply, inverse, rescaling, translation
+from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
+from photonpano_core.dense_motion.field import Image, MotionField
+from photonpano_core.dense_motion.frames import WeightedFrames
+from photonpano_core.dense_motion.warping import add_along, mean_of_seen
+from photonpano_core.photon_mle import to_exposure
 
-Image = NDArray[np.float32]
-
+SCALE = 0.5
+"""Pixels of the grid per pixel of a frame."""
+_HALVED_PX2 = 1 / math.pi
+"""Variance of the Gaussian that lowers noise as much as the average of two by two pixels, in px of a frame squared."""
+_TOLERANCE_PX = 2.0
+"""Motion within which frames are summed before they are warped, in px of a frame."""
 _PLACES = 5
 """Places along an axis, about, at which the blur of interpolation is looked at."""
 _CACHE_BYTES = 64 * 1024**2
-"""Memory for sums of frames that are warped again in each round."""
+"""Memory for halved sums of frames, which are warped again in each round."""
 _SHIFT_PX = 0.2
 """Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame."""
 _MOST = 99.0
@@ -77,41 +73,53 @@ class Joined:
 
 
 class SubExposures:
-    """The sub-exposures of one group, on the grid of its exposure.
+    """The sub-exposures of one group, on a grid of half the size of a frame, whose pixels have four times the light.
 
     Attributes:
         spans: the frames of each, in order.
         shape: (height, width) of the grid.
-        scale: pixels of the grid per pixel of a frame.
         sums: counts and weights of each along the global motion.
         reference: index of the one that contains the reference instant.
-        blur_px2: variance of the bilinear kernels, on average, in px of a frame squared: interpolation blurs noise by it.
+        response: of the camera.
+        noise_px2: variance of the kernels of halving and interpolation, on average, in px of a frame squared: they blur noise.
     """
 
-    def __init__(self, source: Source, group: Group, trajectory: Trajectory, scale: float, n: int, tolerance_px: float) -> None:
+    def __init__(self, source: Source, group: Group, trajectory: Trajectory, n: int) -> None:
         """Merge along the global motion.
 
         Args:
             source: the capture.
             group: its frames are divided.
             trajectory: the global motion.
-            scale: pixels of the grid per pixel of a frame.
             n: number of sub-exposures; fewer if the group has fewer frames.
-            tolerance_px: motion within which frames are summed before they are warped.
         """
-        self._source, self._group, self._trajectory = source, group, trajectory
-        self._onto = to_exposure(group, trajectory, scale)
-        self._cache = CountsCache(source, _CACHE_BYTES)
-        self._corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-        self._worth = worth_of(source)
-        self.shape, self.scale = exposure_shape(source, scale), scale
-        start = group.span.start
-        self.spans = [FrameSpan(start + part.start, start + part.stop) for part in divided(len(group.span), n)]
-        self.reference = next(place for place, span in enumerate(self.spans) if group.reference < span.stop)
-        chunks = self._chunks(tolerance_px)
-        self.sums = [accumulate(source, each, self._onto, self.shape, counts_of=self._cache) for each in chunks]
-        to_image = inverse(self._onto @ np.array([chunk.homography for each in chunks for chunk in each]))
-        self.blur_px2 = _interpolation_blur(to_image, self.shape)
+        self._group, self._trajectory = group, trajectory
+        self._frames = WeightedFrames(source)
+        self._worth = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
+        self._onto = to_exposure(group, trajectory, SCALE)
+        height, width = source.info.frame_shape
+        self.shape, self.response = (height // 2, width // 2), source.response
+        self._halved = lru_cache(max(1, _CACHE_BYTES // (height * width)))(self._summed)
+        self._chunks = chunks_of(group.span, trajectory, source.info.frame_shape, _TOLERANCE_PX)
+        self._trusted = np.ones(self.shape, np.float32)
+        self._divide(n)
+        to_image = self._to_image(np.array([chunk.homography for chunk in self._chunks]))
+        self.noise_px2 = _HALVED_PX2 + _interpolation_blur(to_image, self.shape) / SCALE**2
+
+    def _divide(self, n: int) -> None:
+        """Merge `n` sub-exposures along the global motion."""
+        start = self._group.span.start
+        self.spans = [FrameSpan(start + part.start, start + part.stop) for part in divided(len(self._group.span), n)]
+        self.reference = next(place for place, span in enumerate(self.spans) if self._group.reference < span.stop)
+        nothing = PhotonSum(*np.zeros((2, *self.shape), np.float32))
+        self.sums = [nothing] * len(self.spans)
+        self.sums = self.along(MotionField.zero(self.shape), np.ones(self.shape, np.bool_))
+
+    def divided(self, n: int) -> SubExposures:
+        """Return the same group as another number of sub-exposures."""
+        other = copy(self)
+        other._divide(n)
+        return other
 
     def cropped(self, box: tuple[slice, slice]) -> SubExposures:
         """Return the same sub-exposures on some rows and columns of the grid."""
@@ -121,6 +129,7 @@ class SubExposures:
             PhotonSum(np.ascontiguousarray(each.counts[box]), np.ascontiguousarray(each.weight[box])) for each in self.sums
         ]
         crop.shape = crop.sums[0].counts.shape[0], crop.sums[0].counts.shape[1]
+        crop._trusted = np.ones(crop.shape, np.float32)
         return crop
 
     def joined(self, sums: Sequence[PhotonSum], n: int) -> Joined:
@@ -137,61 +146,77 @@ class SubExposures:
 
     def smoothed(self, photons: PhotonSum, blur_px: float) -> Smoothed:
         """Blur a sub-exposure by some px of a frame, and stabilise its noise."""
-        return smoothed(photons, self.response, blur_px, self.scale, self.blur_px2)
-
-    @property
-    def response(self) -> Response:
-        """The camera's response."""
-        return self._source.response
+        return smoothed(photons, self.response, blur_px, SCALE, self.noise_px2)
 
     def elapsed(self, instant: float) -> float:
         """Return the time since the reference instant, as a share of the longer part of the group before or after it."""
         span, reference = self._group.span, self._group.reference
         return (instant - reference) / max(reference - span.start, span.stop - 1 - reference, 1)
 
-    def along(self, field: MotionField, where: NDArray[np.bool_], tolerance_px: float) -> list[PhotonSum]:
-        """Merge along the global motion and a field, each photon interpolated once.
+    def along(self, field: MotionField, where: BoolArray, others: Sequence[PhotonSum] | None = None) -> list[PhotonSum]:
+        """Merge along the global motion and a field.
 
         Args:
-            field: the motion beyond the global one.
-            where: (H, W) pixels that are merged again, one at least; elsewhere the sums are those along the global motion.
-            tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
+            field: the motion beyond the global one, in px of the grid.
+            where: (H, W) pixels that are merged again, one at least.
+            others: the sums elsewhere; those along the global motion by default.
         """
-        places = np.array(np.nonzero(where)[::-1], np.float64)
-        motion = np.ascontiguousarray(field.coefficients[:, :, where])
-        # Frames between which the field moves by less than the tolerance are summed as well.
-        fastest_px = float(np.percentile(field.way_px[where], _MOST)) / self.scale
         merged = []
-        for chunks, total in zip(self._chunks(tolerance_px), self.sums, strict=True):
-            counts, weight = np.zeros((2, places.shape[1]), np.float32)
-            for chunk in chunks:
-                way_px = fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
-                for part in self._divided(chunk, math.ceil(way_px / tolerance_px)):
-                    self._add(part, places, motion, counts, weight)
-            image = PhotonSum(total.counts.copy(), total.weight.copy())
-            image.counts[where], image.weight[where] = counts, weight
-            merged.append(image)
+        fastest_px = self.fastest_px(field, where)
+        for span, other in zip(self.spans, others or self.sums, strict=True):
+            counts, weight = (np.where(where, np.float32(0), each) for each in (other.counts, other.weight))
+            for chunk, motion in self.moving(clipped(self._chunks, span, self._trajectory), field, fastest_px, _TOLERANCE_PX):
+                to_image = self._to_image(chunk.homography)
+                lit, n_frames = self._halved(chunk.span), float(len(chunk.span))
+                add_along(lit, self._worth, n_frames, to_image, where, (1.0, 0, 0), motion, self._trusted, counts, weight)
+            merged.append(PhotonSum(counts, weight))
         return merged
 
-    def _chunks(self, tolerance_px: float) -> list[tuple[Chunk, ...]]:
-        """Return the chunks of each sub-exposure along the global motion."""
-        chunks = chunks_of(self._group.span, self._trajectory, self._source.info.frame_shape, tolerance_px)
-        return [clipped(chunks, span, self._trajectory) for span in self.spans]
+    @staticmethod
+    def fastest_px(field: MotionField, where: BoolArray) -> float:
+        """Return the speed of nearly the fastest pixels, of some (H, W), in px of a frame per unit of time."""
+        return float(np.percentile(field.way_px[where], _MOST)) / SCALE
 
-    def _divided(self, chunk: Chunk, parts: int) -> list[Chunk]:
-        if parts < 2:
-            return [chunk]
-        start = chunk.span.start
-        spans = [FrameSpan(start + part.start, start + part.stop) for part in divided(len(chunk.span), parts)]
-        return [Chunk(span, self._trajectory.at([span.centre])[0]) for span in spans]
+    def moving(
+        self, chunks: Sequence[Chunk], field: MotionField, fastest_px: float, tolerance_px: float
+    ) -> Iterator[tuple[Chunk, Image]]:
+        """Divide the chunks of a sub-exposure, so that a field moves by less than a tolerance within each.
 
-    def _add(self, chunk: Chunk, places: FloatArray, motion: Image, counts: Image, weight: Image) -> None:
-        n_frames, summed = len(chunk.span), self._cache(chunk.span)
-        lit = (self._corrected(summed, n_frames) if self._corrected else summed).astype(np.float32, copy=False)
-        if self._worth.size:
-            lit = lit * self._worth
-        to_image, elapsed = inverse(self._onto @ chunk.homography), self.elapsed(chunk.span.centre)
-        add_along(lit, self._worth, float(n_frames), to_image, places, motion, elapsed, counts, weight)
+        Args:
+            chunks: to divide.
+            field: the motion beyond the global one, which is linear within a sub-exposure.
+            fastest_px: its speed.
+            tolerance_px: the tolerance.
+
+        Returns:
+            Each with the displacement at its centre, (H, W, 2).
+        """
+        finer: list[Chunk] = []
+        for chunk in chunks:
+            start, way_px = chunk.span.start, fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
+            parts = divided(len(chunk.span), max(1, math.ceil(way_px / tolerance_px)))
+            spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
+            homographies = self._trajectory.at([span.centre for span in spans]) if len(spans) > 1 else [chunk.homography]
+            finer += map(Chunk, spans, homographies)
+        times = [self.elapsed(chunk.span.centre) for chunk in finer]
+        first = field.at(times[0])
+        way = field.at(times[-1]) - first
+        for chunk, time in zip(finer, times, strict=True):
+            share = 0.0 if time == times[0] else (time - times[0]) / (times[-1] - times[0])
+            yield chunk, first + np.float32(share) * way if share else first
+
+    def _to_image(self, homographies: FloatArray) -> FloatArray:
+        """Return the maps of pixels of the grid to halved frames."""
+        return rescaling(SCALE) @ inverse(self._onto @ homographies)
+
+    def _summed(self, span: FrameSpan) -> Image:
+        return halved(self._frames(span))
+
+
+def halved(image: Image) -> Image:
+    """Average two by two pixels; a last odd row or column is left out."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _interpolation_blur(to_image: FloatArray, shape: tuple[int, int]) -> float:
@@ -205,13 +230,6 @@ def _interpolation_blur(to_image: FloatArray, shape: tuple[int, int]) -> float:
     found = apply(to_image, places.reshape(-1, 2))
     fraction = found - np.floor(found)
     return float(np.mean(fraction * (1 - fraction)))
-
-
-def worth_of(source: Source) -> Image:
-    """Return what a frame of each pixel is worth, 0 for a masked one: (H, W); (0, 0) if it is 1 for all."""
-    if isinstance(source, WeightedSource):
-        return np.where(source.valid, source.weights(), np.float32(0))
-    return np.zeros((0, 0), np.float32) if source.valid.all() else source.valid.astype(np.float32)
 
 
 def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
@@ -234,16 +252,14 @@ def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: floa
         interpolation_px2: variance of the kernel that has blurred the noise before: see `SubExposures`.
     """
     counts, weight = (blurred(each, blur_px * scale) for each in (photons.counts, photons.weight))
-    seen = weight > _SEEN * max(float(photons.weight.max()), 1.0)
-    norm = np.where(seen, weight, np.float32(1))
-    # Where weights are uneven, as at a border, the blur shows the surroundings on one side.
-    shift_px = (blur_px**2 * scale) * np.hypot(*np.gradient(weight)) / norm
-    seen &= shift_px < _SHIFT_PX
+    mean, frames = np.empty_like(counts), np.empty_like(counts)
     # The square of a Gaussian is a narrower one. Noise is independent between pixels of frames, but for their interpolation.
-    frames = np.maximum(norm * np.float32(4 * math.pi * (blur_px**2 + interpolation_px2)), np.float32(1))
-    mean = np.where(seen, np.maximum(counts, 0) / norm, np.float32(0)).astype(np.float32)
-    values = response.stabilised(response.flux(mean, frames), frames)
-    return Smoothed(np.where(seen, values, np.float32(0)), np.where(seen, frames, np.float32(0)))
+    area = 4 * math.pi * (blur_px**2 + interpolation_px2)
+    # Where weights are uneven, as at a border, the blur shows the surroundings on one side.
+    steepest = _SHIFT_PX / (blur_px**2 * scale)
+    mean_of_seen(counts, weight, _SEEN * max(float(photons.weight.max()), 1.0), steepest, area, mean, frames)
+    values = response.stabilised(response.flux(mean, np.maximum(frames, 1)), np.maximum(frames, 1))
+    return Smoothed(np.where(frames > 0, values, np.float32(0)), frames)
 
 
 def blurred(image: Image, blur_px: float) -> Image:

@@ -1,4 +1,4 @@
-"""Add warps of images to pixels that move by a polynomial of time beyond a homography. Compiled."""
+"""Add warps of images to pixels of a grid that move beyond a homography. Compiled."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-_BLOCK = 512
-"""Pixels whose places are computed at once, so that this is vectorised."""
-
 
 @compiled
 def add_along(
@@ -17,9 +14,10 @@ def add_along(
     worth: NDArray[np.float32],
     n_frames: float,
     to_image: NDArray[np.float64],
-    places: NDArray[np.float64],
+    where: NDArray[np.bool_],
+    cells: tuple[float, int, int],
     motion: NDArray[np.float32],
-    elapsed: float,
+    trust: NDArray[np.float32],
     counts: NDArray[np.float32],
     weight: NDArray[np.float32],
 ) -> None:
@@ -30,72 +28,103 @@ def add_along(
         worth: (h, w) what a frame of each pixel is worth, from 0 to 1; (0, 0) if it is 1 for all.
         n_frames: number of frames in the sum.
         to_image: (3, 3), pixels of the grid to pixels of the image.
-        places: (2, N), x and y of the pixels of the grid.
-        motion: (D, 2, N), coefficients of their motion on the grid: see `MotionField`.
-        elapsed: the time at which they are displaced.
-        counts: (N,) sums that are added to.
-        weight: (N,) numbers of frames that are added to.
+        where: (H, W) pixels of the grid that are added to.
+        cells: cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike.
+        motion: (h', w', 2), x and y by which cells are displaced, in cells.
+        trust: (h', w') weight of the image in each cell.
+        counts: (H, W) sums that are added to.
+        weight: (H, W) numbers of frames that are added to.
     """
     height, width = image.shape
-    frames = np.float32(n_frames)
-    us, vs = np.empty(_BLOCK), np.empty(_BLOCK)
-    for start in range(0, places.shape[1], _BLOCK):
-        stop = min(start + _BLOCK, places.shape[1])
-        _place(to_image, places[:, start:stop], motion[:, :, start:stop], elapsed, us, vs)
-        into, of = counts[start:stop], weight[start:stop]
-        for i in range(stop - start):
-            u, v = us[i], vs[i]
-            if not (-1 < u < width and -1 < v < height):
+    frames, per_cell, last = np.float32(n_frames), 1 / cells[0], where.shape[1]
+    steps = np.arange(last)
+    columns = np.minimum(np.maximum(((steps + 0.5) * cells[0]).astype(np.int64) - cells[2], 0), trust.shape[1] - 1)
+    us, vs, shares = np.empty(last), np.empty(last), np.empty(last, np.float32)
+    for row in range(where.shape[0]):
+        inside, first, stop = where[row], 0, last
+        while first < stop and not inside[first]:
+            first += 1
+        while stop > first and not inside[stop - 1]:
+            stop -= 1
+        if first == stop:
+            continue
+        cell = min(max(int((row + 0.5) * cells[0]) - cells[1], 0), trust.shape[0] - 1)
+        moved, trusted = motion[cell], trust[cell]
+        for i in range(first, stop):
+            at = columns[i]
+            us[i], vs[i], shares[i] = i + per_cell * moved[at, 0], row + per_cell * moved[at, 1], trusted[at]
+        _map(to_image, us[first:stop], vs[first:stop])
+        into, of = counts[row], weight[row]
+        for i in range(first, stop):
+            u, v, share = us[i], vs[i], shares[i]
+            if not (inside[i] and -1 < u < width and -1 < v < height):
                 continue
-            left, top = int(np.floor(u)), int(np.floor(v))
+            left, top = int(u + 1) - 1, int(v + 1) - 1
             a, b = np.float32(u - left), np.float32(v - top)
             if 0 <= left < width - 1 and 0 <= top < height - 1:
-                above, below = image[top], image[top + 1]
-                p = above[left] + a * (above[left + 1] - above[left])
-                q = below[left] + a * (below[left + 1] - below[left])
-                into[i] += p + b * (q - p)
-                if worth.size:
-                    above, below = worth[top], worth[top + 1]
-                    p = above[left] + a * (above[left + 1] - above[left])
-                    q = below[left] + a * (below[left + 1] - below[left])
-                    of[i] += frames * (p + b * (q - p))
-                else:
-                    of[i] += frames
+                into[i] += share * _between(image, top, left, a, b)
+                of[i] += share * frames * (_between(worth, top, left, a, b) if worth.size else np.float32(1))
                 continue
             for down in range(2):
                 for right in range(2):
-                    row, column = top + down, left + right
-                    if 0 <= row < height and 0 <= column < width:
-                        share = (b if down else 1 - b) * (a if right else 1 - a)
-                        into[i] += share * image[row, column]
-                        of[i] += share * frames * (worth[row, column] if worth.size else 1)
+                    y, x = top + down, left + right
+                    if 0 <= y < height and 0 <= x < width:
+                        part = share * (b if down else 1 - b) * (a if right else 1 - a)
+                        into[i] += part * image[y, x]
+                        of[i] += part * frames * (worth[y, x] if worth.size else np.float32(1))
 
 
 @compiled
-def _place(
-    to_image: NDArray[np.float64],
-    places: NDArray[np.float64],
-    motion: NDArray[np.float32],
-    elapsed: float,
-    us: NDArray[np.float64],
-    vs: NDArray[np.float64],
-) -> None:
-    """Write where displaced pixels of the grid lie in the image; arguments as in `add_along`."""
-    xs, ys = places[0], places[1]
-    for i in range(len(xs)):
-        us[i], vs[i] = xs[i], ys[i]
-    power = 1.0
-    for d in range(motion.shape[0]):
-        power *= elapsed
-        right, down = motion[d, 0], motion[d, 1]
-        for i in range(len(xs)):
-            us[i] += power * right[i]
-            vs[i] += power * down[i]
+def _map(to_image: NDArray[np.float64], us: NDArray[np.float64], vs: NDArray[np.float64]) -> None:
+    """Replace places (x, y) on a grid by those in an image."""
     xx, xy, x1 = to_image[0, 0], to_image[0, 1], to_image[0, 2]
     yx, yy, y1 = to_image[1, 0], to_image[1, 1], to_image[1, 2]
     zx, zy, z1 = to_image[2, 0], to_image[2, 1], to_image[2, 2]
-    for i in range(len(xs)):
+    for i in range(len(us)):
         x, y = us[i], vs[i]
         per_depth = 1 / (zx * x + zy * y + z1)
         us[i] = (xx * x + xy * y + x1) * per_depth
         vs[i] = (yx * x + yy * y + y1) * per_depth
+
+
+@compiled
+def _between(image: NDArray[np.float32], top: int, left: int, a: np.float32, b: np.float32) -> np.float32:
+    """Interpolate between four pixels, at fractions of a pixel to the right and down of the first."""
+    upper = image[top, left] + a * (image[top, left + 1] - image[top, left])
+    lower = image[top + 1, left] + a * (image[top + 1, left + 1] - image[top + 1, left])
+    return np.float32(upper + b * (lower - upper))
+
+
+@compiled
+def mean_of_seen(
+    counts: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    least: float,
+    steepest: float,
+    area: float,
+    mean: NDArray[np.float32],
+    frames: NDArray[np.float32],
+) -> None:
+    """Divide counts by weights where these are large and even.
+
+    Args:
+        counts: (H, W) sums.
+        weight: (H, W) numbers of frames.
+        least: weight above which a pixel is seen.
+        steepest: largest gradient of the weight, relative to it.
+        area: pixels that are averaged.
+        mean: (H, W) output, mean count of a frame; 0 where unseen.
+        frames: (H, W) output, number of frames of one pixel with the same noise, 1 or more; 0 where unseen.
+    """
+    height, width = counts.shape
+    for row in range(height):
+        above, below = max(row - 1, 0), min(row + 1, height - 1)
+        for column in range(width):
+            left, right, here = max(column - 1, 0), min(column + 1, width - 1), weight[row, column]
+            down = (weight[below, column] - weight[above, column]) / max(below - above, 1)
+            along = (weight[row, right] - weight[row, left]) / max(right - left, 1)
+            if here > least and down * down + along * along < (steepest * here) ** 2:
+                mean[row, column] = max(counts[row, column], np.float32(0)) / here
+                frames[row, column] = max(here * np.float32(area), np.float32(1))
+            else:
+                mean[row, column], frames[row, column] = 0, 0

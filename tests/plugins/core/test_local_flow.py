@@ -197,19 +197,19 @@ def test_lens_that_distorts_is_an_error(crossed: MemorySource, motion: Trajector
 
 
 def test_field_is_a_polynomial_of_time() -> None:
-    coefficients = np.zeros((2, 2, 3, 4), np.float32)
-    coefficients[0, 0], coefficients[1, 1] = 2, -4
+    coefficients = np.zeros((2, 3, 4, 2), np.float32)
+    coefficients[0, ..., 0], coefficients[1, ..., 1] = 2, -4
     field = MotionField(coefficients)
-    np.testing.assert_allclose(field.at(0.5)[:, 1, 2], [1, -1])
+    np.testing.assert_allclose(field.at(0.5)[1, 2], [1, -1])
     # A parabola from -1 to 1: its length is measured along 8 straight lines.
     times = np.linspace(-1, 1, 9)
     np.testing.assert_allclose(field.way_px, np.hypot(2 * np.diff(times), 4 * np.diff(times**2)).sum() / 2, rtol=1e-5)
 
 
 def test_filled_field_takes_the_nearest_known_motion() -> None:
-    coefficients = np.arange(2 * 5 * 6, dtype=np.float32).reshape(1, 2, 5, 6)
+    coefficients = np.arange(2 * 5 * 6, dtype=np.float32).reshape(1, 5, 6, 2)
     known = np.zeros((5, 6), bool)
     known[2, 0] = known[2, 5] = True
     filled = MotionField(coefficients).filled(known).coefficients
-    np.testing.assert_array_equal(filled[:, :, 0, 1], coefficients[:, :, 2, 0])
-    np.testing.assert_array_equal(filled[:, :, 4, 4], coefficients[:, :, 2, 5])
+    np.testing.assert_array_equal(filled[:, 0, 1], coefficients[:, 2, 0])
+    np.testing.assert_array_equal(filled[:, 4, 4], coefficients[:, 2, 5])

@@ -1,0 +1,49 @@
+"""Fit a polynomial at each pixel. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.compiling import compiled
+
+
+@compiled
+def fit_each(
+    moments: NDArray[np.float32], right: NDArray[np.float32], prior: float, where: NDArray[np.bool_], found: NDArray[np.float32]
+) -> None:
+    """Solve a least-squares fit of polynomials without a constant term at each pixel, by Cholesky decomposition.
+
+    Args:
+        moments: (2 D - 1, H, W), weighted sums of the powers 2 to 2 D of time.
+        right: (D, H, W, 2), weighted sums of the powers 1 to D of time, times x and y.
+        prior: added to the diagonal.
+        where: (H, W) pixels to solve for.
+        found: (D, H, W, 2) output, coefficients of the powers 1 to D.
+    """
+    degree = right.shape[0]
+    lower, x = np.zeros((degree, degree)), np.zeros((degree, 2))
+    for row in range(where.shape[0]):
+        for column in range(where.shape[1]):
+            if not where[row, column]:
+                continue
+            for i in range(degree):
+                for j in range(i + 1):
+                    total = float(moments[i + j, row, column]) + (prior if i == j else 0.0)
+                    for k in range(j):
+                        total -= lower[i, k] * lower[j, k]
+                    # float32 moments may be singular by rounding errors.
+                    lower[i, j] = np.sqrt(max(total, 0.1 * prior)) if i == j else total / lower[j, j]
+            for axis in range(2):
+                for i in range(degree):
+                    total = float(right[i, row, column, axis])
+                    for k in range(i):
+                        total -= lower[i, k] * x[k, axis]
+                    x[i, axis] = total / lower[i, i]
+                for i in range(degree - 1, -1, -1):
+                    total = x[i, axis]
+                    for k in range(i + 1, degree):
+                        total -= lower[k, i] * x[k, axis]
+                    x[i, axis] = total / lower[i, i]
+                for i in range(degree):
+                    found[i, row, column, axis] = x[i, axis]
