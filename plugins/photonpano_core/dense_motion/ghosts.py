@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 
 from photonpano import BoolArray
 from photonpano_core.dense_motion.field import Image
-from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred
+from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred, noise_area_px2
 
 _DETAIL_PX = 1.2
 """Blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame."""
@@ -64,7 +65,7 @@ def compared(parts: SubExposures, n: int, threshold: float, tolerated_px: float)
     freedom = np.maximum(blurred(np.maximum(freedom, 0), _WINDOW_PX * SCALE), np.float32(1e-6))
     ratio = np.maximum(blurred(energy, _WINDOW_PX * SCALE) / freedom, 0)
     # Squares of neighbouring pixels are correlated, since their blurs overlap.
-    detail = _DETAIL_PX**2 + parts.noise_px2
+    detail = noise_area_px2(_DETAIL_PX, SCALE, parts.spread) / (4 * math.pi)
     correlated = detail / (2 * _WINDOW_PX**2 + detail)
     spread = np.float32(2 / 9 * correlated) / freedom
     significance = np.maximum((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread), 0)

@@ -12,7 +12,7 @@ from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import Image, MotionField
 from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred
 
-_DETAIL_PX, _WINDOW_PX = 1.2, 2.0
+_DETAIL_PX, _WINDOW_PX = 0.9, 1.2
 """Blur of sub-exposures, and the window over which their differences are averaged, in px of a frame."""
 _TOLERATED = 1.5
 """Squared difference, in units of the photon noise, that costs no weight."""

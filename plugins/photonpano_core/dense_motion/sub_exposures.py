@@ -21,18 +21,18 @@ from photonpano_core.photon_mle import to_exposure
 
 SCALE = 0.5
 """Pixels of the grid per pixel of a frame."""
-_HALVED_PX2 = 1 / math.pi
-"""Variance of the Gaussian that lowers noise as much as the average of two by two pixels, in px of a frame squared."""
-_TOLERANCE_PX = 2.0
+_TOLERANCE_PX = 1.5
 """Motion within which frames are summed before they are warped, in px of a frame."""
 _PLACES = 5
 """Places along an axis, about, at which the blur of interpolation is looked at."""
 _CACHE_BYTES = 64 * 1024**2
 """Memory for halved sums of frames, which are warped again in each round."""
 _SHIFT_PX = 0.2
-"""Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame."""
-_MOST = 99.0
+"""Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale."""
+_MOST = 95.0
 """Percentile of the speeds of a field by which frames are summed."""
+_REACH = 4
+"""Standard deviations at which a Gaussian ends."""
 _SEEN = 0.1
 """A pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it."""
 
@@ -81,7 +81,7 @@ class SubExposures:
         sums: counts and weights of each along the global motion.
         reference: index of the one that contains the reference instant.
         response: of the camera.
-        noise_px2: variance of the kernels of halving and interpolation, on average, in px of a frame squared: they blur noise.
+        spread: mean of f (1 - f) over the fractions f of a pixel at which frames are interpolated.
     """
 
     def __init__(self, source: Source, group: Group, trajectory: Trajectory, n: int) -> None:
@@ -104,7 +104,7 @@ class SubExposures:
         self._trusted = np.ones(self.shape, np.float32)
         self._divide(n)
         to_image = self._to_image(np.array([chunk.homography for chunk in self._chunks]))
-        self.noise_px2 = _HALVED_PX2 + _interpolation_blur(to_image, self.shape) / SCALE**2
+        self.spread = _spread(to_image, self.shape)
 
     def _divide(self, n: int) -> None:
         """Merge `n` sub-exposures along the global motion."""
@@ -146,7 +146,7 @@ class SubExposures:
 
     def smoothed(self, photons: PhotonSum, blur_px: float) -> Smoothed:
         """Blur a sub-exposure by some px of a frame, and stabilise its noise."""
-        return smoothed(photons, self.response, blur_px, SCALE, self.noise_px2)
+        return smoothed(photons, self.response, blur_px, SCALE, self.spread)
 
     def elapsed(self, instant: float) -> float:
         """Return the time since the reference instant, as a share of the longer part of the group before or after it."""
@@ -219,8 +219,8 @@ def halved(image: Image) -> Image:
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _interpolation_blur(to_image: FloatArray, shape: tuple[int, int]) -> float:
-    """Return the mean variance along an axis, `f (1 - f)` at the fraction f of a pixel, of bilinear kernels.
+def _spread(to_image: FloatArray, shape: tuple[int, int]) -> float:
+    """Return the mean of `f (1 - f)` over the fractions f of a pixel at which images are interpolated.
 
     Args:
         to_image: (N, 3, 3), pixels of the grid to pixels of frames.
@@ -241,7 +241,7 @@ def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
     return PhotonSum(counts, weight)
 
 
-def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: float, interpolation_px2: float) -> Smoothed:
+def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: float, spread: float) -> Smoothed:
     """Blur a sub-exposure, and stabilise its noise.
 
     Args:
@@ -249,17 +249,27 @@ def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: floa
         response: the camera's response.
         blur_px: standard deviation of the Gaussian, in px of a frame.
         scale: pixels of the sub-exposure per pixel of a frame.
-        interpolation_px2: variance of the kernel that has blurred the noise before: see `SubExposures`.
+        spread: of the interpolation that has blurred the noise before: see `SubExposures`.
     """
     counts, weight = (blurred(each, blur_px * scale) for each in (photons.counts, photons.weight))
     mean, frames = np.empty_like(counts), np.empty_like(counts)
-    # The square of a Gaussian is a narrower one. Noise is independent between pixels of frames, but for their interpolation.
-    area = 4 * math.pi * (blur_px**2 + interpolation_px2)
+    area = noise_area_px2(blur_px, scale, spread)
     # Where weights are uneven, as at a border, the blur shows the surroundings on one side.
-    steepest = _SHIFT_PX / (blur_px**2 * scale)
+    steepest = _SHIFT_PX / blur_px**2
     mean_of_seen(counts, weight, _SEEN * max(float(photons.weight.max()), 1.0), steepest, area, mean, frames)
     values = response.stabilised(response.flux(mean, np.maximum(frames, 1)), np.maximum(frames, 1))
     return Smoothed(np.where(frames > 0, values, np.float32(0)), frames)
+
+
+def noise_area_px2(blur_px: float, scale: float, spread: float) -> float:
+    """Return the number of pixels of a frame whose average has the noise of a smoothed pixel; arguments as in `smoothed`.
+
+    Along an axis, noise is lowered by the sum of the squares of the kernel. Interpolation at a fraction f of a pixel takes
+    `2 f (1 - f)` of it from the products of neighbours.
+    """
+    kernel = cv2.getGaussianKernel(2 * math.ceil(_REACH * blur_px * scale) + 1, blur_px * scale)[:, 0]
+    squares, products = float(kernel @ kernel), float(kernel[1:] @ kernel[:-1])
+    return float((squares - 2 * spread * (squares - products)) * scale) ** -2
 
 
 def blurred(image: Image, blur_px: float) -> Image:
