@@ -245,7 +245,7 @@ def test_doubts_and_lost_frames_are_in_record_report_and_warnings(plan_of: Calla
     ]
     page = (tmp_path / "run" / "report.html").read_text()
     assert page.count(doubt) == 1
-    assert all(text in page for text in ("280 to 299", "median parallax deg", "from above", "doubtful", "pose-errors-"))
+    assert all(text in page for text in ("280 to 299", "median parallax (°)", "from above", "doubtful", "pose-errors-"))
 
 
 @pytest.mark.parametrize(
