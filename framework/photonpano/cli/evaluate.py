@@ -10,6 +10,9 @@ from photonpano.cli.options import Json
 if TYPE_CHECKING:
     from photonpano.evaluation import Evaluation, ImageScore, PoseScore
 
+_FEW = 0.1
+"""Share of positions within 3 expected errors below which poses and truth hardly belong together."""
+
 
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", show_default=False)],
@@ -35,12 +38,17 @@ def evaluate(
     import json
 
     from photonpano.api.runs import evaluate as evaluate_run
+    from photonpano.cli.errors import warn
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.tables import columns
     from photonpano.evaluation import evaluate_poses, has_poses
 
     if has_poses(run):
         score = evaluate_poses(run, truth)
+        if score.honest_shares is not None and score.honest_shares[2] < _FEW:
+            warn(
+                f"{100 * score.honest_shares[2]:.0f} % of the positions are within 3 std_position: is {truth} of this capture?"
+            )
         typer.echo(json.dumps(_pose_data(score), indent=2) if as_json else columns(_pose_rows(score)))
         return
     evaluation = evaluate_run(run, truth, oracle, progress_for_stderr())

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,17 @@ def test_command_prints_ate_and_rpe(folder: Path, tmp_path: Path) -> None:
     assert "position error (ATE), rms" in done.stdout
     assert "RPE over 2 frames, rms" in done.stdout
     assert '"std_ratio": ' in CliRunner().invoke(app, [*arguments, "--json"]).stdout
+    assert "of this capture?" not in done.stderr
+
+
+def test_truth_of_another_path_is_warned_of(folder: Path, tmp_path: Path) -> None:
+    there_and_back = np.concatenate([path()[::2], path()[::-2]])
+    np.savez(tmp_path / "other.npz", camera_from_world=there_and_back)
+    done = CliRunner().invoke(app, ["evaluate", str(folder), "--truth", str(tmp_path / "other.npz")])
+    assert done.exit_code == 0, done.output
+    assert re.search(
+        r"warning: \d % of the positions are within 3 std_position: is .*other\.npz of this capture\?\n", done.stderr
+    )
 
 
 @pytest.mark.parametrize(
