@@ -27,7 +27,7 @@ _SMOOTHING_PX = 5.0
 _FINEST = {17: 0}
 """Level of the pyramid at which optical flow of a round ends: 0 is the grid itself; 1, half of it, by default."""
 _PATCH_STEP_PX, _DESCENT_STEPS = 4, 12
-"""Distance of the patches of optical flow, and steps of each: as exact as more of them, in half the time."""
+"""Distance of the patches of optical flow, and steps of each: as exact as more of them, and faster."""
 _PRIOR = 1e-4
 """Weight of no motion, relative to that of a sub-exposure at an end of the group."""
 _CLIPPED = 0.2, 99.8

@@ -13,6 +13,8 @@ from photonpano.testing import MemorySource
 from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig, RobustMergeConfig
 from photonpano_core.dense_motion.field import MotionField
 from photonpano_core.dense_motion.local_flow import LocalFlowMerger, number_of
+from photonpano_core.dense_motion.polynomials import fit_each
+from photonpano_core.dense_motion.sub_exposures import blurred, noise_area_px2
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.robust_merge import RobustMerger
 
@@ -213,3 +215,38 @@ def test_filled_field_takes_the_nearest_known_motion() -> None:
     filled = MotionField(coefficients).filled(known).coefficients
     np.testing.assert_array_equal(filled[:, 0, 1], coefficients[:, 2, 0])
     np.testing.assert_array_equal(filled[:, 4, 4], coefficients[:, 2, 5])
+
+
+def test_polynomials_are_fitted_at_each_pixel() -> None:
+    rng = np.random.default_rng(0)
+    wanted = rng.standard_normal((3, 2, 4, 2))
+    times, trusts = np.linspace(-1, 1, 9), rng.uniform(0.5, 1, (9, 2, 4))
+    powers = times ** np.arange(1, 7)[:, None]
+    flows = np.tensordot(powers[:3].T, wanted, axes=1)
+    moments = np.tensordot(powers[1:], trusts, axes=1).astype(np.float32)
+    right = np.tensordot(powers[:3], trusts[..., None] * flows, axes=1).astype(np.float32)
+    where = np.ones((2, 4), bool)
+    where[1, 2] = False
+    found = np.zeros((3, 2, 4, 2), np.float32)
+    fit_each(moments, right, 1e-9, where, found)
+    np.testing.assert_allclose(found[:, where], wanted[:, where], atol=1e-4)
+    assert not found[:, ~where].any()
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5])
+def test_noise_of_halved_frames_is_that_of_its_area(fraction: float) -> None:
+    """Halved, interpolated at a fraction of a pixel, and blurred."""
+    noise = np.random.default_rng(0).standard_normal((600, 600)).astype(np.float32)
+    half = cv2.resize(noise, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    for axis in range(2):
+        half = (1 - fraction) * half + fraction * np.roll(half, 1, axis)
+    std = blurred(half.astype(np.float32), 1.2 * 0.5)[5:-5, 5:-5].std()
+    area = noise_area_px2(1.2, 0.5, fraction * (1 - fraction))
+    assert std == pytest.approx(area**-0.5, rel=0.03)
+
+
+def test_frames_of_odd_size_are_merged_to_their_border(motion: Trajectory) -> None:
+    crossed = capture(crossed=True).frames(FrameSpan(0, N))[:, :-1, :-1]
+    found, other = (merger.merge(MemorySource(crossed), GROUP, motion, 1.0) for merger in (local_flow(), plain()))
+    assert found.flux.shape == (HEIGHT - 1, WIDTH - 1)
+    np.testing.assert_allclose(found.flux[-1, 10:-10], other.flux[-1, 10:-10], rtol=0.05)
