@@ -99,8 +99,8 @@ class LocalFlowConfig(Config):
 
     sub_exposures: Literal["auto", 3, 5, 9, 17, 33] = Field(
         "auto",
-        description="parts of a group that are compared and weighted; auto takes 33 or 17 of at least 8 photons per pixel "
-        "each, else 9, 5 or 3 of at least 2, and in less light merges as photon-mle does",
+        description="parts of a group that are compared and weighted; auto takes 17 of at least 8 photons per pixel each, "
+        "33 where something moves fast, else 9, 5 or 3 of at least 2, and in less light merges as photon-mle does",
     )
     significance: float = Field(
         4.0,
