@@ -17,7 +17,6 @@ from photonpano import (
     FluxImage,
     FrameSpan,
     Group,
-    LinearlyCorrectedSource,
     LocationError,
     LostFrames,
     PosedView,
@@ -33,6 +32,7 @@ from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.pose_spline import PoseSpline, left_out, positions_of
+from photonpano_colmap.posing.merging import lit_counts
 from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
 from photonpano_colmap.reversal import Readings
 
@@ -313,9 +313,8 @@ def parallax(piece: Piece) -> FloatArray:
 
 def _exposure(source: Source, span: FrameSpan) -> VirtualExposure:
     """Average the frames of a span."""
-    counts, frames = source.counts(span), len(span)
-    lit = source.corrected(counts, frames) if isinstance(source, LinearlyCorrectedSource) else counts
-    flux = source.response.flux((lit / np.float32(frames)).astype(np.float32), float(frames))
+    frames = len(span)
+    flux = source.response.flux(lit_counts(source, span) / np.float32(frames), float(frames))
     weight = np.where(source.valid, frames, 0).astype(np.float32)
     flux = np.where(source.valid, flux, np.nan).astype(np.float32)
     return VirtualExposure(flux, weight, Group(span, span.centre), 1.0, source.response)

@@ -26,6 +26,7 @@ from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.merging import PosedExposure
+from photonpano_colmap.posing.path import Path
 
 _DENSER = 1.5
 """Exposures of a level, relative to the one before."""
@@ -55,11 +56,11 @@ class StratifiedEstimator:
         if not first.located.all():
             return replace(first, doubts=(*first.doubts, _NOT_REFINED))
         instants = np.array([view.instant for view in first.views])
-        path = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
-        scene, levels = Scene(path, first.points.positions), list(first.levels)
+        spline = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
+        scene, levels = Scene(Path(spline.at(_frames(source))), first.points.positions), list(first.levels)
         with ThreadPoolExecutor(self._context.threads) as pool:
             for number, size in enumerate(self._sizes(len(first.views[0].span)), start=2):
-                before = scene.path.at(_frames(source))
+                before = scene.path.poses
                 with progress.stage(f"level {number}: merge, locate, adjust", 1, "level") as advance:
                     level = refine(source, scene, size, first.camera_matrix, pool)
                     advance(1)
@@ -91,7 +92,7 @@ class _Assembly:
 
     def estimate(self) -> PoseEstimate:
         level, frames = self.level, _frames(self.source)
-        poses = level.path.at(frames)
+        poses = level.path.poses.copy()
         instants = np.array([group.reference for group in level.groups])[level.located]
         stds = [np.interp(frames, instants, std) for std in (level.adjusted.std_position, level.adjusted.std_rotation)]
         moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)

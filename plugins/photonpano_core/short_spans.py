@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
+from photonpano.filtering import SIGNIFICANT, SLOW, SYSTEMATIC_PX, WINDOW, Filtered, exceeding_noise
 from photonpano.geometry import apply, corners, inverse, normalised, step_motions
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.uneven_noise import separated
 
-_WINDOW_SPANS = 128
-"""Longest window of the spectra, in spans: the tremor may change from one window to the next."""
 _FEWEST_SPANS = 16
 """Fewer spans than this have no spectrum."""
-_SIGNIFICANT = 3.0
-"""A frequency is corrected if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies."""
-_SYSTEMATIC_PX = 0.015
-"""Shifts are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
-_SLOW_BINS, _SLOW_PX = 2, 0.04
-"""The two lowest frequencies of a window must exceed an error of this size, too: the panorama follows a slow motion, and is
-no better itself."""
 _DARK, _DARK_SHARE = 10.0, 0.05
 """The light goes out, as between two flickers, if the variance of this share of the steps is this many times the usual one."""
 _SMOOTH_SPANS = 16.0
@@ -33,19 +22,6 @@ _NAMED_LINES = 3
 """Frequencies that a summary names at most."""
 _NAMED_SHARE = 0.003
 """A frequency is named if its peak has at least this share of the power."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Filtered:
-    """One mode of the motion after a Wiener filter.
-
-    Attributes:
-        signal: (S,) what exceeds the noise.
-        std: (S,) the noise that the filter let through, as an expected error.
-    """
-
-    signal: FloatArray
-    std: FloatArray
 
 
 class ShortSpansRefiner:
@@ -78,7 +54,7 @@ class ShortSpansRefiner:
             wiggles = _wiggles(trajectory, instants, self._shape) * to_px
             modes = [_through_the_dark(*columns) for columns in zip(steps.T, wiggles.T, variances.T, strict=True)]
         else:
-            modes = [_filtered(*columns) for columns in zip(steps.T, variances.T, strict=True)]
+            modes = [exceeding_noise(*columns) for columns in zip(steps.T, variances.T, strict=True)]
         shift_px = float(np.sqrt(sum(np.mean(mode.signal**2) for mode in modes)))
         if shift_px < self._config.smallest_px:
             return None
@@ -124,55 +100,13 @@ def _variances(information: FloatArray) -> FloatArray:
     return np.where(known & (variances > 0), variances, np.inf)
 
 
-def _filtered(steps: FloatArray, variances: FloatArray) -> _Filtered:
-    """Filter a series of steps by its own spectrum, window by window.
-
-    Args:
-        steps: (S,) in px.
-        variances: (S,) of their photon noise; infinite where a step is unknown.
-    """
-    size = min(_WINDOW_SPANS, 2 ** int(np.log2(len(steps))))
-    known = np.isfinite(variances)
-    if known.sum() < size // 2:
-        return _Filtered(np.zeros(len(steps)), np.zeros(len(steps)))
-    # A step of large noise, over a dark place, would drown its window: it counts for less.
-    typical = float(np.median(variances[known]))
-    trust = np.where(known, typical / (typical + np.maximum(variances - typical, 0)), 0.0)
-    noise = (
-        np.where(known, np.minimum(variances, typical / np.maximum(trust, 1e-9)), 0.0) * trust**2 + _SYSTEMATIC_PX**2 * trust**2
-    )
-    half = size // 2
-    n_windows = -(-len(steps) // half) + 1
-    end = (n_windows + 1) * half - len(steps) - half
-    series, variance = (np.pad(each, (half, end), mode="reflect") for each in (steps * trust, noise))
-    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size)
-    windows = np.fft.rfft(sliding_window_view(series, size)[::half] * taper)
-    expected = sliding_window_view(variance, size)[::half] @ taper**2
-    floor = np.tile(expected[:, None], windows.shape[1])
-    floor[:, :_SLOW_BINS] += (_SLOW_PX * taper.sum()) ** 2
-    excess = np.abs(windows) ** 2 / np.maximum(floor, 1e-30)
-    mean = _mean_of_neighbours(excess)
-    gain = np.where(mean > _SIGNIFICANT, 1 - 1 / np.maximum(mean, 1), 0)
-    restored = np.fft.irfft(windows * gain, size) * taper
-    # Each frequency between the first and the last counts twice, for its negative.
-    weights = np.r_[1, np.full(half - 1, 2), 1] / size
-    let_through = (gain * weights).sum(axis=1) * expected / (size / 2)
-    signal, spread = np.zeros(len(series)), np.zeros(len(series))
-    for window in range(len(windows)):
-        place = slice(window * half, window * half + size)
-        signal[place] += restored[window]
-        spread[place] += let_through[window] * taper**2
-    inner = slice(half, half + len(steps))
-    return _Filtered(signal[inner], np.sqrt(spread[inner]))
-
-
 def _goes_dark(variances: FloatArray) -> bool:
     """Return whether many steps are far less certain than the others, as between two flickers: variances are (S, 4)."""
     noise = variances[:, 0]
     return bool(np.mean(noise > _DARK * np.median(noise)) > _DARK_SHARE)
 
 
-def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> _Filtered:
+def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:
     """Filter one mode where the light goes out.
 
     What the motion does in the dark follows from what it does before and after, and not from the steps, which vanish there once
@@ -183,10 +117,10 @@ def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatAr
         wiggles: (S,) what the trajectory does faster than a smooth one.
         variances: (S,) of the photon noise of the steps.
     """
-    size = min(_WINDOW_SPANS, len(steps))
-    noise = variances + _SYSTEMATIC_PX**2
-    found = separated(wiggles + steps, noise, size, _SIGNIFICANT, (_SLOW_BINS, _SLOW_PX))
-    return _Filtered(found.signal - wiggles, found.std)
+    size = min(WINDOW, len(steps))
+    noise = variances + SYSTEMATIC_PX**2
+    found = separated(wiggles + steps, noise, size, SIGNIFICANT, SLOW)
+    return Filtered(found.signal - wiggles, found.std)
 
 
 def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
@@ -205,8 +139,3 @@ def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[in
     x, y = wiggles[:, 0].copy(), wiggles[:, 1].copy()
     wiggles[:, 0], wiggles[:, 1] = cosine * x + sine * y, cosine * y - sine * x
     return wiggles
-
-
-def _mean_of_neighbours(image: FloatArray) -> FloatArray:
-    """Return the mean of 3 x 3 values; the border is repeated."""
-    return np.asarray(sliding_window_view(np.pad(image, 1, mode="edge"), (3, 3)).mean(axis=(2, 3)))

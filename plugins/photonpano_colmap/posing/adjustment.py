@@ -68,6 +68,7 @@ class Adjusted:
         poses: (V, 3, 4).
         points: (N, 3).
         confirmed: (N,) points that at least 3 exposures see where they should be.
+        information: (V, 6, 6) of each pose while the others rest: a rotation vector of the camera, and a shift in the world.
         std_position: (V,) expected distance of a camera from its true place, after the best alignment of all.
         std_rotation: (V,) expected angle in radians, after that alignment.
         residual_px: median distance of a sighting from where its point is seen.
@@ -76,6 +77,7 @@ class Adjusted:
     poses: FloatArray
     points: FloatArray
     confirmed: NDArray[np.bool_]
+    information: FloatArray
     std_position: FloatArray
     std_rotation: FloatArray
     residual_px: float
@@ -92,7 +94,7 @@ def adjust(poses: FloatArray, points: FloatArray, sightings: Sightings, camera_m
     """
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(_MOST_STEPS)
-    settings.setRelativeErrorTol(1e-6)
+    settings.setRelativeErrorTol(1e-4)
     covariance, shared = sightings.covariance + _FLOOR_PX**2 * np.eye(2), _shared(sightings)
     for _ in range(_REWEIGHTINGS):
         graph, values = _problem(poses, points, sightings, covariance * shared[:, None, None], camera_matrix)
@@ -110,13 +112,16 @@ def adjust(poses: FloatArray, points: FloatArray, sightings: Sightings, camera_m
         covariance = covariance * of_point[sightings.points, None, None] + _FLOOR_PX**2 * np.eye(2)
     fits = squares < _OUTLIER**2 * of_point[sightings.points]
     confirmed = np.bincount(sightings.points[fits], minlength=len(points)) >= _SEEN_BY
-    std_position, std_rotation = _uncertainty(graph, values, poses, len(points))
+    information = _information(graph, values, poses, len(points))
+    of_views = information.reshape(len(poses), 6, len(poses), 6)[np.arange(len(poses)), :, np.arange(len(poses))]
+    variances = np.diag(without_gauge(information, poses)).reshape(len(poses), 2, 3).sum(axis=2)
     return Adjusted(
         poses,
         points,
         confirmed,
-        std_position,
-        std_rotation,
+        of_views,
+        np.sqrt(variances[:, 1]),
+        np.sqrt(variances[:, 0]),
         float(np.median(np.linalg.norm(residuals, axis=1))),
     )
 
@@ -147,10 +152,8 @@ def _problem(
     return graph, values
 
 
-def _uncertainty(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, poses: FloatArray, n_points: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the expected errors of places, (V,), and of rotations in radians, (V,), where the world itself is free."""
+def _information(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, poses: FloatArray, n_points: int) -> FloatArray:
+    """Return the information of all poses, whatever the points: (6 V, 6 V); see the convention of `pose_noise`."""
     n_views = len(poses)
     order = gtsam.Ordering()
     for point in range(n_points):
@@ -165,8 +168,7 @@ def _uncertainty(
     for view, rotation in enumerate(poses[:, :, :3]):
         turn, move = slice(6 * view, 6 * view + 3), slice(6 * view + 3, 6 * view + 6)
         to_own[turn, turn], to_own[move, move] = -np.eye(3), rotation
-    variances = np.diag(without_gauge(to_own.T @ information @ to_own, poses)).reshape(n_views, 2, 3).sum(axis=2)
-    return np.sqrt(variances[:, 1]), np.sqrt(variances[:, 0])
+    return np.asarray(to_own.T @ information @ to_own)
 
 
 def _shared(sightings: Sightings) -> FloatArray:

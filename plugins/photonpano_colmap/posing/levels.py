@@ -15,7 +15,8 @@ from photonpano_colmap.posing.adjustment import Adjusted, Sightings, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
-from photonpano_colmap.posing.path import CorrectedPath, Path, between
+from photonpano_colmap.posing.path import Path, between, moves
+from photonpano_colmap.posing.tremor import Tremor, exceeding_noise_of_modes, find_tremor
 
 _PATCHES = 300
 """Patches of a key exposure."""
@@ -31,6 +32,8 @@ _LEAST_SIGHTINGS = 20
 """An exposure with fewer sightings is not located."""
 _LEAST_LOCATED = 5
 """Exposures that a path needs at least."""
+_MOST_TREMORS, _LEFT_PX = 4, 0.1
+"""Corrections of a tremor in a level, at most; fewer if one moves the image by less than this."""
 _OUT_OF_SIGHT = 0.8
 """Exposures are not compared if the middle of one lies further than this from that of the other, in sides of a frame."""
 
@@ -49,6 +52,21 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """The exposures of a level.
+
+    Attributes:
+        exposures: of all groups.
+        path: along which they are merged.
+        tremor: what was last corrected in the path; None if the capture is too short to tell.
+    """
+
+    exposures: Sequence[PosedExposure]
+    path: Path
+    tremor: Tremor | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PosedLevel:
     """The exposures of a level, located.
 
@@ -59,6 +77,7 @@ class PosedLevel:
         sightings: of these points, in the located exposures.
         exposures: all of them.
         path: of the camera.
+        tremor: what was corrected last before the exposures were located.
     """
 
     groups: Sequence[Group]
@@ -67,6 +86,7 @@ class PosedLevel:
     sightings: Sightings
     exposures: Sequence[PosedExposure]
     path: Path
+    tremor: Tremor | None
 
     @property
     def scene(self) -> Scene:
@@ -75,11 +95,11 @@ class PosedLevel:
 
 
 def refine(source: Source, scene: Scene, group_size: int, camera_matrix: FloatArray, pool: ThreadPoolExecutor) -> PosedLevel:
-    """Locate denser groups (paper, section 4), merged and registered through the depth of the scene."""
+    """Locate groups (paper, section 4) that are merged and registered through the depth of the scene."""
     groups = resample(source.info.n_frames, group_size)
-    exposures = merge(source, groups, scene, camera_matrix, pool)
-    points, sightings = locate(exposures, camera_matrix, pool)
-    return interpolate(groups, exposures, points, sightings, scene, camera_matrix)
+    merged = merge(source, groups, scene, camera_matrix, pool)
+    points, sightings = locate(merged.exposures, camera_matrix, pool)
+    return interpolate(groups, merged, points, sightings, camera_matrix)
 
 
 def resample(n_frames: int, group_size: int) -> tuple[Group, ...]:
@@ -92,18 +112,31 @@ def resample(n_frames: int, group_size: int) -> tuple[Group, ...]:
 
 def merge(
     source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: FloatArray, pool: ThreadPoolExecutor
-) -> list[PosedExposure]:
-    """Merge each group as its reference instant sees it."""
+) -> Merged:
+    """Merge each group as its reference instant sees it: along the path, and along the tremor that its frames show then."""
 
-    def merged(group: Group) -> PosedExposure:
-        pose = scene.path.at([group.reference])[0]
-        depth = inverse_depth_of(pose, scene.points, camera_matrix, source.info.frame_shape)
+    def depth_of(group: Group) -> NDArray[np.float32]:
+        pose, shape = scene.path.at([group.reference])[0], source.info.frame_shape
+        depth = inverse_depth_of(pose, scene.points, camera_matrix, shape)
         if depth is None:  # the sightings tell whether this view is of any use
             seen = scene.points @ pose[2, :3] + pose[2, 3]
-            depth = np.full(source.info.frame_shape, 1 / np.median(seen[seen > 0]) if (seen > 0).any() else 0, np.float32)
-        return merge_through_depth(source, group, scene.path, depth, camera_matrix)
+            depth = np.full(shape, 1 / np.median(seen[seen > 0]) if (seen > 0).any() else 0, np.float32)
+        return depth
 
-    return list(pool.map(merged, groups))
+    def along(path: Path) -> list[PosedExposure]:
+        return list(pool.map(lambda *each: merge_through_depth(source, each[0], path, each[1], camera_matrix), groups, depths))
+
+    path, depths = scene.path, list(pool.map(depth_of, groups))
+    exposures, tremor = along(path), None
+    for _ in range(_MOST_TREMORS):
+        tremor = find_tremor(source, exposures, path, camera_matrix, pool)
+        if tremor is None or tremor.rms_px == 0:
+            break
+        path = path.moved(tremor.steps)
+        exposures = along(path)
+        if tremor.rms_px < _LEFT_PX:
+            break
+    return Merged(exposures, path, tremor)
 
 
 def locate(
@@ -150,18 +183,14 @@ def locate(
 
 
 def interpolate(
-    groups: Sequence[Group],
-    exposures: Sequence[PosedExposure],
-    points: FloatArray,
-    sightings: Sightings,
-    scene: Scene,
-    camera_matrix: FloatArray,
+    groups: Sequence[Group], merged: Merged, points: FloatArray, sightings: Sightings, camera_matrix: FloatArray
 ) -> PosedLevel:
     """Adjust exposures and points to the sightings, and correct the path by the poses of the exposures.
 
     Raises:
         LocationError: few exposures show points of others.
     """
+    exposures = merged.exposures
     located = np.bincount(sightings.views, minlength=len(exposures)) >= _LEAST_SIGHTINGS
     if located.sum() < _LEAST_LOCATED:
         raise LocationError(
@@ -175,9 +204,13 @@ def interpolate(
     poses = np.array([exposure.pose for exposure in exposures])[located]
     adjusted = adjust(poses, points, sightings, camera_matrix)
     kept = [group for group, is_located in zip(groups, located, strict=True) if is_located]
-    instants = np.array([group.reference for group in kept])
-    path = CorrectedPath(scene.path, _borders(kept), instants, adjusted.poses)
-    return PosedLevel(groups, located, adjusted, sightings, exposures, path)
+    depth = np.median([np.median(each.inverse_depth) for each in exposures])
+    units = float(camera_matrix[0, 0]) * np.array([1, 1, 1, depth, depth, depth])
+    covariance = np.linalg.inv(adjusted.information / units[:, None] / units)
+    means, _ = exceeding_noise_of_modes(moves(poses, adjusted.poses) * units, covariance)
+    return PosedLevel(
+        groups, located, adjusted, sightings, exposures, merged.path.corrected(_borders(kept), means / units), merged.tremor
+    )
 
 
 def _borders(groups: Sequence[Group]) -> FloatArray:

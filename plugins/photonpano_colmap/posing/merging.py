@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photonpano import FloatArray, Group, Source, VirtualExposure
+from photonpano import FloatArray, FrameSpan, Group, LinearlyCorrectedSource, Source, VirtualExposure
 from photonpano.compiling import compiled
 from photonpano.geometry import inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
 from photonpano_colmap.posing.path import Path, between
 
-_CHUNK_PX = 0.5
+_CHUNK_PX = 1.0
 """Frames that move less than this are summed before they are warped."""
 
 
@@ -53,7 +53,7 @@ def merge_through_depth(
     plane = _Plane(path, pose, float(np.median(inverse_depth)), camera_matrix)
     for chunk in chunks_of(group.span, plane, source.info.frame_shape, _CHUNK_PX):
         turn, shift = between(pose, path.at([chunk.span.centre])[0], camera_matrix)
-        frames = source.counts(chunk.span).astype(np.float32) * valid
+        frames = lit_counts(source, chunk.span) * valid
         _add(frames, valid * np.float32(len(chunk.span)), inverse_depth, turn, shift, counts, weight)
     flux, seen = PhotonSum(counts, weight).estimate(source.response)
     return PosedExposure(VirtualExposure(flux, seen, group, 1.0, source.response), pose, inverse_depth)
@@ -67,11 +67,16 @@ class _Plane:
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the maps from pixels of frames to those of the view: (N, 3, 3)."""
-        maps = []
-        for pose in self._path.at(frame_indices):
-            turn, shift = between(self._pose, pose, self._matrix)
-            maps.append(turn + self._inverse_depth * np.outer(shift, [0, 0, 1]))
-        return scaled_ahead(inverse(np.array(maps)))
+        maps, shifts = between(self._pose, self._path.at(frame_indices), self._matrix)
+        maps[:, :, 2] += self._inverse_depth * shifts
+        return scaled_ahead(inverse(maps))
+
+
+def lit_counts(source: Source, span: FrameSpan) -> NDArray[np.float32]:
+    """Return the sum of the frames of a span, of the flux alone: (H, W)."""
+    counts = source.counts(span)
+    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
+    return lit.astype(np.float32)
 
 
 @compiled

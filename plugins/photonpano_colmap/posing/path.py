@@ -1,69 +1,77 @@
-"""The path of a camera through space, interpolated between located instants.
+"""The path of a camera through space: a pose for every frame.
 
 Convention:
-    A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead.
+    A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead. A small motion
+    (w, v) of a camera, in its own axes, maps X_c to X_c + w x X_c + v.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation
 
 from photonpano import FloatArray
+from photonpano.geometry import rotation_matrices, rotation_vectors
 from photonpano_colmap.pose_spline import positions_of
 
 _DEGREE = 5
 """Degree of the spline through the integral of a correction."""
 
 
-class Path(Protocol):
-    """Poses of a camera at any instant."""
+class Path:
+    """The poses of all frames, interpolated between them."""
+
+    def __init__(self, poses: FloatArray) -> None:
+        """Take the (T, 3, 4) poses of at least two frames."""
+        self.poses = poses
+        self._centres = positions_of(poses)
 
     def at(self, instants: ArrayLike) -> FloatArray:
-        """Return the poses of M instants, in frames: (M, 3, 4)."""
-        ...
+        """Return the poses of M instants, in frames: (M, 3, 4). Before the first frame and after the last, the camera rests."""
+        at = np.clip(np.atleast_1d(np.asarray(instants, dtype=np.float64)), 0, len(self.poses) - 1)
+        first = np.minimum(at.astype(int), len(self.poses) - 2)
+        share = (at - first)[:, None, None]
+        rotations = (1 - share) * self.poses[first, :, :3] + share * self.poses[first + 1, :, :3]
+        # A mean of two rotations is one that shrinks; a step of Newton's method undoes that.
+        rotations = rotations @ (3 * np.eye(3) - np.swapaxes(rotations, 1, 2) @ rotations) / 2
+        centres = (1 - share[:, 0]) * self._centres[first] + share[:, 0] * self._centres[first + 1]
+        return posed(rotations, centres)
 
+    def corrected(self, borders: FloatArray, means: FloatArray) -> Path:
+        """Return this path, corrected where groups of frames were located along it.
 
-class CorrectedPath:
-    """A path, corrected where groups of frames were located along it.
-
-    The frames of a group were merged along the path, so that where the group is located tells the mean correction of all of its
-    frames, and not that of one instant. The correction is the smooth function with these means: the derivative of a spline
-    through its integral at the borders of the groups.
-    """
-
-    def __init__(self, path: Path, borders: FloatArray, instants: FloatArray, poses: FloatArray) -> None:
-        """Correct a path.
+        The frames of a group were merged along the path, so that where the group is located tells the mean correction of all of
+        its frames, and not that of one instant. The correction is the smooth function with these means: the derivative of a
+        spline through its integral at the borders of the groups.
 
         Args:
-            path: along which the frames were merged.
             borders: (N + 1,) increasing, in frames: where groups begin and end, side by side.
-            instants: (N,) reference instants of the groups.
-            poses: (N, 3, 4) of these instants, as the groups were located.
+            means: (N, 6) corrections of the groups, as `moves` has them.
         """
-        self._path = path
-        before = path.at(instants)
-        turns = Rotation.from_matrix(poses[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2)).as_rotvec()
-        steps = np.concatenate([turns, positions_of(poses) - positions_of(before)], axis=1)
-        integral = np.concatenate([np.zeros((1, 6)), np.cumsum(steps * np.diff(borders)[:, None], axis=0)])
-        self._correction = make_interp_spline(borders, integral, k=min(_DEGREE, 2 * (len(instants) // 2) - 1)).derivative()
+        integral = np.concatenate([np.zeros((1, 6)), np.cumsum(means * np.diff(borders)[:, None], axis=0)])
+        degree = min(_DEGREE, 2 * (len(means) // 2) - 1)
+        correction = make_interp_spline(borders, integral, k=degree).derivative()(np.arange(len(self.poses)))
+        return Path(posed(rotation_matrices(correction[:, :3]) @ self.poses[:, :, :3], self._centres + correction[:, 3:]))
 
-    def at(self, instants: ArrayLike) -> FloatArray:
-        """Return the poses of M instants, in frames: (M, 3, 4)."""
-        at = np.atleast_1d(np.asarray(instants, dtype=np.float64))
-        before, correction = self._path.at(at), self._correction(at)
-        turned = Rotation.from_rotvec(correction[:, :3]).as_matrix() @ before[:, :, :3]
-        return posed(turned, positions_of(before) + correction[:, 3:])
+    def moved(self, steps: FloatArray) -> Path:
+        """Return this path with a small motion (w, v) of the camera at each frame added: (T, 6)."""
+        rotations, shifts = rotation_matrices(steps[:, :3]), steps[:, 3:]
+        poses = rotations @ self.poses
+        poses[:, :, 3] += shifts
+        return Path(poses)
 
 
 def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:
     """Return the poses of cameras with (N, 3, 3) rotations from the world, at (N, 3) places of the world: (N, 3, 4)."""
     shifts = -np.einsum("nij,nj->ni", rotations, centres)
     return np.concatenate([rotations, shifts[:, :, None]], axis=2)
+
+
+def moves(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return how poses differ, (N, 3, 4) each: rotation vectors of the camera, and shifts of its place in the world; (N, 6)."""
+    turns = rotation_vectors(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
+    return np.concatenate([turns, positions_of(after) - positions_of(before)], axis=1)
 
 
 def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -73,14 +81,15 @@ def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> t
 
     Args:
         pose: (3, 4) of the view.
-        other: (3, 4) of the other one.
-        camera_matrix: (3, 3) K of both.
+        other: (..., 3, 4) of one or several others.
+        camera_matrix: (3, 3) K of all.
 
     Returns:
-        `turn`, (3, 3), and `shift`, (3,).
+        `turn`, (..., 3, 3), and `shift`, (..., 3).
     """
-    rotation = other[:, :3] @ pose[:, :3].T
-    return camera_matrix @ rotation @ np.linalg.inv(camera_matrix), camera_matrix @ (other[:, 3] - rotation @ pose[:, 3])
+    rotation = other[..., :3] @ pose[:, :3].T
+    moved = other[..., 3] - rotation @ pose[:, 3]
+    return camera_matrix @ rotation @ np.linalg.inv(camera_matrix), moved @ camera_matrix.T
 
 
 def projected(poses: FloatArray, points: FloatArray, camera_matrix: FloatArray) -> FloatArray:

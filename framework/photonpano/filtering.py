@@ -1,0 +1,80 @@
+"""What of a series of measured steps exceeds their noise: a Wiener filter whose spectrum is that of the series itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from photonpano.values import FloatArray
+
+WINDOW = 128
+"""Longest window of the spectra, in steps: a tremor may change from one window to the next."""
+SIGNIFICANT = 3.0
+"""A frequency is kept if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies."""
+SYSTEMATIC_PX = 0.015
+"""Steps are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
+SLOW = 2, 0.04
+"""Number of the lowest frequencies of a window that must exceed an error of a size, too, and this size in px: what the steps are
+measured against follows a slow motion, and is no better itself."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Filtered:
+    """A series after a Wiener filter.
+
+    Attributes:
+        signal: (S,) what exceeds the noise.
+        std: (S,) the noise that the filter let through, as an expected error.
+    """
+
+    signal: FloatArray
+    std: FloatArray
+
+
+def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
+    """Filter a series of steps by its own spectrum, window by window.
+
+    Args:
+        steps: (S,) in px.
+        variances: (S,) of their photon noise; infinite where a step is unknown.
+    """
+    size = min(WINDOW, 2 ** int(np.log2(len(steps))))
+    known = np.isfinite(variances)
+    if known.sum() < size // 2:
+        return Filtered(np.zeros(len(steps)), np.zeros(len(steps)))
+    # A step of large noise, over a dark place, would drown its window: it counts for less.
+    typical = float(np.median(variances[known]))
+    trust = np.where(known, typical / (typical + np.maximum(variances - typical, 0)), 0.0)
+    noise = (
+        np.where(known, np.minimum(variances, typical / np.maximum(trust, 1e-9)), 0.0) * trust**2 + SYSTEMATIC_PX**2 * trust**2
+    )
+    half, (slow_bins, slow_px) = size // 2, SLOW
+    n_windows = -(-len(steps) // half) + 1
+    end = (n_windows + 1) * half - len(steps) - half
+    series, variance = (np.pad(each, (half, end), mode="reflect") for each in (steps * trust, noise))
+    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size)
+    windows = np.fft.rfft(sliding_window_view(series, size)[::half] * taper)
+    expected = sliding_window_view(variance, size)[::half] @ taper**2
+    floor = np.tile(expected[:, None], windows.shape[1])
+    floor[:, :slow_bins] += (slow_px * taper.sum()) ** 2
+    excess = np.abs(windows) ** 2 / np.maximum(floor, 1e-30)
+    mean = _mean_of_neighbours(excess)
+    gain = np.where(mean > SIGNIFICANT, 1 - 1 / np.maximum(mean, 1), 0)
+    restored = np.fft.irfft(windows * gain, size) * taper
+    # Each frequency between the first and the last counts twice, for its negative.
+    weights = np.r_[1, np.full(half - 1, 2), 1] / size
+    let_through = (gain * weights).sum(axis=1) * expected / (size / 2)
+    signal, spread = np.zeros(len(series)), np.zeros(len(series))
+    for window in range(len(windows)):
+        place = slice(window * half, window * half + size)
+        signal[place] += restored[window]
+        spread[place] += let_through[window] * taper**2
+    inner = slice(half, half + len(steps))
+    return Filtered(signal[inner], np.sqrt(spread[inner]))
+
+
+def _mean_of_neighbours(image: FloatArray) -> FloatArray:
+    """Return the mean of 3 x 3 values; the border is repeated."""
+    return np.asarray(sliding_window_view(np.pad(image, 1, mode="edge"), (3, 3)).mean(axis=(2, 3)))
