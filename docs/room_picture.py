@@ -23,7 +23,7 @@ GROUP_SIZE, FOCAL_PX, FIRST = 30, 160, 300
 """Frames of an average, the focal length of the capture, and the first frame of the exposures that are shown."""
 ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "colmap-averages": ("tab:orange", {"group_size": GROUP_SIZE}),
-    "stratified-pose": ("tab:blue", {"group_size": GROUP_SIZE, "min_group_size": 20}),
+    "stratified-pose": ("tab:blue", {"group_size": GROUP_SIZE}),
 }
 """Pose estimators, with the colours of their lines and their keys."""
 MAGNIFIED = 1.7

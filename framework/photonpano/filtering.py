@@ -16,7 +16,7 @@ SIGNIFICANT = 3.0
 SYSTEMATIC_PX = 0.015
 """Steps are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
 SLOW = 2, 0.04
-"""Number of the lowest frequencies of a window that must exceed an error of a size, too, and this size in px: what the steps are
+"""Number of the lowest frequencies of a window that must exceed an error of a size, too, and this size in px: what steps are
 measured against follows a slow motion, and is no better itself."""
 
 

@@ -60,15 +60,12 @@ class ColmapAveragesConfig(Config):
 
 
 class StratifiedPoseConfig(ColmapAveragesConfig):
-    """Averages of frames into COLMAP; then denser and denser exposures, merged and located through the depth of the scene."""
+    """Averages of frames into COLMAP; then exposures of the same frames, merged and located through the depth of the scene."""
 
     levels: int = Field(
-        4,
+        3,
         ge=2,
         le=8,
-        description="number of levels, the averages included: the second has exposures of the same frames, and each "
-        "further one about 1.5 times as many",
-    )
-    min_group_size: int = Field(
-        64, ge=4, le=100_000, description="number of frames of an exposure below which no further level is made"
+        description="number of levels, that of the averages included; each further one merges the groups anew, along the path "
+        "and through the depth that the level before found",
     )

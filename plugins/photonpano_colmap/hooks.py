@@ -40,7 +40,7 @@ def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
     )
     yield PoseEstimatorContribution(
         name="stratified-pose",
-        summary="Denser and denser exposures, merged and located through the depth of the scene; begins with colmap-averages",
+        summary="Exposures merged through the depth of the scene, without tremor, and located; begins with colmap-averages",
         config=StratifiedPoseConfig,
         build=_build_stratified,
         check=_problems_of_averages,

@@ -28,14 +28,12 @@ from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import Path
 
-_DENSER = 1.5
-"""Exposures of a level, relative to the one before."""
 _MISSED = 0.5
 """Share of the last change of a frame's pose, beyond that of its exposures, that the next level would change it by."""
 
 
 class StratifiedEstimator:
-    """Begins with the poses of averages, and locates denser and denser exposures."""
+    """Begins with the poses of averages, and merges and locates the same groups again and again along what is known by then."""
 
     def __init__(self, config: StratifiedPoseConfig, context: StageContext) -> None:
         self._config = config
@@ -53,31 +51,19 @@ class StratifiedEstimator:
                 "pose: {use: colmap-averages}"
             )
         first = AveragesEstimator(self._config, self._context).estimate(source, camera, progress)
-        if not first.located.all():
-            return replace(first, doubts=(*first.doubts, _NOT_REFINED))
         instants = np.array([view.instant for view in first.views])
         spline = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
-        scene, levels = Scene(Path(spline.at(_frames(source))), first.points.positions), list(first.levels)
+        path = Path(spline.at(_frames(source)))
+        scene, levels = Scene(path, first.located, first.points.positions), list(first.levels)
         with ThreadPoolExecutor(self._context.threads) as pool:
-            for number, size in enumerate(self._sizes(len(first.views[0].span)), start=2):
+            for number in range(2, self._config.levels + 1):
                 before = scene.path.poses
                 with progress.stage(f"level {number}: merge, locate, adjust", 1, "level") as advance:
-                    level = refine(source, scene, size, first.camera_matrix, pool)
+                    level = refine(source, scene, len(first.views[0].span), first.camera_matrix, pool)
                     advance(1)
                 scene = level.scene
                 levels.append(_record(level, scene))
         return _Assembly(source, first, level, before, tuple(levels)).estimate()
-
-    def _sizes(self, first: int) -> list[int]:
-        """Return the group sizes of the levels after the averages: the same frames, now merged sharp; then fewer and fewer."""
-        sizes = [round(first / _DENSER**index) for index in range(self._config.levels - 1)]
-        return [first, *(size for size in sizes[1:] if size >= self._config.min_group_size)]
-
-
-_NOT_REFINED = (
-    "some frames have no pose, so that the poses of the averages were not refined; choose a smaller pose.with.step, or a part "
-    "of the capture with source.with.frames"
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,14 +79,13 @@ class _Assembly:
     def estimate(self) -> PoseEstimate:
         level, frames = self.level, _frames(self.source)
         poses = level.path.poses.copy()
-        instants = np.array([group.reference for group in level.groups])[level.located]
+        instants = np.array([group.reference for group in level.groups])[level.is_located]
         stds = [np.interp(frames, instants, std) for std in (level.adjusted.std_position, level.adjusted.std_rotation)]
+        if level.tremor is not None:
+            stds = [np.hypot(stds[0], level.tremor.shift), np.hypot(stds[1], level.tremor.std)]
         moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)
         turned = _left(_turns(self.before, poses), frames, instants)
-        located = np.ones(len(frames), np.bool_)
-        lost = self._lost()
-        for each in lost:
-            located[each.span.start : each.span.stop] = False
+        located = level.scene.located
         poses[~located] = np.nan
         std_position, std_rotation = (
             np.where(located, np.hypot(std, _MISSED * missed), np.nan)
@@ -115,18 +100,19 @@ class _Assembly:
             std_rotation_deg=np.rad2deg(std_rotation),
             points=ScenePoints(level.adjusted.points, self._flux(views)),
             views=views,
-            lost=lost,
+            lost=self._lost(),
             levels=self.levels,
         )
 
     def _lost(self) -> tuple[LostFrames, ...]:
         reason = "too few patches of other exposures were found in theirs"
-        groups = zip(self.level.groups, self.level.located, strict=True)
-        return tuple(LostFrames(group.span, reason) for group, kept in groups if not kept)
+        groups = zip(self.level.groups, self.level.is_located, strict=True)
+        lost = [LostFrames(group.span, reason) for group, is_located in groups if not is_located]
+        return tuple(sorted([*self.first.lost, *lost], key=lambda each: each.span.start))
 
     def _views(self) -> tuple[PosedView, ...]:
         level, views = self.level, []
-        kept = [each for each, located in zip(level.exposures, level.located, strict=True) if located]
+        kept = [each for each, located in zip(level.exposures, level.is_located, strict=True) if located]
         for number, (posed, pose) in enumerate(zip(kept, level.adjusted.poses, strict=True)):
             seen = level.sightings.views == number
             # A point is sought from several key exposures, but is one point of one of them: it is seen once.
@@ -175,7 +161,7 @@ def _record(level: PosedLevel, scene: Scene) -> dict[str, float | int | str | No
     return {
         "group_frames": len(level.groups[0].span),
         "averages": len(level.groups),
-        "located": int(level.located.sum()),
+        "located": int(level.is_located.sum()),
         "points": len(scene.points),
         "residual_px": level.adjusted.residual_px,
         "std_position": float(np.sqrt(np.mean(level.adjusted.std_position**2))) / length if length else None,

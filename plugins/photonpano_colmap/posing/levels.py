@@ -10,13 +10,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FloatArray, FrameSpan, Group, LocationError, Source
+from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Source
 from photonpano_colmap.posing.adjustment import Adjusted, Sightings, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
 from photonpano_colmap.posing.path import Path, between, moves
-from photonpano_colmap.posing.tremor import Tremor, exceeding_noise_of_modes, find_tremor
+from photonpano_colmap.posing.smoothing import exceeding_noise_of_poses
+from photonpano_colmap.posing.tremor import Tremor, find_tremor
 
 _PATCHES = 300
 """Patches of a key exposure."""
@@ -32,8 +33,9 @@ _LEAST_SIGHTINGS = 20
 """An exposure with fewer sightings is not located."""
 _LEAST_LOCATED = 5
 """Exposures that a path needs at least."""
-_MOST_TREMORS, _LEFT_PX = 4, 0.1
-"""Corrections of a tremor in a level, at most; fewer if one moves the image by less than this."""
+_MOST_TREMORS, _LEFT_PX = 4, 0.02
+"""Corrections of a tremor in a level, at most; fewer if the next would move the image by less than this, or by more than the
+last: then it is not tremor that spans show, but depth that is wrong."""
 _OUT_OF_SIGHT = 0.8
 """Exposures are not compared if the middle of one lies further than this from that of the other, in sides of a frame."""
 
@@ -44,10 +46,12 @@ class Scene:
 
     Attributes:
         path: of the camera.
+        located: (T,) frames whose pose is known.
         points: (N, 3) of the world.
     """
 
     path: Path
+    located: BoolArray
     points: FloatArray
 
 
@@ -58,7 +62,7 @@ class Merged:
     Attributes:
         exposures: of all groups.
         path: along which they are merged.
-        tremor: what was last corrected in the path; None if the capture is too short to tell.
+        tremor: what was last found; None if the capture is too short to tell.
     """
 
     exposures: Sequence[PosedExposure]
@@ -72,16 +76,16 @@ class PosedLevel:
 
     Attributes:
         groups: of the exposures.
-        located: (V,) bool.
+        is_located: (V,) bool.
         adjusted: poses of the located exposures, and points.
         sightings: of these points, in the located exposures.
         exposures: all of them.
         path: of the camera.
-        tremor: what was corrected last before the exposures were located.
+        tremor: what was found last before the exposures were located.
     """
 
     groups: Sequence[Group]
-    located: NDArray[np.bool_]
+    is_located: BoolArray
     adjusted: Adjusted
     sightings: Sightings
     exposures: Sequence[PosedExposure]
@@ -91,28 +95,33 @@ class PosedLevel:
     @property
     def scene(self) -> Scene:
         """What the next level begins with."""
-        return Scene(self.path, self.adjusted.points[self.adjusted.confirmed])
+        located = np.zeros(len(self.path.poses), np.bool_)
+        for group, is_located in zip(self.groups, self.is_located, strict=True):
+            located[group.span.start : group.span.stop] = is_located
+        return Scene(self.path, located, self.adjusted.points[self.adjusted.confirmed])
 
 
 def refine(source: Source, scene: Scene, group_size: int, camera_matrix: FloatArray, pool: ThreadPoolExecutor) -> PosedLevel:
     """Locate groups (paper, section 4) that are merged and registered through the depth of the scene."""
-    groups = resample(source.info.n_frames, group_size)
+    groups = resample(scene.located, group_size)
     merged = merge(source, groups, scene, camera_matrix, pool)
     points, sightings = locate(merged.exposures, camera_matrix, pool)
     return interpolate(groups, merged, points, sightings, camera_matrix)
 
 
-def resample(n_frames: int, group_size: int) -> tuple[Group, ...]:
-    """Return groups side by side, of about this size."""
-    number = max(1, round(n_frames / group_size))
-    borders = [round(index * n_frames / number) for index in range(number + 1)]
-    spans = [FrameSpan(start, stop) for start, stop in pairwise(borders)]
-    return tuple(Group(span, span.centre) for span in spans)
+def resample(located: BoolArray, group_size: int) -> tuple[Group, ...]:
+    """Return groups side by side, of about this size, that cover the located frames, (T,)."""
+    groups = []
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], located, [False]]).astype(np.int8)))
+    for start, stop in ends.reshape(-1, 2).tolist():
+        number = max(1, round((stop - start) / group_size))
+        borders = np.linspace(start, stop, number + 1).round().astype(int).tolist()
+        spans = [FrameSpan(*each) for each in pairwise(borders)]
+        groups += [Group(span, span.centre) for span in spans]
+    return tuple(groups)
 
 
-def merge(
-    source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: FloatArray, pool: ThreadPoolExecutor
-) -> Merged:
+def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: FloatArray, pool: ThreadPoolExecutor) -> Merged:
     """Merge each group as its reference instant sees it: along the path, and along the tremor that its frames show then."""
 
     def depth_of(group: Group) -> NDArray[np.float32]:
@@ -129,13 +138,11 @@ def merge(
     path, depths = scene.path, list(pool.map(depth_of, groups))
     exposures, tremor = along(path), None
     for _ in range(_MOST_TREMORS):
-        tremor = find_tremor(source, exposures, path, camera_matrix, pool)
-        if tremor is None or tremor.rms_px == 0:
+        before, tremor = tremor, find_tremor(source, exposures, path, camera_matrix, pool)
+        if tremor is None or tremor.rms_px < _LEFT_PX or (before and tremor.rms_px > before.rms_px):
             break
-        path = path.moved(tremor.steps)
+        path = path.turned(tremor.turns)
         exposures = along(path)
-        if tremor.rms_px < _LEFT_PX:
-            break
     return Merged(exposures, path, tremor)
 
 
@@ -206,8 +213,8 @@ def interpolate(
     kept = [group for group, is_located in zip(groups, located, strict=True) if is_located]
     depth = np.median([np.median(each.inverse_depth) for each in exposures])
     units = float(camera_matrix[0, 0]) * np.array([1, 1, 1, depth, depth, depth])
-    covariance = np.linalg.inv(adjusted.information / units[:, None] / units)
-    means, _ = exceeding_noise_of_modes(moves(poses, adjusted.poses) * units, covariance)
+    covariance = np.linalg.inv(adjusted.information / units[:, None] / units).astype(np.float64)
+    means = exceeding_noise_of_poses(moves(poses, adjusted.poses) * units, covariance)
     return PosedLevel(
         groups, located, adjusted, sightings, exposures, merged.path.corrected(_borders(kept), means / units), merged.tremor
     )

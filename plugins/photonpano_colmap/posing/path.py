@@ -1,8 +1,7 @@
 """The path of a camera through space: a pose for every frame.
 
 Convention:
-    A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead. A small motion
-    (w, v) of a camera, in its own axes, maps X_c to X_c + w x X_c + v.
+    A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead.
 """
 
 from __future__ import annotations
@@ -54,12 +53,9 @@ class Path:
         correction = make_interp_spline(borders, integral, k=degree).derivative()(np.arange(len(self.poses)))
         return Path(posed(rotation_matrices(correction[:, :3]) @ self.poses[:, :, :3], self._centres + correction[:, 3:]))
 
-    def moved(self, steps: FloatArray) -> Path:
-        """Return this path with a small motion (w, v) of the camera at each frame added: (T, 6)."""
-        rotations, shifts = rotation_matrices(steps[:, :3]), steps[:, 3:]
-        poses = rotations @ self.poses
-        poses[:, :, 3] += shifts
-        return Path(poses)
+    def turned(self, turns: FloatArray) -> Path:
+        """Return this path with the camera turned on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
+        return Path(rotation_matrices(turns) @ self.poses)
 
 
 def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:

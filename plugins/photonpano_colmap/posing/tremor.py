@@ -1,4 +1,9 @@
-"""Tremor within groups: short spans of frames against the merged exposures, through depth, in six degrees of freedom."""
+"""Tremor within groups: short spans of frames against the merged exposures, through depth.
+
+Only turns are corrected. A hand that trembles by half a millimetre moves things at 4 m by a tenth of what its turns move them,
+and within a group a shift of the camera looks almost like a turn: noise, or depth that is wrong, would be taken for it. How
+much the camera shifts is told by the power of the shifts beyond their noise, which is the same at all frequencies.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +21,7 @@ from scipy.interpolate import CubicSpline
 from photonpano import FloatArray, FrameSpan, Source
 from photonpano.compiling import compiled
 from photonpano.filtering import exceeding_noise
+from photonpano.photometry import flux_std
 from photonpano_colmap.posing.merging import PosedExposure, lit_counts
 from photonpano_colmap.posing.path import Path, between
 
@@ -31,10 +37,12 @@ _SLOPE_NOISE = (1 - np.exp(-1 / _BLUR_PX**2)) / (8 * np.pi * _BLUR_PX**2)
 """Variance of a slope that is noise, relative to that of a pixel before the blur."""
 _BORDER = 4
 """Pixels nearer to unknown ones have no slope."""
-_UNKNOWNS, _GAIN = 7, 6
-"""Of a span: rotation and shift of the camera, each along three axes, and last the gain of the light."""
-_PRIOR = 1e-4
-"""Information that keeps the equations of a span regular: all of a step is below 100 px."""
+_TURNS, _MOTION, _GAIN = slice(3), slice(6), 6
+"""Unknowns of a span: turns about three axes and shifts along them, and last the gain of the light."""
+_SIDEWAYS, _AXES = slice(3, 5), 3
+"""Shifts that are seen well; the camera shifts along the third axis as much."""
+_LEAST_INFORMATION = 1e-2
+"""Modes that a span shows with a noise of more than 10 px are unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,16 +50,16 @@ class Tremor:
     """What the camera does faster than its path.
 
     Attributes:
-        steps: (T, 6) small motions (w, v) of the camera at each frame; see `path`.
-        std_rotation: (T,) noise of these, in radians.
-        std_position: (T,) the same of the position, in units of the world.
-        rms_px: root mean square of what the steps move in the image.
+        turns: (T, 3) small rotation vectors of the camera at each frame.
+        std: (T,) their noise, in radians.
+        rms_px: root mean square of what they move in the image.
+        shift: root mean square of the shifts within groups, which are not corrected, in units of the world.
     """
 
-    steps: FloatArray
-    std_rotation: FloatArray
-    std_position: FloatArray
+    turns: FloatArray
+    std: FloatArray
     rms_px: float
+    shift: float
 
 
 def find_tremor(
@@ -60,66 +68,53 @@ def find_tremor(
     """Find how the camera moves within groups that were merged along a path.
 
     A span of a few frames shows what the exposure of its group shows, moved by a step of the camera: one step of weighted least
-    squares. Steps are filtered in the modes that the photons tell apart: some turns and shifts of the camera look alike.
+    squares, of which is kept what exceeds the noise.
 
     Args:
         source: the capture.
         exposures: of groups side by side, merged along the path.
         path: of the camera.
         camera_matrix: (3, 3) K.
+        pool: threads; the result does not depend on their number.
 
     Returns:
-        None if the capture is too short.
+        None if the frames are too few.
     """
-    units = _Units(camera_matrix, float(np.median([np.median(each.inverse_depth) for each in exposures])))
-    predicted = list(pool.map(lambda posed: _prediction(posed, units), exposures))
+    inverse_depth = float(np.median([np.median(each.inverse_depth) for each in exposures]))
+    predicted = list(pool.map(lambda posed: _prediction(posed, camera_matrix, inverse_depth), exposures))
     size = _span_frames(predicted)
 
-    def measured(posed: PosedExposure, prediction: _Prediction) -> list[_Step]:
+    def measured(posed: PosedExposure, prediction: _Prediction) -> list[_Equations]:
         spans = _divided(posed.exposure.group.span, size)
-        turns, shifts = between(posed.pose, path.at([span.centre for span in spans]), camera_matrix)
-        return [_measured(source, *each, posed, prediction, units) for each in zip(spans, turns, shifts, strict=True)]
+        maps = between(posed.pose, path.at([span.centre for span in spans]), camera_matrix)
+        return [_measured(source, *each, posed, prediction) for each in zip(spans, *maps, strict=True)]
 
-    found = [step for steps in pool.map(measured, exposures, predicted) for step in steps]
+    found = [equations for each in pool.map(measured, exposures, predicted) for equations in each]
     if len(found) < _FEWEST:
         return None
-    steps, covariance = np.array([each.pixels for each in found]), np.array([each.covariance for each in found])
-    signal, noise = exceeding_noise_of_modes(steps, covariance)
-    instants = np.array([each.instant for each in found])
-    frames = np.arange(source.info.n_frames)
-    at_frames = CubicSpline(instants, signal)(np.clip(frames, instants[0], instants[-1]))
-    stds = [np.interp(frames, instants, np.sqrt(noise[:, part].sum(axis=1))) for part in (slice(3), slice(3, 6))]
-    return Tremor(
-        at_frames / units.pixels,
-        stds[0] / units.pixels[0],
-        stds[1] / units.pixels[3],
-        float(np.sqrt(np.mean(np.sum(signal**2, axis=1)))),
-    )
+    gradient, information = np.array([each.gradient for each in found]), np.array([each.information for each in found])
+    of_turns, mean = information[:, _TURNS, _TURNS], information[:, _TURNS, _TURNS].mean(axis=0)
+    # In these modes, errors are independent of each other.
+    _, modes = np.linalg.eigh(mean)
+    steps, variances = _solved(gradient[:, _TURNS] @ modes, modes.T @ of_turns @ modes)
+    filtered = [exceeding_noise(*columns) for columns in zip(steps.T, variances.T, strict=True)]
+    turns = np.stack([each.signal for each in filtered], axis=1) @ modes.T
+    noise = np.sqrt(sum(each.std**2 for each in filtered))
+    instants, frames = np.array([each.instant for each in found]), np.arange(source.info.n_frames)
+    at_frames = CubicSpline(instants, turns)(np.clip(frames, instants[0], instants[-1]))
+    # A turn about x or y moves all pixels alike, but for the corners.
+    moved_px = np.sqrt(np.mean(np.einsum("si,ij,sj->s", turns, mean, turns)) / max(np.trace(mean[:2, :2]) / 2, 1e-12))
+    focal_px = float(camera_matrix[0, 0])
+    shift = _beyond_noise(_solved(gradient, information)[0][:, _SIDEWAYS]) / (focal_px * inverse_depth)
+    return Tremor(at_frames / focal_px, np.interp(frames, instants, noise) / focal_px, float(moved_px), shift)
 
 
-def exceeding_noise_of_modes(steps: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Filter small motions of a camera in the modes that are measured independently of each other.
-
-    Args:
-        steps: (S, 6) px, in order of time.
-        covariance: (S, 6, 6) of their noise.
-
-    Returns:
-        What exceeds the noise, (S, 6); and the variances that the filter let through, (S, 6).
-    """
-    _, modes = np.linalg.eigh(np.linalg.inv(covariance).mean(axis=0))
-    variances = np.einsum("ka,skl,la->sa", modes, covariance, modes)
-    filtered = [exceeding_noise(*columns) for columns in zip((steps @ modes).T, variances.T, strict=True)]
-    signal, stds = (np.stack([getattr(each, name) for each in filtered], axis=1) for name in ("signal", "std"))
-    return signal @ modes.T, stds**2 @ (modes**2).T
-
-
-class _Units:
-    """What a motion of the camera moves in the image, so that all unknowns are of one size."""
-
-    def __init__(self, camera_matrix: FloatArray, inverse_depth: float) -> None:
-        self.to_ideal, self.inverse_depth = np.linalg.inv(camera_matrix), inverse_depth
-        self.pixels = camera_matrix[0, 0] * np.array([1.0, 1.0, 1.0, inverse_depth, inverse_depth, inverse_depth])
+def _beyond_noise(shifts: FloatArray) -> float:
+    """Return the root mean square of the shifts along all axes beyond noise that is white, from those along two: (S, 2)."""
+    power = np.abs(np.fft.rfft(shifts - shifts.mean(axis=0), axis=0)[1:]) ** 2
+    # The median of an exponential distribution is its mean times ln 2.
+    excess = float((power.mean(axis=0) - np.median(power, axis=0) / np.log(2)).sum()) / len(shifts)
+    return float(np.sqrt(max(0.0, _AXES / shifts.shape[1] * excess)))
 
 
 class _Prediction(NamedTuple):
@@ -131,6 +126,8 @@ class _Prediction(NamedTuple):
         slope_y: (H, W) the same along y.
         gain: (H, W) the mean, divided by that variance; 0 where the slopes are not known.
         inverse_depth: (H, W).
+        mean_depth: inverse depth at which a shift of the camera counts in px.
+        to_ideal: (3, 3) pixels to directions.
         information: (7, 7) of one frame that sees all of it.
     """
 
@@ -139,34 +136,54 @@ class _Prediction(NamedTuple):
     slope_y: NDArray[np.float32]
     gain: NDArray[np.float32]
     inverse_depth: NDArray[np.float32]
+    mean_depth: float
+    to_ideal: FloatArray
     information: FloatArray
 
 
-class _Step(NamedTuple):
-    """The motion of the camera in a span: (6,) px, and its (6, 6) covariance by photon noise."""
+class _Equations(NamedTuple):
+    """Normal equations of the motion of a span, whatever its gain, for what turns and shifts move in the image, in px.
+
+    Attributes:
+        instant: centre of the span, in frames.
+        gradient: (6,) right-hand side.
+        information: (6, 6).
+    """
 
     instant: float
-    pixels: FloatArray
-    covariance: FloatArray
+    gradient: FloatArray
+    information: FloatArray
 
 
-def _prediction(posed: PosedExposure, units: _Units) -> _Prediction:
+def _solved(gradient: FloatArray, information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the solutions of (S, N) and (S, N, N) equations, and their variances, infinite if unknown: (S, N) each."""
+    known = np.linalg.eigvalsh(information)[:, 0] > _LEAST_INFORMATION
+    covariance = np.linalg.inv(np.where(known[:, None, None], information, np.eye(gradient.shape[1])))
+    steps = np.einsum("sab,sb->sa", covariance, gradient)
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    return np.where(known[:, None], steps, 0.0), np.where(known[:, None], variances, np.inf)
+
+
+def _prediction(posed: PosedExposure, camera_matrix: FloatArray, mean_depth: float) -> _Prediction:
     exposure, response = posed.exposure, posed.exposure.response
     known = np.isfinite(exposure.flux) & (exposure.weight > 0)
     flux, frames = np.where(known, exposure.flux, np.float32(0)), np.where(known, exposure.weight, np.float32(1))
     mean = response.mean_count(flux)
     little = np.float32(1e-2) * np.maximum(flux, np.float32(1e-2))
     by_flux = (response.mean_count(flux + little) - mean) / little
-    variance = np.maximum((by_flux * response.flux_std(flux, frames)) ** 2 * frames, np.float32(1e-6))
+    variance = np.maximum((by_flux * flux_std(flux, frames, response)) ** 2 * frames, np.float32(1e-6))
     inner = cv2.erode(known.astype(np.uint8), np.ones((2 * _BORDER + 1,) * 2, np.uint8), borderValue=0).astype(bool)
     smooth = cv2.GaussianBlur(mean, (0, 0), _BLUR_PX)
     slope_x, slope_y = (np.where(inner, cv2.filter2D(smooth, cv2.CV_32F, each), np.float32(0)) for each in _DIFFERENCES)
     # Slopes that are noise would count as structure.
     noise = np.where(inner, np.float32(_SLOPE_NOISE) / frames, np.float32(0))
     gain = np.where(inner, mean / variance, np.float32(0))
-    information = np.zeros((_UNKNOWNS, _UNKNOWNS))
-    predicted = _Prediction(mean, slope_x / variance, slope_y / variance, gain, posed.inverse_depth, information)
-    _add_information(predicted, slope_x, slope_y, noise, units.to_ideal, units.inverse_depth)
+    information = np.zeros((_GAIN + 1, _GAIN + 1))
+    to_ideal: FloatArray = np.linalg.inv(camera_matrix).astype(np.float64)
+    predicted = _Prediction(
+        mean, slope_x / variance, slope_y / variance, gain, posed.inverse_depth, mean_depth, to_ideal, information
+    )
+    _add_information(predicted, slope_x, slope_y, noise)
     information += np.triu(information, 1).T
     return predicted
 
@@ -176,7 +193,7 @@ _DIFFERENCES = [np.array(kernel, np.float32) for kernel in ([[-0.5, 0, 0.5]], [[
 
 def _span_frames(predicted: Sequence[_Prediction]) -> int:
     """Return how many frames show a shift with little noise."""
-    mean = np.mean([each.information[3:5, 3:5] for each in predicted], axis=0)
+    mean = np.mean([each.information[:2, :2] for each in predicted], axis=0)
     variance = float(np.trace(np.linalg.pinv(mean))) / 2
     return int(np.clip(np.ceil(variance / _NOISE_PX**2), _SHORTEST, _LONGEST))
 
@@ -194,21 +211,19 @@ def _measured(
     shift: FloatArray,
     posed: PosedExposure,
     predicted: _Prediction,
-    units: _Units,
-) -> _Step:
+) -> _Equations:
     """Return the motion of the camera in a span, beyond that along which its group was merged."""
     valid = source.valid.astype(np.float32)
-    sums = np.zeros(_UNKNOWNS + 1)
+    sums = np.zeros(_GAIN + 2)
     frames, weight = lit_counts(source, span) * valid, valid * np.float32(len(span))
-    _add_residuals(frames, weight, predicted, turn, shift, units.to_ideal, units.inverse_depth, sums)
-    gradient, seen = sums[:_UNKNOWNS], sums[_UNKNOWNS]
+    _add_residuals(frames, weight, predicted, turn, shift, sums)
+    gradient, seen, every = sums[:-1], sums[-1], predicted.information
+    every = every * (seen / every[_GAIN, _GAIN] if every[_GAIN, _GAIN] > 0 else 0.0)
+    mixed, gain = every[_MOTION, _GAIN], max(every[_GAIN, _GAIN], _LEAST_INFORMATION)
     # The exposure holds the frames of the span, and follows them by their share.
-    share = len(span) / len(posed.exposure.group.span)
-    full = predicted.information[_GAIN, _GAIN]
-    information = predicted.information * (seen / full if full > 0 else 0.0) + _PRIOR * np.eye(_UNKNOWNS)
-    covariance = np.linalg.inv(information)
-    step = covariance @ gradient / (1 - share)
-    return _Step(span.centre, step[:_GAIN], covariance[:_GAIN, :_GAIN] / (1 - share))
+    others = 1 - len(span) / len(posed.exposure.group.span)
+    information = (every[_MOTION, _MOTION] - np.outer(mixed, mixed) / gain) * others
+    return _Equations(span.centre, gradient[_MOTION] - mixed * (gradient[_GAIN] / gain), information)
 
 
 @compiled
@@ -217,8 +232,6 @@ def _add_information(
     slope_x: NDArray[np.float32],
     slope_y: NDArray[np.float32],
     noise: NDArray[np.float32],
-    to_ideal: FloatArray,
-    mean_depth: float,
 ) -> None:
     """Add the upper triangle of the information of one frame.
 
@@ -227,18 +240,17 @@ def _add_information(
         slope_x: (H, W) slopes of the mean count.
         slope_y: (H, W) the same along y.
         noise: (H, W) variance of a slope that is noise, divided by that of a frame.
-        to_ideal: (3, 3) pixels to directions.
-        mean_depth: inverse depth of which a shift of the camera counts in px.
     """
     height, width = slope_x.shape
-    along_x, along_y = np.zeros(7), np.zeros(7)
+    along_x, along_y = np.zeros(6), np.zeros(6)
     total = predicted.information
     for row in range(height):
         for column in range(width):
             gain = predicted.gain[row, column]
             if gain == 0:
                 continue
-            _moves(row, column, predicted.inverse_depth[row, column] / mean_depth, to_ideal, along_x, along_y)
+            q = predicted.inverse_depth[row, column]
+            _moves(row, column, q / predicted.mean_depth, predicted.to_ideal, along_x, along_y)
             x_x = predicted.slope_x[row, column] * slope_x[row, column] - noise[row, column]
             x_y = predicted.slope_x[row, column] * slope_y[row, column]
             y_y = predicted.slope_y[row, column] * slope_y[row, column] - noise[row, column]
@@ -259,11 +271,9 @@ def _add_residuals(
     predicted: _Prediction,
     turn: FloatArray,
     shift: FloatArray,
-    to_ideal: FloatArray,
-    mean_depth: float,
     sums: FloatArray,
 ) -> None:
-    """Add the right-hand side of the equations of a span, and the light that it sees: (8,).
+    """Add the right-hand side of the equations of a span, and the light that it sees.
 
     Args:
         frames: (H, W) sum of the frames of the span.
@@ -271,12 +281,10 @@ def _add_residuals(
         predicted: what one frame is expected to show.
         turn: (3, 3), see `path.between`.
         shift: (3,), see `path.between`.
-        to_ideal: (3, 3) pixels to directions.
-        mean_depth: inverse depth of which a shift of the camera counts in px.
         sums: (8,) output.
     """
     height, width = frames.shape
-    along_x, along_y = np.zeros(7), np.zeros(7)
+    along_x, along_y = np.zeros(6), np.zeros(6)
     for row in range(height):
         for column in range(width):
             gain = predicted.gain[row, column]
@@ -300,7 +308,7 @@ def _add_residuals(
             )
             mean = predicted.mean[row, column]
             residual = lit - seen * mean
-            _moves(row, column, q / mean_depth, to_ideal, along_x, along_y)
+            _moves(row, column, q / predicted.mean_depth, predicted.to_ideal, along_x, along_y)
             by_x, by_y = residual * predicted.slope_x[row, column], residual * predicted.slope_y[row, column]
             # What a camera moves by, its image moves against.
             for k in range(6):
@@ -311,7 +319,16 @@ def _add_residuals(
 
 @compiled
 def _moves(row: int, column: int, q: float, to_ideal: FloatArray, along_x: FloatArray, along_y: FloatArray) -> None:
-    """Write where a pixel moves by turns and shifts of the camera along its three axes, in px: (6,) along x and along y."""
+    """Write where a pixel moves by turns of the camera about its three axes, and by shifts along them, in focal lengths.
+
+    Args:
+        row: of the pixel.
+        column: of the pixel.
+        q: its inverse depth.
+        to_ideal: (3, 3) pixels to directions.
+        along_x: (6,) output.
+        along_y: (6,) output.
+    """
     x = to_ideal[0, 0] * column + to_ideal[0, 2]
     y = to_ideal[1, 1] * row + to_ideal[1, 2]
     along_x[0], along_x[1], along_x[2] = -x * y, 1 + x * x, -y

@@ -20,13 +20,15 @@ from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.pose_spline import PoseSpline, positions_of
 from photonpano_colmap.posing.adjustment import Sightings, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
-from photonpano_colmap.posing.levels import Scene, locate, merge, resample
+from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
 from photonpano_colmap.posing.merging import merge_through_depth
-from photonpano_colmap.posing.path import CorrectedPath, between, posed, projected
+from photonpano_colmap.posing.path import Path, between, moves, posed, projected
+from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
 from photonpano_colmap.stratified import StratifiedEstimator
 
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
-TRUE = PoseSpline(np.arange(N_FRAMES, dtype=float), true_poses())
+TRUE = Path(true_poses())
+EVERYWHERE = np.ones(N_FRAMES, np.bool_)
 
 
 def points_on_planes(number: int, seed: int = 0) -> np.ndarray:
@@ -70,22 +72,92 @@ def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
     assert edges["true"] > 1.5 * edges["wrong"], edges
 
 
+def test_path_is_interpolated_between_frames_and_rests_beyond() -> None:
+    spline = PoseSpline(np.arange(N_FRAMES, dtype=float), true_poses())
+    np.testing.assert_allclose(TRUE.at([0, 7]), true_poses()[[0, 7]], atol=1e-12)
+    np.testing.assert_allclose(TRUE.at([3.5, 100.25]), spline.at([3.5, 100.25]), atol=1e-4)
+    np.testing.assert_allclose(TRUE.at([-5, 400]), true_poses()[[0, -1]], atol=1e-12)
+
+
 def test_corrected_path_has_the_means_at_which_its_groups_were_located() -> None:
     borders = np.linspace(0, 320, 17)
-    instants = (borders[:-1] + borders[1:] - 1) / 2
     frames = np.arange(320)
     turns = 0.01 * np.stack([np.sin(frames / 15), np.cos(frames / 19), np.sin(frames / 16)], axis=1)
-    moves = 0.02 * np.stack([np.cos(frames / 17), np.sin(frames / 18), np.sin(frames / 14)], axis=1)
-    means = [each.reshape(16, 20, 3).mean(axis=1) for each in (turns, moves)]
-    before = TRUE.at(instants)
-    located = posed(rotation_matrices(means[0]) @ before[:, :, :3], positions_of(before) + means[1])
-    expected = posed(rotation_matrices(turns) @ true_poses()[:, :, :3], positions_of(true_poses()) + moves)
+    shifts = 0.02 * np.stack([np.cos(frames / 17), np.sin(frames / 18), np.sin(frames / 14)], axis=1)
+    expected = posed(rotation_matrices(turns) @ true_poses()[:, :, :3], positions_of(true_poses()) + shifts)
+    means = np.concatenate([turns, shifts], axis=1).reshape(16, 20, 6).mean(axis=1)
+    instants = (borders[:-1] + borders[1:] - 1) / 2
+    through = np.stack([np.interp(frames, instants, each) for each in means.T], axis=1)
     errors = [
-        np.linalg.norm(positions_of(path.at(frames)) - positions_of(expected), axis=1)[40:-40].max()
-        for path in (CorrectedPath(TRUE, borders - 0.5, instants, located), PoseSpline(instants, located))
+        np.linalg.norm(moves(poses, expected)[40:-40, 3:], axis=1).max()
+        for poses in (
+            TRUE.corrected(borders - 0.5, means).poses,
+            posed(rotation_matrices(through[:, :3]) @ true_poses()[:, :, :3], positions_of(true_poses()) + through[:, 3:]),
+        )
     ]
-    # A spline through the means as if they were instants loses some of the motion.
+    # A curve through the means as if they were instants loses some of the motion.
     assert errors[0] < 0.4 * errors[1], errors
+
+
+def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
+    """Return a path that misses a tremor, and the tremor: rotation vectors of the camera, (N_FRAMES, 3)."""
+    frames = np.arange(N_FRAMES)
+    turns = [np.sin(2 * np.pi * (frames / period + phase)) for period, phase in ((41, 0.1), (27, 0.4), (35, 0.7))]
+    tremor = np.sqrt(2) * rms_px / FOCAL_PX * np.stack(turns, axis=1)
+    return TRUE.turned(-tremor), tremor
+
+
+def test_tremor_within_a_group_is_found() -> None:
+    path, tremor = trembling(1.0)
+    with ThreadPoolExecutor(2) as pool:
+        merged = merge(capture(), resample(EVERYWHERE, 160), Scene(path, EVERYWHERE, _seen_points()), MATRIX, pool)
+    left, before = (np.sqrt(np.mean(moves(each.poses, true_poses())[:, :3] ** 2, axis=0)) for each in (merged.path, path))
+    np.testing.assert_allclose(before, np.sqrt(np.mean(tremor**2, axis=0)), rtol=0.02)
+    assert (left < 0.3 * before).all(), left / before
+
+
+def test_steady_path_has_no_tremor() -> None:
+    with ThreadPoolExecutor(2) as pool:
+        merged = merge(capture(), resample(EVERYWHERE, 160), Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
+        found = find_tremor(capture(), merged.exposures, TRUE, MATRIX, pool)
+        short = merge(capture(), resample(EVERYWHERE, 40)[:2], Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
+    assert found is not None
+    assert found.rms_px < 0.15
+    assert found.std.max() < np.deg2rad(0.1)
+    assert short.tremor is None
+    assert short.path is TRUE
+
+
+def test_shifts_beyond_white_noise_are_told() -> None:
+    rng, spans = np.random.default_rng(0), np.arange(1600)
+    noise = rng.normal(0, 0.1, (1600, 2))
+    trembling = np.stack([np.sin(spans / 3), np.sin(spans / 5 + 1)], axis=1) * np.sqrt(2) * 0.05
+    assert _beyond_noise(noise) < 0.04
+    # 0.05 px along each of three axes
+    assert _beyond_noise(noise + trembling) == pytest.approx(np.sqrt(3) * 0.05, rel=0.2)
+
+
+def test_noise_of_located_groups_does_not_move_the_path() -> None:
+    # Sightings with noise move exposures; along a path that is right, only what exceeds this noise is a correction.
+    rng, points = np.random.default_rng(5), points_on_planes(150, seed=2)
+    with ThreadPoolExecutor(2) as pool:
+        merged = merge(capture(), resample(EVERYWHERE, 16), Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
+    groups = [each.exposure.group for each in merged.exposures]
+    poses = TRUE.at([group.reference for group in groups])
+    views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
+    pixels = projected(poses[views], points[numbers], MATRIX) + rng.normal(0, 0.3, (3000, 2))
+    sightings = Sightings(numbers, views, pixels, np.tile(0.3**2 * np.eye(2), (3000, 1, 1)))
+    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, sightings, MATRIX)
+    located = _after_similarity(positions_of(level.adjusted.poses), positions_of(poses))
+    path = _after_similarity(positions_of(level.path.at([group.reference for group in groups])), positions_of(poses))
+    assert np.sqrt(np.mean(path**2)) < 0.7 * np.sqrt(np.mean(located**2)), (path, located)
+
+
+def test_groups_cover_the_located_frames_only() -> None:
+    located = EVERYWHERE.copy()
+    located[100:150] = False
+    spans = [group.span for group in resample(located, 40)]
+    assert [(span.start, span.stop) for span in spans] == [(0, 50), (50, 100), (150, 192), (192, 235), (235, 278), (278, 320)]
 
 
 def test_adjustment_finds_poses_and_knows_its_errors() -> None:
@@ -121,11 +193,11 @@ def test_patches_at_edges_of_things_count_less() -> None:
 
 
 def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
-    source, groups = capture(), resample(N_FRAMES, 40)
+    source, groups = capture(), resample(EVERYWHERE, 40)
     with ThreadPoolExecutor(2) as pool:
-        exposures = merge(source, groups, Scene(TRUE, _seen_points()), MATRIX, pool)
-        points, sightings = locate(exposures, MATRIX, pool)
-    poses = TRUE.at([group.reference for group in groups])
+        merged = merge(source, groups, Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
+        points, sightings = locate(merged.exposures, MATRIX, pool)
+    poses = merged.path.at([group.reference for group in groups])
     away = sightings.pixels - projected(poses[sightings.views], points[sightings.points], MATRIX)
     assert len(sightings.points) > 500
     assert np.median(np.linalg.norm(away, axis=1)) < 0.5
@@ -134,9 +206,10 @@ def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
 def test_exposures_without_anything_in_common_are_an_error() -> None:
     source = MemorySource(np.random.default_rng(0).integers(0, 2, (80, *SHAPE)))
     with ThreadPoolExecutor(2) as pool:
-        exposures = merge(source, resample(80, 20), Scene(TRUE, _seen_points()), MATRIX, pool)
+        everywhere = np.ones(80, np.bool_)
+        merged = merge(source, resample(everywhere, 20), Scene(TRUE, everywhere, _seen_points()), MATRIX, pool)
         with pytest.raises(LocationError, match="no patch of one was found in another"):
-            locate(exposures, MATRIX, pool)
+            locate(merged.exposures, MATRIX, pool)
 
 
 def test_lens_that_distorts_is_refused() -> None:
