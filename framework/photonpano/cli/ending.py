@@ -50,7 +50,8 @@ def end_on_signals() -> None:
 def leave(code: int) -> NoReturn:
     """End the program with an exit code, without waiting for threads that a plugin has left running."""
     last = time.monotonic() + _LEFT_S
-    others = [each for each in threading.enumerate() if not each.daemon and each is not threading.current_thread()]
+    # A thread that a signal stopped before its first step is listed, but is not alive, and cannot be joined.
+    others = [t for t in threading.enumerate() if t.is_alive() and not t.daemon and t is not threading.current_thread()]
     for each in others:
         each.join(max(0.0, last - time.monotonic()))
     if any(each.is_alive() for each in others):

@@ -118,6 +118,18 @@ def test_thread_left_by_plugin_keeps_no_process_alive(working: Callable[[str], s
     assert (code, out) == (0, "done\n")
 
 
+def test_program_ends_though_a_thread_never_started(program: list[str]) -> None:
+    """A signal may come between the listing of a thread and its first step: such a thread cannot be joined."""
+    code = """
+import threading
+from photonpano.cli.ending import leave
+threading._limbo["stopped"] = threading.Thread()
+leave(130)
+"""
+    done = subprocess.run([program[0], "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_killed_command_leaves_no_process(working: Callable[[str], subprocess.Popen[str]]) -> None:
     with working("time.sleep(60)") as process:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
