@@ -51,7 +51,7 @@ def room(folder: Path) -> Picture:
     exposures = [
         cv2.imread(str(folder / name / "images" / f"exposure_{FIRST}.png"), cv2.IMREAD_GRAYSCALE) for name in ESTIMATORS
     ]
-    labels = "one frame", f"{GROUP_SIZE} frames, averaged", "20 frames, merged through depth"
+    labels = "one frame", f"{GROUP_SIZE} frames, averaged", "the same, merged through depth"
     above = beside(
         [
             labelled(cv2.resize(each, None, fx=MAGNIFIED, fy=MAGNIFIED, interpolation=cv2.INTER_AREA), label)

@@ -83,7 +83,7 @@ def _rows(evaluation: "Evaluation") -> list[list[str]]:
 def _pose_rows(score: "PoseScore") -> list[list[str]]:
     rows = [
         ["position error (ATE), rms", f"{score.ate_m:.4g} m, {100 * score.ate_share:.3f} % of the path"],
-        ["rotation error, rms", f"{score.rotation_deg:.4f} degrees"],
+        ["rotation error, rms", f"{score.rotation_deg:.4f} degrees, {score.turns_deg:.4f} after the best common rotation"],
     ]
     if score.rpe_m is not None:
         rows.append([f"RPE over {score.rpe_frames} frames, rms", f"{score.rpe_m:.4g} m, {score.rpe_deg:.4f} degrees"])
@@ -101,6 +101,7 @@ def _pose_data(score: "PoseScore") -> dict[str, Any]:
         "ate_m": score.ate_m,
         "ate_share": score.ate_share,
         "rotation_deg": score.rotation_deg,
+        "turns_deg": score.turns_deg,
         "rpe_frames": score.rpe_frames,
         "rpe_m": score.rpe_m,
         "rpe_deg": score.rpe_deg,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.evaluation.pose_inputs import load_run_poses, load_true_poses
-from photonpano.geometry import rotation_vectors
+from photonpano.geometry import nearest_rotations, rotation_vectors
 from photonpano.poses import centres
 from photonpano.record.contents import require_one_run
 from photonpano.values import BoolArray, FloatArray
@@ -33,6 +33,7 @@ class PoseScore:
         ate_m: absolute trajectory error: root mean square of `errors_m`.
         ate_share: the same as a share of the length of the true path of the located frames.
         rotation_deg: root mean square of `errors_deg`.
+        turns_deg: the same after the best common rotation instead. Positions near a line hardly tell how the world lies.
         rpe_frames: frames over which relative errors are taken.
         rpe_m: root mean square error of the motion over that many frames; None if no two located frames are that far apart.
         rpe_deg: root mean square error of the turn over that many frames.
@@ -48,6 +49,7 @@ class PoseScore:
     ate_m: float
     ate_share: float
     rotation_deg: float
+    turns_deg: float
     rpe_frames: int
     rpe_m: float | None
     rpe_deg: float | None
@@ -125,6 +127,7 @@ def pose_errors(
         ate_m=ate_m,
         ate_share=ate_m / path_m,
         rotation_deg=_rms(errors_deg[located]),
+        turns_deg=_turns_deg(found[located, :, :3], true[located, :, :3]),
         rpe_frames=rpe_frames,
         rpe_m=None if apart is None else _rms(np.linalg.norm(apart[:, :, 3], axis=1)),
         rpe_deg=None if apart is None else _rms(_angles(apart[:, :, :3])),
@@ -151,6 +154,11 @@ def align_positions(found: FloatArray, true: FloatArray) -> tuple[float, FloatAr
     rotation = (left * signs) @ right
     scale = float((strengths * signs).sum() / (here**2).sum())
     return scale, rotation, middles[1] - scale * rotation @ middles[0]
+
+
+def _turns_deg(found: FloatArray, true: FloatArray) -> float:
+    worlds = np.swapaxes(true, 1, 2) @ found
+    return _rms(_angles(worlds @ nearest_rotations(worlds.sum(axis=0)).T))
 
 
 def _relative_of(poses: FloatArray, first: NDArray[np.intp], frames: int) -> FloatArray:

@@ -6,6 +6,8 @@ Convention:
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
@@ -13,9 +15,6 @@ from scipy.interpolate import make_interp_spline
 from photonpano import FloatArray
 from photonpano.geometry import rotation_matrices, rotation_vectors
 from photonpano_colmap.pose_spline import positions_of
-
-_DEGREE = 5
-"""Degree of the spline through the integral of a correction."""
 
 
 class Path:
@@ -41,16 +40,17 @@ class Path:
         """Return this path, corrected where groups of frames were located along it.
 
         The frames of a group were merged along the path, so that where the group is located tells the mean correction of all of
-        its frames, and not that of one instant. The correction is the smooth function with these means: the derivative of a
-        spline through its integral at the borders of the groups.
+        its frames, and not that of one instant. The correction is the smoothest function with these means, that of the least
+        second derivative: the derivative of the natural quintic spline through its integral at the borders of the groups.
 
         Args:
             borders: (N + 1,) increasing, in frames: where groups begin and end, side by side.
             means: (N, 6) corrections of the groups, as `moves` has them.
         """
         integral = np.concatenate([np.zeros((1, 6)), np.cumsum(means * np.diff(borders)[:, None], axis=0)])
-        degree = min(_DEGREE, 2 * (len(means) // 2) - 1)
-        correction = make_interp_spline(borders, integral, k=degree).derivative()(np.arange(len(self.poses)))
+        end = [(3, np.zeros(6)), (4, np.zeros(6))]
+        ends: Any = end, end  # which the library's types do not have
+        correction = make_interp_spline(borders, integral, k=5, bc_type=ends).derivative()(np.arange(len(self.poses)))
         return Path(posed(rotation_matrices(correction[:, :3]) @ self.poses[:, :, :3], self._centres + correction[:, 3:]))
 
     def turned(self, turns: FloatArray) -> Path:

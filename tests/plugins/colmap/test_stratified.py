@@ -99,6 +99,12 @@ def test_corrected_path_has_the_means_at_which_its_groups_were_located() -> None
     assert errors[0] < 0.4 * errors[1], errors
 
 
+def test_noise_of_the_outermost_groups_is_not_magnified_at_the_ends() -> None:
+    means = 1e-4 * np.random.default_rng(0).normal(size=(20, 6))
+    steps = moves(true_poses(), TRUE.corrected(np.linspace(0, 320, 21) - 0.5, means).poses)
+    assert abs(steps[[0, -1]]).max() < 5e-4
+
+
 def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
     """Return a path that misses a tremor, and the tremor: rotation vectors of the camera, (N_FRAMES, 3)."""
     frames = np.arange(N_FRAMES)

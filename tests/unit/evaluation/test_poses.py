@@ -82,8 +82,19 @@ def test_errors_are_those_of_the_noise_whatever_the_world(folder: Path, tmp_path
 
 def test_perfect_poses_have_no_error() -> None:
     score = pose_errors(in_other_world(path()), path(), np.ones(N_FRAMES, bool), rpe_frames=10)
-    assert max(score.ate_m, score.rotation_deg, score.rpe_m, score.rpe_deg) < 1e-5
+    assert max(score.ate_m, score.rotation_deg, score.turns_deg, score.rpe_m, score.rpe_deg) < 1e-5
     assert score.honest_shares is None
+
+
+def test_a_rotation_that_all_cameras_share_is_told_apart() -> None:
+    true = path()
+    places = -np.einsum("nji,nj->ni", true[:, :, :3], true[:, :, 3])
+    rotations = true[:, :, :3] @ Rotation.from_rotvec([0, 0, np.deg2rad(0.5)]).as_matrix()
+    turned = np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+    score = pose_errors(turned, true, np.ones(N_FRAMES, bool), rpe_frames=10)
+    assert score.ate_m < 1e-9
+    assert score.rotation_deg == pytest.approx(0.5)
+    assert score.turns_deg < 1e-5
 
 
 def test_mirrored_poses_are_not_right() -> None:
