@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,12 +20,14 @@ from photonpano.merging.warping import add_footprint, add_running_sums, add_warp
 from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource, camera_of, light_of
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
-_BATCH = 16
-"""Chunks that are summed before they are added to the grid."""
-_PART_ROWS = 64
-"""Rows of the grid, about, that a thread adds to at a time."""
+_RUN = 64
+"""Chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded."""
 MIN_WEIGHT = 1.0
 """Pixels with less weight than this, in frames, are unknown."""
+
+InOrder = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+"""Calls a function with each item, several at once, and yields the results in order: see `threads.in_order`."""
+_Visible = Sequence[tuple[Chunk, Footprint | BentFootprint]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +69,7 @@ def accumulate(
     onto: Homography | Canvas,
     shape: tuple[int, int],
     advance: Callable[[int], None] | None = None,
-    pool: Executor | None = None,
+    in_order: InOrder | None = None,
     counts_of: Callable[[FrameSpan], Counts] | None = None,
 ) -> PhotonSum:
     """Sum the frames of chunks on a grid, each chunk warped once.
@@ -84,49 +85,97 @@ def accumulate(
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid; or a canvas of any projection, which is the grid.
         shape: (height, width) of the grid.
-        advance: called with the number of frames of each chunk that is done; first with that of all chunks off the grid.
-        pool: sums several chunks, and adds to several parts of the grid, at once; the result does not depend on its
-            number of threads.
+        advance: called with numbers of frames that are done; first with that of all chunks off the grid.
+        in_order: sums runs of chunks at once, each on the part of the grid that it covers, and yields the sums in order. They
+            do not depend on how many are under way. By default, there is one run.
         counts_of: returns the uncorrected sum of the frames of a span, such as a `CountsCache`; `source.counts` by default.
     """
+    advance = advance or (lambda _: None)
     light = light_of(source)
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
     canvas = onto if isinstance(onto, Canvas) else Canvas(*shape, onto)
-    homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
-    grid = BentGrid.of(canvas, camera_of(source), homographies, frame_shape)
-    total = _Total.zeros(shape, 1 if terms is None else terms.number, None if grid is None else grid.rays)
-    # Parts are narrow, so that every thread has work wherever frames lie on the grid. Their number does not depend on that of
-    # the threads, since OpenCV rounds a warp by where it starts.
-    n_parts = max(1, shape[0] // _PART_ROWS) if pool else 1
-    parts = [total.rows(part) for part in divided(shape[0], n_parts)]
-    masked = weights_of(source)
-    corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-    footprints: Sequence[Footprint | BentFootprint]
-    if grid is None:
-        footprints = footprints_of(canvas.transform @ homographies, frame_shape, shape)
-    else:
-        footprints = grid.footprints(homographies, frame_shape)
-    pairs: Iterable[tuple[Chunk, Footprint | BentFootprint]] = zip(chunks, footprints, strict=True)
-    visible = [(chunk, at) for chunk, at in pairs if at.rows and at.columns]
-    advance = advance or (lambda _: None)
-    if off_grid := sum(len(chunk.span) for chunk in chunks) - sum(len(chunk.span) for chunk, _ in visible):
+    visible = _visible(source, chunks, canvas)
+    if off_grid := _frames(chunks) - _frames([chunk for chunk, _ in visible]):
         advance(off_grid)
-    # With a pool, one batch is added while the next is summed; batches are added in order.
-    start = pool.map if pool else map
-    adding: Iterable[None] = ()
-    for first in range(0, len(visible), _BATCH):
-        batch = visible[first : first + _BATCH]
-        summed = list(start(partial(_summed, counts_of or source.counts, corrected, masked, terms), *zip(*batch, strict=True)))
-        deque(adding, maxlen=0)
-        adding = start(partial(_Total.add, summed=summed), parts)
-        for chunk, _ in batch:
-            advance(len(chunk.span))
-    deque(adding, maxlen=0)
-    counts, coverages = total.result()
+    if in_order is None:
+        counts, coverages = _sum_on(source, terms, counts_of or source.counts, canvas, visible, advance)
+    else:
+        number = 1 if terms is None else terms.number
+        counts, coverages = np.zeros(shape, np.float32), np.zeros((number, *shape), np.float32)
+        runs = [visible[first : first + _RUN] for first in range(0, len(visible), _RUN)]
+        for part in in_order(partial(_sum_of_run, source, terms, canvas), ([chunk for chunk, _ in run] for run in runs)):
+            counts[part.box] += part.counts
+            coverages[:, *part.box] += part.coverages
+            advance(part.n_frames)
     if light is None or terms is None:
         return PhotonSum(counts, coverages[0])
     lit = terms.lit_frames(coverages, light, canvas)
     return PhotonSum(counts, lit.weight, lit)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """The sum of a run of chunks on the part of the grid that it covers.
+
+    Attributes:
+        box: rows and columns of that part.
+        counts: (h, w) float32.
+        coverages: (P, h, w) float32.
+        n_frames: of the run.
+    """
+
+    box: tuple[slice, slice]
+    counts: FluxImage
+    coverages: FluxImage
+    n_frames: int
+
+
+def _frames(chunks: Sequence[Chunk]) -> int:
+    return sum(len(chunk.span) for chunk in chunks)
+
+
+def _visible(source: Source, chunks: Sequence[Chunk], canvas: Canvas) -> _Visible:
+    """Return the chunks that lie on a canvas, with their footprints."""
+    homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
+    grid = BentGrid.of(canvas, camera_of(source), homographies, frame_shape)
+    footprints: Sequence[Footprint | BentFootprint]
+    if grid is None:
+        footprints = footprints_of(canvas.transform @ homographies, frame_shape, canvas.shape)
+    else:
+        footprints = grid.footprints(homographies, frame_shape)
+    pairs: Iterable[tuple[Chunk, Footprint | BentFootprint]] = zip(chunks, footprints, strict=True)
+    return [(chunk, at) for chunk, at in pairs if at.rows and at.columns]
+
+
+def _sum_of_run(source: Source, terms: LightTerms | None, canvas: Canvas, chunks: Sequence[Chunk]) -> _Part:
+    """Sum chunks on the part of a canvas that they cover."""
+    footprints = [at for _, at in _visible(source, chunks, canvas)]
+    top, bottom = min(at.rows.start for at in footprints), max(at.rows.stop for at in footprints)
+    columns = [each for at in footprints for each in ([at.columns] if isinstance(at, Footprint) else at.columns)]
+    left, right = min(each.start for each in columns), max(each.stop for each in columns)
+    part = canvas.part(left, top, bottom - top, right - left)
+    counts, coverages = _sum_on(source, terms, source.counts, part, _visible(source, chunks, part), lambda _: None)
+    return _Part((slice(top, bottom), slice(left, right)), counts, coverages, _frames(chunks))
+
+
+def _sum_on(
+    source: Source,
+    terms: LightTerms | None,
+    counts_of: Callable[[FrameSpan], Counts],
+    canvas: Canvas,
+    visible: _Visible,
+    advance: Callable[[int], None],
+) -> tuple[FluxImage, FluxImage]:
+    """Return the counts and the coverages of a canvas: (H, W) and (P, H, W)."""
+    masked = weights_of(source)
+    corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
+    bent = any(isinstance(at, BentFootprint) for _, at in visible)
+    rays = (*canvas.columns(), *canvas.rows()) if bent else None
+    total = _Total.zeros(canvas.shape, 1 if terms is None else terms.number, rays)
+    for chunk, footprint in visible:
+        total.add(_summed(counts_of, corrected, masked, terms, chunk, footprint))
+        advance(len(chunk.span))
+    return total.result()
 
 
 def weights_of(source: Source) -> FluxImage | None:
@@ -186,10 +235,9 @@ def _summed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Total:
-    """Some rows of the grid.
+    """The sums of a grid.
 
     Attributes:
-        first: index of the first row.
         counts: (H, W) float32.
         coverages: (P, H, W) float32, coverages from the borders of frames and from masked frames.
         steps: (P, H, W + 1) float32, row-wise differences of the coverages inside of frames; `result` adds their cumulative
@@ -197,7 +245,6 @@ class _Total:
         rays: of all columns and rows of a `BentGrid`; None if homographies map frames to the grid.
     """
 
-    first: int
     counts: FluxImage
     coverages: FluxImage
     steps: FluxImage
@@ -207,49 +254,39 @@ class _Total:
     def zeros(cls, shape: tuple[int, int], number: int, rays: Rays | None) -> _Total:
         height, width = shape
         coverages, steps = (np.zeros((number, height, columns), np.float32) for columns in (width, width + 1))
-        return cls(0, np.zeros(shape, np.float32), coverages, steps, rays)
+        return cls(np.zeros(shape, np.float32), coverages, steps, rays)
 
-    def rows(self, rows: range) -> _Total:
-        """Return a view of some of the rows."""
-        part = slice(rows.start, rows.stop)
-        return _Total(rows.start, self.counts[part], self.coverages[:, part], self.steps[:, part], self.rays)
-
-    def add(self, summed: Sequence[_Summed]) -> None:
-        """Add sums of chunks, in order."""
-        for each in summed:
-            if each.footprint.rows.start >= self.first + len(self.counts) or each.footprint.rows.stop <= self.first:
-                continue
-            if isinstance(each.footprint, BentFootprint):
-                assert self.rays is not None
-                image = np.asarray(each.counts, np.float32), each.seen, each.amounts
-                add_bent(*image, each.footprint, self.rays, self.first, self.counts, self.coverages)
-                continue
-            to_image = each.footprint.to_image @ translation(0, self.first)
-            if each.seen is None:
-                for amount, coverage, steps in zip(each.amounts, self.coverages, self.steps, strict=True):
-                    if amount:
-                        add_footprint(each.counts.shape, to_image, float(amount), steps, coverage)
-            elif len(each.amounts) == 1:
-                self._warp(each.seen, each.footprint, to_image, self.coverages[0])
-            else:
-                seen = np.zeros_like(self.counts)
-                self._warp(each.seen, each.footprint, to_image, seen)
-                for amount, coverage in zip(each.amounts, self.coverages, strict=True):
-                    if amount:
-                        coverage += np.float32(amount) * seen
-            self._warp(each.counts, each.footprint, to_image, self.counts)
-
-    def _warp(self, image: FluxImage | Counts, footprint: Footprint, to_image: Homography, total: FluxImage) -> None:
-        if footprint.straight:
-            add_warped(image, to_image, total)
+    def add(self, each: _Summed) -> None:
+        """Add the sum of a chunk."""
+        if isinstance(each.footprint, BentFootprint):
+            assert self.rays is not None
+            image = np.asarray(each.counts, np.float32), each.seen, each.amounts
+            add_bent(*image, each.footprint, self.rays, self.counts, self.coverages)
             return
-        rows = range(max(footprint.rows.start - self.first, 0), min(footprint.rows.stop - self.first, len(total)))
-        if rows and footprint.columns:
-            size = len(footprint.columns), len(rows)
-            to_image = to_image @ translation(footprint.columns.start, rows.start)
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            box = slice(rows.start, rows.stop), slice(footprint.columns.start, footprint.columns.stop)
-            total[box] += cv2.warpPerspective(image, to_image, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        if each.seen is None:
+            for amount, coverage, steps in zip(each.amounts, self.coverages, self.steps, strict=True):
+                if amount:
+                    add_footprint(each.counts.shape, each.footprint.to_image, float(amount), steps, coverage)
+        elif len(each.amounts) == 1:
+            self._warp(each.seen, each.footprint, self.coverages[0])
+        else:
+            seen = np.zeros_like(self.counts)
+            self._warp(each.seen, each.footprint, seen)
+            for amount, coverage in zip(each.amounts, self.coverages, strict=True):
+                if amount:
+                    coverage += np.float32(amount) * seen
+        self._warp(each.counts, each.footprint, self.counts)
+
+    def _warp(self, image: FluxImage | Counts, footprint: Footprint, total: FluxImage) -> None:
+        if footprint.straight:
+            add_warped(image, footprint.to_image, total)
+            return
+        rows, columns = footprint.rows, footprint.columns
+        to_image = footprint.to_image @ translation(columns.start, rows.start)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        box = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
+        warped = cv2.warpPerspective(image, to_image, (len(columns), len(rows)), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        total[box] += warped
 
     def result(self) -> tuple[FluxImage, FluxImage]:
         """Return the counts, (H, W), and the coverages, (P, H, W)."""

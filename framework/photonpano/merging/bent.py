@@ -218,7 +218,6 @@ def add_bent(
     amounts: FloatArray,
     footprint: BentFootprint,
     rays: Rays,
-    first_row: int,
     total: FluxImage,
     coverages: FluxImage,
 ) -> None:
@@ -230,16 +229,11 @@ def add_bent(
         amounts: (P,) factors of the share.
         footprint: of the frame on the grid.
         rays: p and s of the columns of the grid, q and r of its rows.
-        first_row: the row of the grid that is the first one of `total`.
-        total: (H, W), some rows of the grid.
-        coverages: (P, H, W), the same rows.
+        total: (H, W).
+        coverages: (P, H, W).
     """
-    rows = range(max(footprint.rows.start, first_row), min(footprint.rows.stop, first_row + len(total)))
-    if not rows:
-        return
     p, s, q, r = rays
-    down = slice(rows.start, rows.stop)
-    part = slice(rows.start - first_row, rows.stop - first_row)
+    down = slice(footprint.rows.start, footprint.rows.stop)
     matrix = np.ascontiguousarray(footprint.to_image)
     for columns in footprint.columns:
         across = slice(columns.start, columns.stop)
@@ -251,8 +245,8 @@ def add_bent(
             matrix,
             footprint.lens,
             (p[across], s[across], q[down], r[down]),
-            total[part, across],
-            coverages[:, part, across],
+            total[down, across],
+            coverages[:, down, across],
         )
 
 
@@ -281,7 +275,7 @@ def laid(
         known = padded(average_squares(valid, at.shrink))
         for number, (image, total) in enumerate(zip(images, sums, strict=True)):
             counts = padded(average_squares(np.asarray(image * valid, np.float32), at.shrink))
-            add_bent(counts, known, never if number else once, at, grid.rays, 0, total, share)
+            add_bent(counts, known, never if number else once, at, grid.rays, total, share)
     return sums, share[0]
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING
 
 from photonpano.merging.accumulate import accumulate
 from photonpano.merging.chunks import chunks_of
 from photonpano.photometry import debiased
 from photonpano.protocols import Source, Trajectory
+from photonpano.threads import in_order
 from photonpano.values import FrameSpan, Panorama
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ class MergeRenderer:
     ) -> Panorama:
         """Merge the frames of a span on a canvas: see `Renderer`."""
         chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        with ThreadPoolExecutor(self._threads, thread_name_prefix="render") as pool:
-            photons = accumulate(source, chunks, canvas, canvas.shape, advance, pool)
+        photons = accumulate(source, chunks, canvas, canvas.shape, advance, partial(in_order, threads=self._threads))
         flux, weight = photons.estimate(source.response)
         return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)

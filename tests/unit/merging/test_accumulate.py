@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan
+from photonpano import FrameSpan, Light
 from photonpano.geometry import from_parameters, rescaling, translation
+from photonpano.lighting import in_light
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
@@ -223,3 +224,19 @@ def test_estimate_is_zero_where_corrected_counts_are_negative() -> None:
 def test_divided_returns_about_equal_parts_of_1_or_more() -> None:
     assert divided(10, 3) == [range(3), range(3, 6), range(6, 10)]
     assert divided(2, 7) == [range(1), range(1, 2)]
+
+
+@pytest.mark.parametrize("run", [1, 7, 64])
+def test_runs_of_chunks_add_up(memory_source: type, run: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the light of lamps, with masked pixels, along a path that leaves the grid."""
+    monkeypatch.setitem(accumulate.__globals__, "_RUN", run)
+    valid = np.random.default_rng(1).random(SHAPE) > 0.1
+    light = Light.of_frames(1 + 0.5 * np.sin(np.arange(50) / 3))
+    source = in_light(memory_source(frames_of(FLUX, 50), valid), light)
+    chunks = [Chunk(FrameSpan(t, t + 1), translation(0.6 * t, -0.3 * t)) for t in range(50)]
+    done: list[int] = []
+    at_once = accumulate(source, chunks, translation(2, 3), (25, 40))
+    in_runs = accumulate(source, chunks, translation(2, 3), (25, 40), done.append, in_order=map)
+    assert sum(done) == 50
+    np.testing.assert_allclose(in_runs.counts, at_once.counts, atol=1e-4)
+    np.testing.assert_allclose(in_runs.weight, at_once.weight, atol=1e-4)

@@ -141,6 +141,19 @@ def test_part_of_a_canvas_is_the_same_as_that_part_of_the_whole() -> None:
     assert np.allclose(piece.weight, whole.weight[box], atol=1e-3)
 
 
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("run", [1, 5, 64])
+def test_runs_of_chunks_add_up_also_across_the_seam(camera: Camera, run: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(accumulate.__globals__, "_RUN", run)
+    turns = rotations()
+    canvas = canvas_around(covered_by(turns, camera, SHAPE), CAMERA, 1.0, "spherical")
+    source = seen_through(capture(turns, camera), camera)
+    at_once = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
+    in_runs = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape, in_order=map)
+    assert np.allclose(in_runs.counts, at_once.counts, atol=0.05)
+    assert np.allclose(in_runs.weight, at_once.weight, atol=1e-3)
+
+
 def test_bent_warp_onto_a_plane_is_that_of_opencv() -> None:
     image = np.random.default_rng(0).random(SHAPE, np.float32)
     matrix = translation(-20, 10) @ CAMERA.homographies(rotation_matrices([0.05, 0.1, 0.2]))
