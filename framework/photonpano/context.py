@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
+from photonpano.execution import Executor, Here
+from photonpano.threads import in_order
+
+ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 
@@ -109,13 +114,19 @@ class Context:
     """How a computation runs; its result does not depend on it.
 
     Attributes:
-        threads: how many threads work at once.
+        threads: how many tasks are under way at once.
         progress: receives stages and messages.
         on_level: called with the `LevelResult` of each level of the loop when it is done.
         checkpoints: keep what is found, for the case of an interruption.
+        executor: works on the tasks.
     """
 
     threads: int = 1
     progress: Progress = field(default_factory=Quiet)
     on_level: Callable[[Any], object] = lambda _: None
     checkpoints: Checkpoints = field(default_factory=KeepNothing)
+    executor: Executor = field(default_factory=Here)
+
+    def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:
+        """Yield the results of `work` in the order of the items, each a task of the executor: see `threads.in_order`."""
+        return in_order(partial(self.executor.call, self.executor.share(work)), items, self.threads)

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 from photonpano.errors import CaptureUnreadError
 from photonpano.paths import given_path, refusal
 from photonpano.protocols import Exporter, Interpolator, Locator, Merger, PoseEstimator, Refiner, Renderer, Resampler, Source
+from photonpano.threads import InOrder
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
 API_VERSION = 1
@@ -82,6 +83,8 @@ class StageContext:
             `CaptureUnreadError` where a spec is only explained: call it when the component works, not when it is built.
         decide: records a choice that the spec leaves to the component: what was chosen, its value (a number, a text, true
             or false), and a clause with the reason. `run.json` and the report list it.
+        in_order: calls a function with each of some items, several at once, and yields the results in order. Other processes
+            or machines may do the work: there the function is a copy, pickled with all that it holds.
     """
 
     stream: StreamInfo
@@ -90,6 +93,7 @@ class StageContext:
     threads: int = 1
     capture: Callable[[], CaptureSummary] = field(default=_unread, compare=False)
     decide: Callable[[str, DecisionValue, str], None] = field(default=_not_recorded, compare=False)
+    in_order: InOrder = field(default=map, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

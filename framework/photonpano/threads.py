@@ -6,15 +6,17 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from threadpoolctl import threadpool_limits
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
+InOrder = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+"""Calls a function with each item, several at once, and yields the results in order."""
 
 
 def thread_count(threads: int | Literal["auto"]) -> int:
@@ -97,7 +99,15 @@ class Stopwatch:
         try:
             yield
         finally:
-            share = 1 if threading.get_ident() == self._caller else self._threads
-            elapsed = (time.perf_counter() - start) / share
-            with self._lock:
-                self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
+            self.add({stage: time.perf_counter() - start})
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Add seconds, by stage, that were spent for the calling thread."""
+        share = 1 if threading.get_ident() == self._caller else self._threads
+        with self._lock:
+            for stage, spent in seconds.items():
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + spent / share
+
+    def __reduce__(self) -> tuple[type[Stopwatch], tuple[int]]:
+        """Start anew where it travels to."""
+        return Stopwatch, (self._threads,)

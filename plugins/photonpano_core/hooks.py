@@ -277,7 +277,7 @@ def _build_merge(config: MergeConfig, context: StageContext) -> Renderer:
     from photonpano.merging import MergeRenderer
 
     del config
-    return MergeRenderer(context.threads)
+    return MergeRenderer(context.in_order)
 
 
 def _build_super_resolution(config: SuperResolutionConfig, context: StageContext) -> Renderer:

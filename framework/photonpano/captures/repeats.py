@@ -11,7 +11,6 @@ from photonpano.context import Context
 from photonpano.errors import InputError
 from photonpano.motion.timeline import Timeline
 from photonpano.protocols import PackedSource, Source
-from photonpano.threads import in_order
 from photonpano.values import BoolArray, FrameSpan, true_spans
 
 _BLOCK_FRAMES = 256
@@ -36,7 +35,7 @@ def timeline_of(source: Source, context: Context) -> Timeline:
         return Timeline.regular(n_frames)
     spans = [FrameSpan(max(0, span.start - 1), span.stop) for span in source.info.span.blocks(_BLOCK_FRAMES)]
     same = np.zeros(n_frames, dtype=bool)
-    for span, found in zip(spans, in_order(partial(_same_as_before, source), spans, context.threads), strict=True):
+    for span, found in zip(spans, context.in_order(partial(_same_as_before, source), spans), strict=True):
         same[span.start + 1 : span.stop] = found
     if n_frames > 1 and same[1:].all():
         raise InputError(f"all {n_frames} frames are copies of the first one; check that the camera went on recording")

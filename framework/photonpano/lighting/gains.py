@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
 from photonpano.protocols import Source, Trajectory, camera_of_motion
-from photonpano.threads import in_order
 from photonpano.values import FloatArray, FrameSpan, Homography
 
 _CELLS = 24
@@ -124,20 +124,8 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     weights = weights_of(source)
     covered = _COVERED if weights is None else _COVERED * float(weights.mean())
 
-    def seen(place: tuple[FrameSpan, Homography]) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-        span, homography = place
-        summed = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
-        counts, weight = (
-            cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
-            for image in (np.maximum(summed.counts, 0), summed.weight)
-        )
-        index = np.flatnonzero(weight > covered * len(span))
-        frames = np.asarray(weight.ravel()[index], np.float32)
-        exposure = 4 * half**2 * frames
-        flux = source.response.flux(np.asarray(counts.ravel()[index] / frames, np.float32), exposure)
-        return index, np.asarray(np.maximum(flux, 0) * exposure, np.float64), exposure.astype(np.float64)
-
-    parts = list(in_order(seen, list(zip(spans, motions, strict=True)), context.threads))
+    seen = partial(_seen, source, canvas, half, covered)
+    parts = list(context.in_order(seen, list(zip(spans, motions, strict=True))))
     cells = np.concatenate([part[0] for part in parts])
     times = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     return SeenCells(
@@ -149,6 +137,32 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         (n_rows, n_columns),
         np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform if canvas.planar else None,
     )
+
+
+def _seen(
+    source: Source, canvas: Canvas, half: int, covered: float, place: tuple[FrameSpan, Homography]
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Return the squares that a span sees, the photons in them, and their exposures in frames and pixels.
+
+    Args:
+        source: the capture.
+        canvas: two pixels are the side of a square.
+        half: pixels of a frame in a pixel of the canvas.
+        covered: least share of the frames in which a square is seen.
+        place: the span, and where its frames lie.
+    """
+    span, homography = place
+    summed = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
+    n_rows, n_columns = canvas.height // 2, canvas.width // 2
+    counts, weight = (
+        cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
+        for image in (np.maximum(summed.counts, 0), summed.weight)
+    )
+    index = np.flatnonzero(weight > covered * len(span))
+    frames = np.asarray(weight.ravel()[index], np.float32)
+    exposure = 4 * half**2 * frames
+    flux = source.response.flux(np.asarray(counts.ravel()[index] / frames, np.float32), exposure)
+    return index, np.asarray(np.maximum(flux, 0) * exposure, np.float64), exposure.astype(np.float64)
 
 
 def _canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.light import LightTerms, LitFrames
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
 from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource, camera_of, light_of
+from photonpano.threads import InOrder
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
 _RUN = 64
@@ -25,8 +25,6 @@ _RUN = 64
 MIN_WEIGHT = 1.0
 """Pixels with less weight than this, in frames, are unknown."""
 
-InOrder = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
-"""Calls a function with each item, several at once, and yields the results in order: see `threads.in_order`."""
 _Visible = Sequence[tuple[Chunk, Footprint | BentFootprint]]
 
 

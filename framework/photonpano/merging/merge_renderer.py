@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING
 
 from photonpano.merging.accumulate import accumulate
 from photonpano.merging.chunks import chunks_of
 from photonpano.photometry import debiased
 from photonpano.protocols import Source, Trajectory
-from photonpano.threads import in_order
+from photonpano.threads import InOrder
 from photonpano.values import FrameSpan, Panorama
 
 if TYPE_CHECKING:
@@ -20,9 +19,9 @@ if TYPE_CHECKING:
 class MergeRenderer:
     """Warps the photons of all frames to the canvas, and estimates the flux of each pixel once (paper, equation 3)."""
 
-    def __init__(self, threads: int) -> None:
-        """Take the number of threads that warp; the result does not depend on it."""
-        self._threads = threads
+    def __init__(self, in_order: InOrder) -> None:
+        """Take what works on several parts at once, such as that of a `StageContext`; the result does not depend on it."""
+        self._in_order = in_order
 
     def render(
         self,
@@ -35,6 +34,6 @@ class MergeRenderer:
     ) -> Panorama:
         """Merge the frames of a span on a canvas: see `Renderer`."""
         chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        photons = accumulate(source, chunks, canvas, canvas.shape, advance, partial(in_order, threads=self._threads))
+        photons = accumulate(source, chunks, canvas, canvas.shape, advance, self._in_order)
         flux, weight = photons.estimate(source.response)
         return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)

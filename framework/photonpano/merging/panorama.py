@@ -124,7 +124,7 @@ def render(
         context: threads and progress.
         renderer: by default, it merges all frames.
     """
-    renderer = renderer or MergeRenderer(context.threads)
+    renderer = renderer or MergeRenderer(context.in_order)
     (panorama,) = render_tiles(renderer, source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
     return panorama
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -100,11 +99,11 @@ def locate(
     given = groups, pairs, exposures.previous_homographies(), exposures.timeline, camera_of(exposures.source)
     log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:
-        registrar = Registrar(exposures, pool, log)
+        registrar = Registrar(exposures, log, context)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
-        require_motion(level, edges, shape, partial(_seen_px, exposures, edges, pool))
+        require_motion(level, edges, shape, partial(_seen_px, exposures, edges, context))
         with exposures.clock("locate"), solving(level.number):
             edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
@@ -138,11 +137,11 @@ def locate(
     )
 
 
-def _seen_px(exposures: VirtualExposures, edges: Sequence[Edge], pool: ThreadPoolExecutor) -> float:
+def _seen_px(exposures: VirtualExposures, edges: Sequence[Edge], context: Context) -> float:
     """Return the largest motion of a pair at the first level, in px, as short spans of frames show it; 0 where they do not."""
     if exposures.previous is not None:
         return 0.0
-    start, instants = starting_motion(exposures.source, exposures.groups, pool), instants_of(exposures.groups)
+    start, instants = starting_motion(exposures.source, exposures.groups, context), instants_of(exposures.groups)
     moved = [start.between(instants[edge.moving], instants[edge.fixed]) for edge in edges] if start else []
     return max((float(np.hypot(*motion[:2, 2])) for motion in moved if motion is not None), default=0.0)
 

@@ -6,47 +6,42 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from threading import Lock
-from typing import Any
+from typing import TypeVar
 
-from photonpano.context import Log
+from photonpano.context import Context, Log
 from photonpano.geometry import inverse, why_implausible
-from photonpano.motion.checks import require_no_standstill, require_valid, why_undetermined
-from photonpano.motion.closures import MIN_SIMILARITY, exposure_similarity
-from photonpano.motion.diagnosis import Contrast, contrast_of
-from photonpano.motion.level import FrameHomography, NamedLocator
+from photonpano.motion.closures import MIN_SIMILARITY
+from photonpano.motion.diagnosis import Contrast
+from photonpano.motion.exposure_tasks import Described, ExposureTasks
+from photonpano.motion.level import FrameHomography
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of, shared_share
 from photonpano.motion.start import starting_motion
 from photonpano.motion.tracking import Place, Track
 from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import in_order, lagging
-from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated, VirtualExposure
+from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated
+
+ResultT = TypeVar("ResultT")
 
 BRIDGE = 3
 """If no pair of an exposure with earlier ones is located, pairs with this many predecessors are tried."""
-MAX_HYPOTHESES = 100
-"""Most hypotheses of a pair that are used."""
 MIN_PAIR_WEIGHT = 0.05
 """Lower bound of a pair's weight. Shared photons carry no new information: their noise agrees with the motion known so far."""
 
 
 @dataclass(slots=True)
-class _Described:
+class _Kept:
     """What is kept of an exposure until its last pair is registered.
 
     Attributes:
-        contrast: how much there is to see in it.
-        features: what each locator made of it, by the locator's name.
+        described: stands for what each locator made of it, by the locator's number.
         lock: held while a locator describes it, so that each does so once.
-        exposure: the exposure itself, for loop closures.
     """
 
-    contrast: Contrast
-    features: dict[str, Any] = field(default_factory=dict)
+    described: dict[int, Described] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
-    exposure: VirtualExposure | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,22 +72,23 @@ class Registrar:
         to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
-    def __init__(self, exposures: VirtualExposures, pool: ThreadPoolExecutor, log: Log) -> None:
+    def __init__(self, exposures: VirtualExposures, log: Log, context: Context) -> None:
         """Prepare to register.
 
         Args:
             exposures: of the level.
-            pool: merges, describes and registers.
             log: the first exposures in order, as `Registered`; receives the others.
+            context: its executor merges, describes and registers.
         """
+        self._executor, self._tasks = context.executor, context.executor.share(ExposureTasks(exposures))
         self._exposures, self._level, self._clock = exposures, exposures.level, exposures.clock
         self._log = log
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
         self.to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))
         self._from_plane = None if self.to_plane is None else inverse(self.to_plane)
-        self._track = self._started(pool) if exposures.previous is None else None
+        self._track = self._started(context) if exposures.previous is None else None
         self._independent = independent_share(exposures.groups)
-        self._described: dict[int, _Described] = {}
+        self._kept: dict[int, _Kept] = {}
         self.contrasts: dict[int, Contrast] = {}
 
     @property
@@ -107,7 +103,7 @@ class Registrar:
 
         Args:
             pairs: (moving, fixed), ordered by the moving exposure, which is the later one.
-            pool: merges, describes and registers.
+            pool: waits for tasks.
             threads: how many exposures are worked on ahead.
             advance: called with 1 after each moving exposure.
         """
@@ -133,8 +129,8 @@ class Registrar:
                 found += self._bridge(moving, partners[moving])
             self._log.add(self._registered(moving, tuple(found)))
             yield from found
-            for index in [index for index in self._described if needed_until[index] <= moving]:
-                del self._described[index]
+            for index in [index for index in self._kept if needed_until[index] <= moving]:
+                del self._kept[index]
             advance(1)
 
     def closures(
@@ -147,24 +143,24 @@ class Registrar:
         Args:
             pairs: (moving, fixed), ordered by the moving exposure.
             homographies: (N, 3, 3) solution of the graph without these pairs, frame pixels to a common plane.
-            pool: describes the two exposures of a pair at the same time.
+            pool: waits for tasks: the two exposures of a pair are described at the same time.
             log: the first pairs in order, as `Edge`; receives the others.
         """
-        self._described.clear()
+        self._kept.clear()
         needed_until = {index: position for position, pair in enumerate(pairs) for index in pair}
         yield from log.found
         for position, (moving, fixed) in enumerate(pairs):
             if position < len(log.found):
                 continue
-            missing = [index for index in (moving, fixed) if index not in self._described]
-            for index, described in zip(missing, pool.map(lambda each: self._describe(each, keep=True), missing), strict=True):
-                self._described[index] = described
+            missing = [index for index in (moving, fixed) if index not in self._kept]
+            for index, (kept, _) in zip(missing, pool.map(lambda each: self._describe(each, keep=True), missing), strict=True):
+                self._kept[index] = kept
             expected = FrameHomography(inverse(homographies[fixed]) @ homographies[moving])
             closure = self._similar(self._register(moving, fixed, expected))
             log.add(closure)
             yield closure
-            for index in [index for index in self._described if needed_until[index] <= position]:
-                del self._described[index]
+            for index in [index for index in self._kept if needed_until[index] <= position]:
+                del self._kept[index]
 
     def _registered(self, moving: int, edges: tuple[Edge, ...]) -> Registered:
         alternatives = {edge.fixed: self.alternatives_px.get((moving, edge.fixed)) for edge in edges}
@@ -190,11 +186,11 @@ class Registrar:
         Args:
             partners: the exposures to describe, with the earlier ones that each is registered with.
             known: the number of exposures whose pairs are registered already.
-            pool: merges, describes and registers.
+            pool: waits for tasks.
             threads: how many exposures are worked on ahead.
         """
         for moving, described in zip(partners, in_order(self._describe, partners, threads, pool), strict=True):
-            self._described[moving], self.contrasts[moving] = described, described.contrast
+            self._kept[moving], self.contrasts[moving] = described
             if moving < known:
                 yield moving, []
             elif self._track is not None:
@@ -233,38 +229,35 @@ class Registrar:
 
     def _similar(self, closure: Edge) -> Edge:
         """Return a loop closure with its similarity, not located if that is too small."""
-        first, second = self._described[closure.moving].exposure, self._described[closure.fixed].exposure
-        if isinstance(closure.motion, NotLocated) or first is None or second is None:
+        if isinstance(closure.motion, NotLocated):
             return closure
-        with self._clock("locate"):
-            similarity = exposure_similarity(first, second, FrameHomography(closure.motion.homography))
+        pair = (self._described_by(0, each) for each in (closure.moving, closure.fixed))
+        similarity = self._timed(self._executor.call(ExposureTasks.similarity, self._tasks, *pair, closure.motion.homography))
         evidence = {**closure.motion.evidence, "closure_similarity": similarity}
         if similarity < MIN_SIMILARITY:
             reason = f"the similarity of the exposures of this loop closure is {similarity:.2f}, less than {MIN_SIMILARITY:g}"
             return Edge(closure.moving, closure.fixed, NotLocated(reason, evidence))
         return replace(closure, motion=replace(closure.motion, evidence=evidence))
 
-    def _describe(self, index: int, keep: bool = False) -> _Described:
-        exposure = self._exposures.merged(index)
-        with self._clock("locate"):
-            contrast = contrast_of(exposure)
-        described = _Described(contrast, exposure=exposure if keep else None)
-        if not contrast.blank:
-            first = self._level.locators[0]
-            described.features[first.name] = self._described_by(first, exposure)
-        return described
+    def _describe(self, index: int, keep: bool = False) -> tuple[_Kept, Contrast]:
+        """Have the first locator describe an exposure."""
+        described, known = self._executor.keep(ExposureTasks.describe, self._tasks, index, 0, keep)
+        return _Kept({0: described}), self._timed(known)
 
-    def _described_by(self, locator: NamedLocator, exposure: VirtualExposure) -> Any:
-        with self._clock("locate"), self._level.attributing(locator):
-            return locator.component.describe(exposure)
+    def _described_by(self, locator: int, index: int) -> Described:
+        """Return what stands for a locator's description of an exposure; for a fallback, it is merged again."""
+        kept = self._kept[index]
+        with kept.lock:
+            if locator not in kept.described:
+                kept.described[locator], known = self._executor.keep(ExposureTasks.describe, self._tasks, index, locator, False)
+                self._timed(known)
+            return kept.described[locator]
 
-    def _features(self, locator: NamedLocator, index: int) -> Any:
-        """Return a locator's features of an exposure; for a fallback, it is merged again."""
-        described = self._described[index]
-        with described.lock:
-            if locator.name not in described.features:
-                described.features[locator.name] = self._described_by(locator, self._exposures.merged(index))
-            return described.features[locator.name]
+    def _timed(self, done: tuple[ResultT, dict[str, float]]) -> ResultT:
+        """Return the result of a task, and add its time to that of the level."""
+        result, seconds = done
+        self._clock.add(seconds)
+        return result
 
     def _expected(self, moving: int, fixed: int) -> FrameHomography | None:
         """Return the motion of a pair that is known so far; None at the first level, unless both exposures are tracked."""
@@ -274,7 +267,7 @@ class Registrar:
             return None
         return FrameHomography(self._from_plane[fixed] @ self.to_plane[moving])
 
-    def _started(self, pool: ThreadPoolExecutor) -> Track | None:
+    def _started(self, context: Context) -> Track | None:
         """Measure how the image moves, for a first level whose locators make use of it."""
         level, groups = self._level, self._exposures.groups
         if not any(isinstance(locator.component, KeepsHypotheses) for locator in level.locators):
@@ -282,20 +275,17 @@ class Registrar:
         with self._clock("locate"):
             complete = len(self._log.found) == len(groups)
             exposures = self._exposures
-            start = None if complete else starting_motion(exposures.source, groups, pool, exposures.timeline)
+            start = None if complete else starting_motion(exposures.source, groups, context, exposures.timeline)
         return Track(start, instants_of(groups), self._exposures.frame_shape)
 
     def _hypotheses(self, moving: int, fixed: int) -> list[Homography]:
         """Return what the first locator that keeps hypotheses makes of a pair, in pixels of frames; none of blank exposures."""
-        for locator in self._level.locators:
-            component = locator.component
-            if not isinstance(component, KeepsHypotheses) or self.contrasts[moving].blank or self.contrasts[fixed].blank:
-                continue
-            features = self._features(locator, moving), self._features(locator, fixed)
-            with self._clock("locate"), self._level.attributing(locator):
-                listed = list(islice(component.hypotheses(*features), MAX_HYPOTHESES))
-                found = [require_valid(Located(each)) for each in listed]
-            return [self._level.in_frame_px(each).homography for each in found if isinstance(each, Located)]
+        if self.contrasts[moving].blank or self.contrasts[fixed].blank:
+            return []
+        for number, locator in enumerate(self._level.locators):
+            if isinstance(locator.component, KeepsHypotheses):
+                pair = (self._described_by(number, each) for each in (moving, fixed))
+                return self._timed(self._executor.call(ExposureTasks.hypotheses, self._tasks, number, *pair))
         return []
 
     def _register(self, moving: int, fixed: int, expected: FrameHomography | None, guessed: bool = False) -> Edge:
@@ -313,34 +303,23 @@ class Registrar:
         if expected is not None and (reason := why_implausible(expected, self._exposures.frame_shape)):
             return Edge(moving, fixed, NotLocated(f"by the motion known so far, {reason}"))
         failures: dict[str, NotLocated] = {}
-        for locator in self._level.locators:
+        for number, locator in enumerate(self._level.locators):
             starts = not guessed or isinstance(locator.component, KeepsHypotheses)
-            motion = self._located_by(locator, moving, fixed, expected if starts else None)
+            motion = self._located_by(number, moving, fixed, expected if starts else None)
             if isinstance(motion, Located):
                 return Edge(moving, fixed, motion, locator.name)
             failures[locator.name] = motion
         return Edge(moving, fixed, _joined(failures))
 
-    def _located_by(
-        self, locator: NamedLocator, moving: int, fixed: int, expected: FrameHomography | None
-    ) -> Located | NotLocated:
-        """Return the motion of a pair in pixels of frames, as one locator finds it."""
-        level, groups, shape = self._level, self._exposures.groups, self._exposures.frame_shape
-        features = self._features(locator, moving), self._features(locator, fixed)
-        initial = None if expected is None else level.in_exposure_px(expected)
-        with self._clock("locate"):
-            with level.attributing(locator):
-                motion = require_valid(locator.component.register(*features, initial))
-                if isinstance(motion, NotLocated):
-                    return motion
-                require_no_standstill(motion, expected, shape)
-            motion = level.in_frame_px(motion)
-            if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
-                return NotLocated(reason, motion.evidence)
-            if motion.information is None:
-                return motion
-            new = self._independent * max(1 - shared_share(groups[moving].span, groups[fixed].span), MIN_PAIR_WEIGHT)
-            return replace(motion, information=motion.information * new)
+    def _located_by(self, locator: int, moving: int, fixed: int, expected: FrameHomography | None) -> Located | NotLocated:
+        """Return the motion of a pair as one locator finds it; photons that both share do not count."""
+        pair = (self._described_by(locator, each) for each in (moving, fixed))
+        motion = self._timed(self._executor.call(ExposureTasks.register, self._tasks, locator, *pair, expected))
+        if isinstance(motion, NotLocated) or motion.information is None:
+            return motion
+        groups = self._exposures.groups
+        new = self._independent * max(1 - shared_share(groups[moving].span, groups[fixed].span), MIN_PAIR_WEIGHT)
+        return replace(motion, information=motion.information * new)
 
 
 def _joined(failures: Mapping[str, NotLocated]) -> NotLocated:

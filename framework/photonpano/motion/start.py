@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import pairwise
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from photonpano.context import Context
 from photonpano.geometry import translation
 from photonpano.locating import Follows, correlation_peaks, correlation_surface, follows
 from photonpano.merging import binned_mean, binning_of
@@ -118,7 +118,7 @@ class StartingMotion:
 
 
 def starting_motion(
-    source: Source, groups: Sequence[Group], pool: ThreadPoolExecutor, timeline: Timeline | None = None
+    source: Source, groups: Sequence[Group], context: Context, timeline: Timeline | None = None
 ) -> StartingMotion | None:
     """Measure the velocity of the image all over a capture, before any motion is known.
 
@@ -132,8 +132,8 @@ def starting_motion(
     n_frames = source.info.n_frames
     length = min(n_frames, max(2 * _SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
     starts = np.rint(np.linspace(0, n_frames - length, max(1, n_frames // length))).astype(int).tolist()
-    found = list(pool.map(partial(_hypotheses, source, length), starts))
-    found = list(pool.map(partial(_with_those_near, source, length, starts, found), range(len(starts))))
+    found = list(context.in_order(partial(_hypotheses, source, length), starts))
+    found = list(context.in_order(partial(_with_those_near, source, length, starts, found), range(len(starts))))
     known = [(start + (length - 1) / 2, each) for start, each in zip(starts, found, strict=True) if each is not None]
     if not known:
         return None

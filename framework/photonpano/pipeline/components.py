@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 from photonpano.captures.part import part_of
@@ -32,7 +32,7 @@ from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.threads import thread_count
+from photonpano.threads import InOrder, in_order, thread_count
 from photonpano.values import CaptureSummary, Decision, DecisionValue, FrameSpan, Group
 
 if TYPE_CHECKING:
@@ -165,18 +165,23 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
     return tuple(NamedRefiner(choice.contribution.name, _built(choice, context), choice.label) for choice in plan.refine)
 
 
-def build_renderer(plan: Plan, source: Source, decisions: list[Decision]) -> AttributedRenderer:
+def build_renderer(
+    plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None
+) -> AttributedRenderer:
     """Build the renderer of a plan.
 
     Args:
         plan: which renderer.
         source: the capture.
         decisions: receives the decisions that it takes.
+        in_order: works on parts of the panorama at once; by default, threads do.
     """
     from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
 
     choice, contribution = plan.renderer, plan.renderer.contribution
     context = _stage_context(plan, source, decisions)
+    if in_order is not None:
+        context = replace(context, in_order=in_order)
     assert isinstance(contribution, RendererContribution)
     if light_of(source) is not None and not contribution.divides_by_light:
         logger.warning(
@@ -279,7 +284,8 @@ def _stage_context(
         capture: returns the flux and the speed of the capture; None for components that cannot ask for them.
     """
     threads = thread_count(plan.run.threads)
-    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_recorder(decisions))
+    at_once = partial(in_order, threads=threads)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_recorder(decisions), in_order=at_once)
     return context if capture is None else replace(context, capture=capture)
 
 

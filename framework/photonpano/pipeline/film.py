@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -106,9 +107,10 @@ def merged(
     source: Source, motion: FrameMotion, span: FrameSpan, canvas: Canvas, tolerance_px: float, threads: int
 ) -> FluxImage:
     """Merge frames on a canvas along a motion; of a filter array, the colours: (H, W) or (H, W, 3)."""
+    renderer = MergeRenderer(partial(in_order, threads=threads))
 
     def of_colour(each: Source) -> Panorama:
-        return MergeRenderer(threads).render(each, motion.trajectory, span, canvas, tolerance_px, lambda _: None)
+        return renderer.render(each, motion.trajectory, span, canvas, tolerance_px, lambda _: None)
 
     return composed(in_colours(source, of_colour), source).flux
 

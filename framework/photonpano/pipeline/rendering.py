@@ -59,7 +59,8 @@ def render_into(
         PluginError: the renderer or an exporter failed, or broke its contract.
     """
     decisions: list[Decision] = []
-    renderer, exporters = build_renderer(plan, source, decisions), build_exporters(plan, source, decisions)
+    renderer = build_renderer(plan, source, decisions, context.in_order)
+    exporters = build_exporters(plan, source, decisions)
     try:
         panorama = render_panorama(
             renderer,

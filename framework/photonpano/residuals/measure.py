@@ -16,7 +16,6 @@ from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
 from photonpano.residuals.prediction import Prediction, Predictions
-from photonpano.threads import in_order
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
 N_STEPS = 4
@@ -127,7 +126,7 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
     total: _Batch | None = None
     results: list[tuple[FloatArray, ...]] = []
     with context.progress.stage("residuals", len(span), "frames") as advance:
-        for batch, part in zip(batches, in_order(work, batches, context.threads), strict=True):
+        for batch, part in zip(batches, context.in_order(work, batches), strict=True):
             results.append((part.normal, part.gradient, part.misfit))
             total = part if total is None else total.plus(part)
             advance(sum(map(len, spans[batch])))

@@ -94,11 +94,11 @@ def test_super_resolution_exceeds_interpolated_panorama_by_3_db_with_the_weight_
     truth, decisions = true_panorama(scene), []
     panorama = rendered(source, motion, decisions)
     small = Canvas(56, 56, np.eye(3))
-    merged = MergeRenderer(1).render(source, motion, source.info.span, small, 0.125, lambda _: None)
+    merged = MergeRenderer(map).render(source, motion, source.info.span, small, 0.125, lambda _: None)
     bicubic = cv2.resize(np.nan_to_num(merged.flux), CANVAS.shape, interpolation=cv2.INTER_CUBIC)
     assert psnr_db(panorama.flux, truth) > psnr_db(bicubic, truth) + 3
     assert float(panorama.flux[INNER].mean()) == pytest.approx(truth[INNER].mean(), rel=0.01)
-    merged = MergeRenderer(1).render(source, motion, source.info.span, CANVAS, 0.125, lambda _: None)
+    merged = MergeRenderer(map).render(source, motion, source.info.span, CANVAS, 0.125, lambda _: None)
     assert panorama.weight[INNER].mean() == pytest.approx(merged.weight[INNER].mean(), rel=0.02)
     (what, value, reason), (supported, yes, _) = decisions
     assert (what, supported, yes) == ("super_resolution.rounds", "super_resolution.supported", True)

@@ -150,7 +150,9 @@ def test_render_tiles_equals_render(panning: Any, known_motion: type, motion: tu
     assert len(tiles) > 2
     flux, weight = np.zeros(canvas.shape), np.zeros(canvas.shape)
     shown = Thumbnail(canvas, reduction)
-    for tile, part in zip(tiles, render_tiles(MergeRenderer(2), panning, turning, ALL, tiles, 0.25, Context(2)), strict=True):
+    two = Context(2)
+    parts = render_tiles(MergeRenderer(two.in_order), panning, turning, ALL, tiles, 0.25, two)
+    for tile, part in zip(tiles, parts, strict=True):
         box = np.s_[tile.top : tile.top + tile.canvas.height, tile.left : tile.left + tile.canvas.width]
         flux[box], weight[box] = part.flux, part.weight
         shown.add(tile, part)
@@ -172,8 +174,8 @@ def test_render_of_rolled_frames_does_not_depend_on_threads(memory_source: type,
     tiles, _ = tiles_of(canvas, BYTES_PER_PIXEL * canvas.height * canvas.width // (1 if n_tiles == 1 else 2))
     assert (len(tiles) > 1) == (n_tiles > 1)
     one, *others = (
-        list(render_tiles(MergeRenderer(threads), source, roll, source.info.span, tiles, 0.1, Context(threads)))
-        for threads in (1, 2, 3, 5)
+        list(render_tiles(MergeRenderer(context.in_order), source, roll, source.info.span, tiles, 0.1, context))
+        for context in map(Context, (1, 2, 3, 5))
     )
     for other in others:
         for part, same in zip(one, other, strict=True):

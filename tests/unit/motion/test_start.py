@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group
+from photonpano.context import Context
 from photonpano.motion.start import StartingMotion, starting_motion
 
 SHAPE = (64, 96)
@@ -36,8 +36,7 @@ def started(memory_source: type) -> Callable[..., StartingMotion | None]:
         source = memory_source([rng.random(SHAPE) < -np.expm1(-view) for view in views])
         length = LENGTH if front is None else 2 * LENGTH
         spans = [FrameSpan(start, start + length) for start in range(0, n_frames, length)]
-        with ThreadPoolExecutor(1) as pool:
-            return starting_motion(source, [Group(span, span.centre) for span in spans], pool)
+        return starting_motion(source, [Group(span, span.centre) for span in spans], Context())
 
     return started
 

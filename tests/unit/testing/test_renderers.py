@@ -18,7 +18,7 @@ class Honest:
 
     def __init__(self, context):
         self.threads = context.threads
-        self.renderer = MergeRenderer(context.threads)
+        self.renderer = MergeRenderer(context.in_order)
 
     def render(self, source, trajectory, span, canvas, tolerance_px, advance):
         return self.renderer.render(source, trajectory, span, canvas, tolerance_px, advance)
