@@ -9,6 +9,7 @@ from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Progress, Quiet
 from photonpano.errors import InputError
 from photonpano.motion.attribution import attributing
+from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_checks import require_estimate
@@ -26,18 +27,19 @@ from photonpano.values import CameraGuess, Decision, PoseEstimate
 
 def run_poses(
     plan: Plan, progress: Progress | None = None, *, overwrite: bool = False, resume: bool = False, keeps_work: bool = False
-) -> RunRecord:
+) -> tuple[RunRecord, bool]:
     """Run a plan with a pose estimator, and write its run folder.
 
     Args:
         plan: from `load_spec` or `parse_spec`.
         progress: receives stages and messages; quiet by default.
         overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
-        resume: begin anew, with a note: such a run keeps nothing to go on with.
+        resume: take the results of a finished run of the same spec, capture and versions; an interrupted one begins anew,
+            since such a run keeps nothing to go on with.
         keeps_work: whether the caller asks for work that is kept, which is refused.
 
     Returns:
-        The content of `run.json`.
+        The content of `run.json`, and whether `resume` found that nothing was left to do.
 
     Raises:
         InputError: the capture cannot be used, shows nothing, or does not suit the plan; or `keeps_work`.
@@ -48,13 +50,16 @@ def run_poses(
     if keeps_work:
         raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
     progress = progress or Quiet()
-    if resume:
-        progress.note("a run with `pose` keeps no work: it begins anew")
     observers = Observers(plan.observers, plan.output.directory)
     with begun_run(plan, observers, progress, overwrite=overwrite) as begun:
         source, folder = begun.source, begun.folder
-        decisions = first_decisions(plan, source)
         capture = fingerprint(plan, source)
+        if resume:
+            if (done := finished_run(plan, capture)) is not None:
+                begun.finished(done)
+                return done, True
+            progress.note("a run with `pose` keeps no work: it begins anew")
+        decisions = first_decisions(plan, source)
         start = time.perf_counter()
         with naming_obstacles(source, decisions):
             estimate = _estimated(plan, source, decisions, progress)
@@ -69,7 +74,7 @@ def run_poses(
         )
         record = with_report(folder, record, lambda record: render_pose_report(record, estimate))
         begun.finished(record)
-    return record
+    return record, False
 
 
 def camera_guess(plan: Plan) -> CameraGuess:

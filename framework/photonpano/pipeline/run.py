@@ -18,7 +18,7 @@ from photonpano.pipeline.pose_run import run_poses
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import begun_run, first_decisions, with_report
 from photonpano.protocols import light_of
-from photonpano.record.run_json import record_of
+from photonpano.record.run_json import record_of, verdict_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_report
 from photonpano.residuals.refinement import refine
@@ -73,19 +73,18 @@ def run(
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
     """
     if plan.pose is not None:
-        return RunResult(
-            plan.output.directory,
-            run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keep_work or from_level is not None),
-            verdict=None,
-        )
+        keeps_work = keep_work or from_level is not None
+        poses, was_finished = run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keeps_work)
+        return RunResult(plan.output.directory, poses, None, was_finished)
     observers = Observers(plan.observers, plan.output.directory)
     context = Context(thread_count(plan.run.threads), progress or Quiet(), observers.level_finished)
     with begun_run(plan, observers, context.progress, overwrite=overwrite) as begun, ExitStack() as stack:
         source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
         depends_on = run_fingerprint(plan, source)
-        if resume and (done := finished_run(plan, depends_on)) is not None:
-            begun.finished(done[0])
-            return RunResult(plan.output.directory, *done, was_finished=True)
+        if resume and (done := finished_run(plan, depends_on["capture"])) is not None:
+            assert done["verdict"] is not None
+            begun.finished(done)
+            return RunResult(plan.output.directory, done, verdict_of(done["verdict"]), was_finished=True)
         decisions = first_decisions(plan, source)
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))

@@ -287,6 +287,16 @@ def test_work_is_not_kept(plan_of: Callable[..., Plan], without_report: None) ->
     assert run(plan_of(), resume=True).was_finished is False
 
 
+def test_resume_of_finished_poses_returns_them_and_of_changed_ones_begins_anew(
+    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
+) -> None:
+    first = run(plan_of())
+    again = run(plan_of(), resume=True)
+    assert (again.was_finished, again.record) == (True, first.record)
+    (tmp_path / "run" / "poses.npz").unlink()
+    assert run(plan_of(), resume=True).was_finished is False
+
+
 def test_observers_see_the_stage_pose(plan_of: Callable[..., Plan], without_report: None) -> None:
     told: list[Any] = []
     watcher = ModuleType("watcher")

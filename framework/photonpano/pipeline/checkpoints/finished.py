@@ -7,23 +7,21 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from photonpano.captures.fingerprint import changes
+from photonpano.captures.fingerprint import CaptureRecord, changes
 from photonpano.errors import InputError
-from photonpano.pipeline.checkpoints.fingerprint import Fingerprint
 from photonpano.record.contents import changed_files
 from photonpano.record.environment import library_versions, plugin_records
-from photonpano.record.run_json import read_record, verdict_of
+from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
-from photonpano.residuals.verdict import Verdict
 from photonpano.specs.plan import Plan
 
 
-def finished_run(plan: Plan, now: Fingerprint) -> tuple[RunRecord, Verdict] | None:
-    """Return the record and verdict in the run folder of a plan, if it is of this spec, capture and software, and unchanged.
+def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
+    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged.
 
     Args:
         plan: what would be run.
-        now: what its results would depend on.
+        capture: the fingerprint of the capture as it is now.
     """
     try:
         record = read_record(plan.output.directory)
@@ -32,11 +30,12 @@ def finished_run(plan: Plan, now: Fingerprint) -> tuple[RunRecord, Verdict] | No
             and record["libraries"] == library_versions(plan)
             and record["plugins"] == plugin_records(plan)
             and _without_machine(record["spec"]) == _without_machine(plan.document)
-            and not changes(record["capture"], now["capture"])
+            and not changes(record["capture"], capture)
             and all((plan.output.directory / name).exists() for name in record["files"])
             and not changed_files(plan.output.directory)
         )
-        return (record, verdict_of(record["verdict"])) if same and record["verdict"] is not None else None
+        result = record["verdict"] if plan.pose is None else record["poses"]
+        return record if same and result is not None else None
     except (InputError, KeyError, TypeError, AttributeError):
         return None
 
