@@ -1,3 +1,5 @@
+from .api.batch.batch import BatchResult as BatchResult
+from .api.batch.batch import batch as batch
 from .api.capture_info import CaptureInfo as CaptureInfo
 from .api.capture_info import info as info
 from .api.captures import WrittenCapture as WrittenCapture
@@ -77,6 +79,7 @@ from .protocols import Resampler as Resampler
 from .protocols import Source as Source
 from .protocols import Trajectory as Trajectory
 from .protocols import WeightedSource as WeightedSource
+from .record.batch_row import BatchRow as BatchRow
 from .registry import Catalog as Catalog
 from .registry import discover as discover
 from .specs import Plan as Plan

@@ -135,7 +135,7 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
 
 
 def test_every_example_spec_is_in_this_file():
-    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, "poses", "stratified-poses"}
+    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, "poses", "stratified-poses", "many-captures"}
 
 
 def test_examples_readme_links_every_spec():
@@ -173,6 +173,17 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
     assert record["spec"]["merge"]["with"].get("compensate", True) == (name != "naive-average")
     assert any(level["revisits"]["located"] for level in record["levels"]) == (name == "revisits")
     assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
+
+
+def test_example_of_many_captures_runs(examples, tmp_path):
+    out = tmp_path / "many"
+    printed = photonpano(
+        *("batch", examples / "many-captures.yaml", examples / "capture.npy", "--output", out),
+        **{"resample.with.group_size": "[50]", "levels": 1},
+    )
+    assert printed.splitlines()[1].startswith("capture, resample.with.group_size=50  trusted")
+    assert (out / "capture,resample.with.group_size=50" / "report.html").is_file()
+    assert "<svg" in (out / "summary.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("name", "pictures", "std"), [("poses", 16, 0.02), ("stratified-poses", 0, 0.005)])

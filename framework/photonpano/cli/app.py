@@ -6,6 +6,7 @@ import typer
 from typer.core import TyperGroup
 
 import photonpano
+from photonpano.cli.batch import batch
 from photonpano.cli.check import check
 from photonpano.cli.check_run import check_run
 from photonpano.cli.clean import clean
@@ -50,8 +51,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 _COMMANDS = (
-    *(run, check, check_run, verify, render, video, explain, info, preview, convert),
-    *(export, simulate, dark, evaluate, clean, schema, warm_up),
+    *(run, batch, check, check_run, verify, render, video, explain, info, preview),
+    *(convert, export, simulate, dark, evaluate, clean, schema, warm_up),
 )
 for command in _COMMANDS:
     app.command()(command)

@@ -1,7 +1,8 @@
-"""The HTML report of a run: one page that needs nothing else."""
+"""The HTML reports of runs and of batches: pages that need nothing else.
 
-from photonpano.report.drawing import loading_figures
-from photonpano.report.page import render_report
-from photonpano.report.pose_page import render_pose_report
+A name is imported when it is first used: the summary of a batch needs no library of the pipeline.
+"""
 
-__all__ = ["loading_figures", "render_pose_report", "render_report"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

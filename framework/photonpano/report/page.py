@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from photonpano import text
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import RunRecord
 from photonpano.report import figures, residual_figures
 from photonpano.report.drawing import jpeg_uri, shrunk
+from photonpano.report.environment import environment_of, yaml_of
 from photonpano.report.failures import failure_groups
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Light, true_spans
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 PICTURE_PIXELS = 1600
 """Longer side of the panorama on the page; the files of the run folder have all pixels."""
@@ -56,22 +51,6 @@ def render_report(
     return page
 
 
-def environment_of() -> Environment:
-    """Return what fills the templates, with filters that write numbers."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("photonpano.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    for name in ("byte_size", "count", "counted", "duration", "pixels", "rate", "share", "span"):
-        environment.filters[name] = getattr(text, name)
-    return environment
-
-
 def head_of(record: RunRecord) -> dict[str, Any]:
     """Return what the pages of all runs show."""
     return {
@@ -80,7 +59,7 @@ def head_of(record: RunRecord) -> dict[str, Any]:
         "title": _title(record),
         "created": datetime.fromisoformat(record["created"]).strftime("%d %B %Y, %H:%M %Z").strip(),
         "capture_seconds": _capture_seconds(record),
-        "spec_yaml": _yaml(record["spec"]),
+        "spec_yaml": yaml_of(record["spec"]),
     }
 
 
@@ -128,13 +107,3 @@ def _title(record: RunRecord) -> str:
 def _capture_seconds(record: RunRecord) -> float | None:
     rate = record["source"]["frame_rate_hz"]
     return None if rate is None else record["source"]["n_frames"] / rate
-
-
-def _yaml(document: Mapping[str, Any]) -> str:
-    from ruamel.yaml import YAML
-
-    yaml = YAML()
-    yaml.width = 100
-    buffer = io.StringIO()
-    yaml.dump(document, buffer)
-    return buffer.getvalue()

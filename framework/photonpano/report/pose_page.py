@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from photonpano.record.pose_record import DOUBTFUL
 from photonpano.record.schema import RunRecord
-from photonpano.report.page import environment_of, head_of
+from photonpano.report.environment import environment_of
+from photonpano.report.page import head_of
 from photonpano.report.pose_figures import errors_over_time
 from photonpano.report.pose_views import path_views, scene_views
 from photonpano.values import PoseEstimate

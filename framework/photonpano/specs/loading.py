@@ -41,7 +41,7 @@ def load_spec(
     """
     path, catalog = Path(path), discover() if catalog is None else catalog
     try:
-        return _load(_read(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog)
+        return _load(read_spec(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog)
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
             raise
@@ -57,6 +57,7 @@ def parse_spec(
     overrides: Sequence[str] = (),
     output: str | Path | None = None,
     catalog: Catalog | None = None,
+    file: Path | None = None,
 ) -> Plan:
     """Resolve a spec that is given as plain data, or as the text of a YAML file.
 
@@ -68,12 +69,13 @@ def parse_spec(
         overrides: values to change, such as `run.seed=1`.
         output: the run folder, relative to the current folder, in place of the spec's `output.directory`.
         catalog: what can be chosen; by default what the installed plugins offer.
+        file: what the text was read from, for messages and for the record of a run.
 
     Raises:
         SpecError: the spec is wrong; carries all problems.
     """
     catalog = discover() if catalog is None else catalog
-    return _load(spec, Place(), Path(directory).absolute(), name, overrides, output, catalog)
+    return _load(spec, Place(file=file), Path(directory).absolute(), name, overrides, output, catalog)
 
 
 def capture_plan(
@@ -103,7 +105,12 @@ def capture_plan(
     return parse_spec(spec, overrides=overrides, catalog=catalog)
 
 
-def _read(path: Path) -> str:
+def read_spec(path: Path) -> str:
+    """Return the text of a spec file.
+
+    Raises:
+        SpecError: it cannot be read, or is too long for a spec.
+    """
     if reason := refusal(path):
         raise SpecError([Problem("", reason.removeprefix(f"{path} "), path)])
     try:

@@ -43,6 +43,7 @@ def test_help_imports_nothing_heavy(program: list[str]) -> None:
 def test_commands_are_complete() -> None:
     assert {" ".join(name) for name in COMMANDS} == {
         "run",
+        "batch",
         "check",
         "check-run",
         "render",

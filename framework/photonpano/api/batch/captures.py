@@ -1,0 +1,150 @@
+"""Find the captures of a batch: files, folders, patterns, and lists of them."""
+
+from __future__ import annotations
+
+import glob
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+from photonpano.contributions import SourceContribution
+from photonpano.errors import InputError
+from photonpano.paths import given_path, refusal
+from photonpano.registry import Catalog
+
+_TRUTH = ".truth.npz"
+_COMPRESSED = (".gz",)
+_LONGEST_LIST = 2**24
+"""Bytes above which a list is no list: a capture that is given by mistake."""
+
+
+def find_captures(
+    given: Iterable[str | Path], lists: Iterable[str | Path], catalog: Catalog, is_capture: Callable[[Path], bool]
+) -> dict[str, Path]:
+    """Find captures, and name them.
+
+    A file that is missing counts as a capture: its run fails and says so, and the others go on.
+
+    Args:
+        given: files, folders and patterns such as `captures/*.npy`, relative to the current folder. A folder that is no
+            capture stands for the captures in it.
+        lists: text files with one of these a line, relative to the folder of the list; empty lines, and those that begin with
+            `#`, are left out. `-` is standard input, whose paths count from the current folder.
+        catalog: the sources, whose files end as captures do.
+        is_capture: returns whether the spec can read a folder, or a file in one.
+
+    Returns:
+        The captures by their names, each once, in the order in which they were given.
+
+    Raises:
+        InputError: nothing is found in a place, a list cannot be read, two captures have one name, or there are none at all;
+            the message has all problems, a line each.
+    """
+    found: dict[Path, Path] = {}
+    problems: list[str] = []
+    sources = [each.contribution for each in catalog.rows if isinstance(each.contribution, SourceContribution)]
+    endings = {suffix for source in sources for suffix in source.suffixes}
+    nothing_given = True
+    for text, folder, where in _texts(given, lists, problems):
+        nothing_given = False
+        try:
+            for path in _captures_at(text, folder, endings, is_capture):
+                found.setdefault(path.resolve(), path)
+        except (InputError, ValueError, OSError) as error:
+            problems.append(f"{where}{error}")
+    if nothing_given and not problems:
+        problems.append("no capture is given: name files, folders, or patterns in quotes such as 'captures/*.npy'")
+    named: dict[str, Path] = {}
+    for path in found.values():
+        name = _name(path)
+        if name in named:
+            problems.append(
+                f"two captures are called {name}, and would get one run folder: {named[name]} and {path}; rename one of them, "
+                "or run them in two batches"
+            )
+        named.setdefault(name, path)
+    if problems:
+        raise InputError("\n".join(problems))
+    return named
+
+
+def _texts(given: Iterable[str | Path], lists: Iterable[str | Path], problems: list[str]) -> Iterator[tuple[str, Path, str]]:
+    """Yield what stands for captures, the folder that it counts from, and the beginning of a message about it."""
+    for each in given:
+        yield str(each), Path(), ""
+    for each in lists:
+        try:
+            lines, folder = _lines(Path(each))
+        except (InputError, ValueError) as error:
+            problems.append(str(error))
+            continue
+        empty = True
+        for number, line in enumerate(lines, start=1):
+            text = line.strip()
+            if text and not text.startswith("#"):
+                empty = False
+                yield text, folder, f"{each}:{number}: "
+        if empty:
+            problems.append(f"{each}: the list names no capture; write one a line")
+
+
+def _lines(path: Path) -> tuple[Sequence[str], Path]:
+    """Return the lines of a list, and what its paths count from."""
+    if str(path) == "-":
+        return sys.stdin.read().splitlines(), Path()
+    path = given_path(path)
+    if reason := refusal(path):
+        raise InputError(reason)
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LONGEST_LIST + 1)
+        if len(data) > _LONGEST_LIST or b"\0" in data:
+            raise InputError(f"{path}: not a list of captures, which is text; name captures as arguments")
+        return data.decode("utf-8-sig").splitlines(), path.parent
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: the list is not UTF-8 text; save it as UTF-8, one capture a line") from error
+    except OSError as error:
+        raise InputError(f"{path}: the list of captures cannot be read: {error.strerror}") from error
+
+
+def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> list[Path]:
+    """Return the captures that a text stands for: a path, or a pattern.
+
+    Raises:
+        InputError: there are none.
+    """
+    path = folder / given_path(Path(text))
+    if "\0" in text:
+        raise InputError(f"{text!r} contains the character NUL, which no path can; correct the path")
+    if path.is_dir():
+        return _captures_in(path, endings, is_capture)
+    if path.exists() or not glob.has_magic(text):
+        return [path]
+    matches = sorted(Path(each) for each in glob.glob(str(path), recursive=True))  # noqa: PTH207 - may be absolute
+    captures = [each for each in matches if not each.name.endswith(_TRUTH)]
+    if not captures:
+        raise InputError(f"nothing matches {text}; check the pattern")
+    return captures
+
+
+def _captures_in(folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> list[Path]:
+    """Return a folder that is a capture, or else the captures in it, and files that end as captures do."""
+    if is_capture(folder):
+        return [folder]
+    found = [
+        path
+        for path in sorted(folder.iterdir())
+        if not path.name.startswith(".")
+        and not path.name.endswith(_TRUTH)
+        and ((path.is_file() and path.suffix.lower() in endings) or is_capture(path))
+    ]
+    if not found:
+        raise InputError(f"{folder} is no capture that the spec can read, and there is none in it; name the files")
+    return found
+
+
+def _name(path: Path) -> str:
+    """Return the name of a capture: that of its folder, or of its file without the ending."""
+    absolute = path.absolute()
+    plain = Path(absolute.stem) if absolute.suffix in _COMPRESSED else absolute
+    return absolute.name if path.is_dir() else plain.stem

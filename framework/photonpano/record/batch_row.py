@@ -1,0 +1,67 @@
+"""One run of a batch, as its summary shows it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+Status = Literal["waiting", "running", "done", "failed", "interrupted"]
+
+
+@dataclass(frozen=True, slots=True)
+class BatchRow:
+    """One run of a batch, as it is now.
+
+    Attributes:
+        name: of the capture, which is the name of its folder.
+        capture: the file or folder.
+        settings: the swept keys of the spec with their values; empty without a sweep.
+        directory: the run folder.
+        status: "waiting", "running", "done", "failed", or "interrupted" for a run that the end of the batch has stopped.
+        was_finished: whether the run was finished before, so that nothing was left to do.
+        verdict: "trusted" or "doubtful"; None unless the run is done.
+        reason: why it failed, is doubtful, or has no score; empty if there is nothing to say.
+        expected_error_px: expected corner error of the motion, in px of a frame; None for poses.
+        true_error_px: mean corner error against the truth beside the capture, in px of a frame; None without a truth.
+        psnr_db: of the panorama against the true scene, in dB; None without a true scene.
+        expected_position_error: expected error of the positions of poses, as a share of the length of the path; None for a
+            panorama.
+        true_position_error: their error against the truth, as a share of the length of the path; None without a truth.
+        n_frames: frames of the capture.
+        seconds: time that the run took.
+        peak_memory_bytes: the largest memory of the run; None where the system does not report it.
+        has_report: whether the run folder has a `report.html`.
+        thumbnail: the panorama as a data URI of a small JPEG; None without a panorama.
+    """
+
+    name: str
+    capture: Path
+    settings: Mapping[str, Any]
+    directory: Path
+    status: Status = "waiting"
+    was_finished: bool = False
+    verdict: str | None = None
+    reason: str = ""
+    expected_error_px: float | None = None
+    true_error_px: float | None = None
+    psnr_db: float | None = None
+    expected_position_error: float | None = None
+    true_position_error: float | None = None
+    n_frames: int | None = None
+    seconds: float | None = None
+    peak_memory_bytes: int | None = None
+    has_report: bool = False
+    thumbnail: str | None = field(default=None, repr=False)
+
+    @property
+    def label(self) -> str:
+        """The name of the capture, and what the run has of its own: `night, resample.with.group_size=50`."""
+        return ", ".join([self.name, *(f"{key}={written(value)}" for key, value in self.settings.items())])
+
+
+def written(value: Any) -> str:
+    """Write a value of a spec in a line, as in an override: text without quotes where it needs none."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

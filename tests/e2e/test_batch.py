@@ -1,0 +1,98 @@
+"""Batches of small captures, in real processes."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from photonpano import batch
+from photonpano.captures.writing import truth_path
+
+SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 25}}, "levels": 1, "refine": []}
+INTERRUPTED = """\
+import sys, time
+from pathlib import Path
+sys.path[:] = {path}
+import photonpano.api.batch.batch
+import hanging
+photonpano.api.batch.batch.SpecText = hanging.Hanging
+from photonpano.cli import main
+main()
+"""
+HANGING = """\
+import time
+from pathlib import Path
+from photonpano.api.batch.sweeps import SpecText
+from photonpano.folders import staging_of
+
+class Hanging(SpecText):
+    def plan(self, overrides, output, catalog=None):
+        if output.name == "b":
+            with staging_of(output):
+                (output.parent / "begun").touch()
+                time.sleep(60)
+        return super().plan(overrides, output, catalog)
+"""
+
+
+@pytest.fixture(scope="module")
+def capture(simulated: Callable[..., Path]) -> Path:
+    """A capture of 200 frames of 64x96 px, with its truth."""
+    return simulated(n_frames=200, frame_shape=[64, 96])
+
+
+def copied(capture: Path, path: Path) -> Path:
+    shutil.copy(capture, path)
+    shutil.copy(truth_path(capture), truth_path(path))
+    return path
+
+
+def test_batch_runs_what_is_left(capture: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        copied(capture, tmp_path / f"{name}.npy")
+    (tmp_path / "empty.npy").touch()
+    first = batch(SPEC, [tmp_path / "*.npy"], tmp_path / "out", jobs=2)
+    assert [(row.name, row.status) for row in first.rows] == [("a", "done"), ("b", "done"), ("empty", "failed")]
+    assert first.failed == first.rows[2:]
+    results = [tmp_path / "out" / name / "trajectory.npz" for name in ("a", "b")]
+    assert results[0].read_bytes() == results[1].read_bytes()
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "b", "summary.csv", "summary.html"}
+    copied(capture, tmp_path / "empty.npy")
+    again = batch(SPEC, [tmp_path / "*.npy"], tmp_path / "out")
+    assert [(row.status, row.was_finished) for row in again.rows] == [("done", True), ("done", True), ("done", False)]
+    assert [row.true_error_px for row in again.rows] == [first.rows[0].true_error_px] * 3
+    with (tmp_path / "out" / "summary.csv").open(encoding="utf-8") as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["done"] * 3
+
+
+def test_interrupted_batch_keeps_what_is_finished(capture: Path, tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        copied(capture, tmp_path / f"{name}.npy")
+    (tmp_path / "hanging.py").write_text(HANGING, encoding="utf-8")
+    (tmp_path / "scan.yaml").write_text(
+        "{version: 1, source: {use: auto}, resample: {with: {group_size: 25}}, levels: 1, refine: []}", encoding="utf-8"
+    )
+    program = INTERRUPTED.format(path=[str(tmp_path), *sys.path])
+    command = [sys.executable, "-c", program, "batch", "scan.yaml", "a.npy", "b.npy", "c.npy", "-o", "out"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    with subprocess.Popen(command, cwd=tmp_path, **pipes, **heed) as process:
+        last = time.monotonic() + 60
+        while not (tmp_path / "out" / "begun").exists() and process.poll() is None and time.monotonic() < last:
+            time.sleep(0.05)
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=10)
+    assert process.returncode == 130, err
+    assert err.startswith("[1/3] a: ")
+    with (tmp_path / "out" / "summary.csv").open(encoding="utf-8") as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["done", "interrupted", "interrupted"]
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "begun", "summary.csv", "summary.html"}
