@@ -27,6 +27,7 @@ from photonpano import (
 from photonpano.merging import PhotonSum, divided
 from photonpano_core.configs import BurstConfig
 from photonpano_core.dense_motion.frames import WeightedFrames
+from photonpano_core.dense_motion.noise import count_variance
 from photonpano_core.dense_motion.patches import Image, PatchGrid, add_patches, search
 from photonpano_core.dense_motion.rescaled import rescaled
 from photonpano_core.dense_motion.sub_exposures import smoothed
@@ -209,7 +210,7 @@ def wiener_mean(counts: Image, weight: Image, reference: int, response: Response
     """
     fixed = _mean(counts[reference], weight[reference], np.float32(0))
     frames = weight.mean(axis=(-2, -1))
-    noise = _variance(fixed.mean(axis=(-2, -1)), response)
+    noise = count_variance(fixed.mean(axis=(-2, -1)), response)
     own = fft.rfft2(fixed)
     total, n = own * frames[reference, ..., None, None], frames[reference].copy()
     for place in range(len(counts)):
@@ -231,12 +232,3 @@ def _mean(counts: Image, weight: Image, unseen: NDArray[np.float32] | np.float32
     """Return the mean count of a frame, and `unseen` where there is none."""
     seen = weight > 1e-3
     return np.where(seen, counts / np.where(seen, weight, np.float32(1)), unseen).astype(np.float32)
-
-
-def _variance(mean: Image, response: Response) -> Image:
-    """Return the variance of the count of one frame, from the slope of the scale on which it is uniform."""
-    many = 1e4
-    low, high = mean * np.float32(0.99), mean * np.float32(1.01) + np.float32(1e-4)
-    low_value, high_value = (response.stabilised(response.flux(each, many), many) for each in (low, high))
-    per_unit = (high - low) / np.maximum(high_value - low_value, np.float32(1e-9))
-    return np.asarray(many * (response.stabilised_std(many) * per_unit) ** 2, np.float32)

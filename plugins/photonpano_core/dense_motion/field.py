@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import BoolArray
+from photonpano_core.dense_motion.polynomials import value_of_each
 
 Image = NDArray[np.float32]
 
@@ -39,11 +40,8 @@ class MotionField:
 
     def at(self, elapsed: float) -> Image:
         """Return the displacement at a time: (H, W, 2), x and y in px of the grid."""
-        time = np.float32(elapsed)
-        displacement: Image = time * self.coefficients[-1]
-        for each in self.coefficients[-2::-1]:
-            displacement += each
-            displacement *= time
+        displacement = np.empty(self.coefficients.shape[1:], np.float32)
+        value_of_each(self.coefficients.reshape(len(self.coefficients), -1), np.float32(elapsed), displacement.reshape(-1))
         return displacement
 
     @property
@@ -60,5 +58,4 @@ class MotionField:
         )
         places = np.zeros(int(labels.max()) + 1, np.int64)
         places[labels[known]] = np.flatnonzero(known)
-        degree = len(self.coefficients)
-        return MotionField(self.coefficients.reshape(degree, -1, 2)[:, places[labels]].reshape(self.coefficients.shape))
+        return MotionField(np.stack([each.reshape(-1, 2)[places[labels]] for each in self.coefficients]))

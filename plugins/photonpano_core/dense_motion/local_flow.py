@@ -17,6 +17,7 @@ from photonpano_core.dense_motion.frames import WeightedFrames
 from photonpano_core.dense_motion.ghosts import GhostMap, compared
 from photonpano_core.dense_motion.rescaled import rescaled
 from photonpano_core.dense_motion.robust_sum import weighted
+from photonpano_core.dense_motion.sharpening import sharpened
 from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures
 from photonpano_core.dense_motion.warping import add_along
 from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
@@ -43,7 +44,7 @@ class LocalFlowMerger:
     A group is divided into sub-exposures of half the size. Where these agree, as everywhere in a still scene, all frames are
     merged as `photon-mle` does, to the same flux. Elsewhere optical flow is estimated in rounds. Sub-exposures that still
     differ from the one around the reference instant, such as those in which a pixel is occluded, get less weight. Then counts
-    are warped along the sum of both motions, in one interpolation, at full size.
+    are warped along the sum of both motions, in one interpolation, at full size, and its blur is undone where noise allows it.
 
     In a group with too few photons, and while no motion is known, frames are merged as `photon-mle` does.
     """
@@ -105,13 +106,18 @@ class LocalFlowMerger:
         fastest_px = parts.fastest_px(best.field, there)
         inside = enlarged(where, total.counts.shape, scale)
         counts, weight = (np.where(inside, np.float32(0), each) for each in (total.counts, total.weight))
+        blur = np.zeros_like(weight)
         frames, cells = WeightedFrames(source), (SCALE / scale, box[0].start, box[1].start)
         for span, trust in zip(parts.spans, best.trusts, strict=True):
             for chunk, motion in parts.moving(clipped(chunks, span, trajectory), best.field, fastest_px, tolerance_px):
                 to_image = inverse(onto @ chunk.homography)
                 lit, n_frames = frames(chunk.span), float(len(chunk.span))
-                add_along(lit, frames.worth, n_frames, to_image, inside, cells, motion, trust, counts, weight)
-        return PhotonSum(counts, weight)
+                add_along(lit, frames.worth, n_frames, to_image, inside, cells, motion, trust, counts, weight, blur)
+        photons = PhotonSum(counts, weight)
+        if scale > 1:
+            return photons  # Its neighbouring pixels share more noise than `sharpened` expects.
+        blur_px2 = np.asarray(blur / np.maximum(weight, np.float32(1e-3)), np.float32)
+        return sharpened(photons, blur_px2, inside, source.response)
 
 
 def enlarged(image: NDArray[Any], shape: tuple[int, int], scale: float = 1.0) -> NDArray[Any]:

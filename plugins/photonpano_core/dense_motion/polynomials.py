@@ -1,4 +1,4 @@
-"""Fit a polynomial at each pixel. Compiled."""
+"""Fit and evaluate a polynomial at each pixel. Compiled."""
 
 from __future__ import annotations
 
@@ -47,3 +47,19 @@ def fit_each(
                     x[i, axis] = total / lower[i, i]
                 for i in range(degree):
                     found[i, row, column, axis] = x[i, axis]
+
+
+@compiled
+def value_of_each(coefficients: NDArray[np.float32], time: np.float32, found: NDArray[np.float32]) -> None:
+    """Evaluate polynomials without a constant term, by Horner's rule.
+
+    Args:
+        coefficients: (D, N), of the powers 1 to D of time.
+        time: where they are evaluated.
+        found: (N,) output.
+    """
+    found[:] = 0
+    for degree in range(len(coefficients) - 1, -1, -1):
+        own = coefficients[degree]
+        for i in range(len(found)):
+            found[i] = time * (found[i] + own[i])

@@ -161,14 +161,15 @@ class SubExposures:
             where: (H, W) pixels that are merged again, one at least.
             others: the sums elsewhere; those along the global motion by default.
         """
-        merged = []
+        merged, unwanted = [], np.zeros((0, 0), np.float32)
         fastest_px = self.fastest_px(field, where)
         for span, other in zip(self.spans, others or self.sums, strict=True):
             counts, weight = (np.where(where, np.float32(0), each) for each in (other.counts, other.weight))
             for chunk, motion in self.moving(clipped(self._chunks, span, self._trajectory), field, fastest_px, _TOLERANCE_PX):
                 to_image = self._to_image(chunk.homography)
                 lit, n_frames = self._halved(chunk.span), float(len(chunk.span))
-                add_along(lit, self._worth, n_frames, to_image, where, (1.0, 0, 0), motion, self._trusted, counts, weight)
+                cells = (1.0, 0, 0)
+                add_along(lit, self._worth, n_frames, to_image, where, cells, motion, self._trusted, counts, weight, unwanted)
             merged.append(PhotonSum(counts, weight))
         return merged
 

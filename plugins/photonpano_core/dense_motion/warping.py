@@ -20,6 +20,7 @@ def add_along(
     trust: NDArray[np.float32],
     counts: NDArray[np.float32],
     weight: NDArray[np.float32],
+    blur: NDArray[np.float32],
 ) -> None:
     """Add an image to some pixels of a grid, interpolated bilinearly; the image is 0 outside of its border.
 
@@ -34,6 +35,8 @@ def add_along(
         trust: (h', w') weight of the image in each cell.
         counts: (H, W) sums that are added to.
         weight: (H, W) numbers of frames that are added to.
+        blur: (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames, that are added
+            to; (0, 0) if unwanted.
     """
     height, width = image.shape
     frames, per_cell, last = np.float32(n_frames), 1 / cells[0], where.shape[1]
@@ -63,7 +66,10 @@ def add_along(
             a, b = np.float32(u - left), np.float32(v - top)
             if 0 <= left < width - 1 and 0 <= top < height - 1:
                 into[i] += share * _between(image, top, left, a, b)
-                of[i] += share * frames * (_between(worth, top, left, a, b) if worth.size else np.float32(1))
+                seen = share * frames * (_between(worth, top, left, a, b) if worth.size else np.float32(1))
+                of[i] += seen
+                if blur.size:
+                    blur[row, i] += seen * np.float32(0.5) * (a * (1 - a) + b * (1 - b))
                 continue
             for down in range(2):
                 for right in range(2):
