@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,12 +48,19 @@ class SourceWrapper(Closing):
     the classes `PackedWrapper`, `LinearlyCorrectedWrapper`, `WeightedWrapper`, `LitWrapper`, `LensedWrapper`,
     `ColouredWrapper`, `TruthWrapper` and `SharpViewsWrapper`: see `with_capabilities`.
 
+    A wrapper can be pickled if what it wraps can: see `photonpano.execution`.
+
     Attributes:
         wrapped: the other source.
     """
 
+    made_of: ClassVar[tuple[type[SourceWrapper], tuple[type[SourceWrapper], ...]] | None] = None
+
     def __init__(self, wrapped: Source) -> None:
         self.wrapped = wrapped
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, self.made_of or (type(self), ()), self.__getstate__()
 
     @property
     def info(self) -> StreamInfo:
@@ -190,7 +197,13 @@ def with_capabilities(wrapper: type[WrapperT], capabilities: list[type[SourceWra
 
     `isinstance` with `PackedSource` and the other protocols is then decided by the class of an object.
     """
-    return type(wrapper.__name__, (*capabilities, wrapper), {})
+    return type(wrapper.__name__, (*capabilities, wrapper), {"made_of": (wrapper, tuple(capabilities))})
+
+
+def _unpickled(wrapper: type[SourceWrapper], capabilities: tuple[type[SourceWrapper], ...]) -> SourceWrapper:
+    """Return a wrapper without attributes."""
+    made = with_capabilities(wrapper, list(capabilities))
+    return made.__new__(made)
 
 
 def seen_through(source: Source, camera: Camera) -> SeenThrough:

@@ -66,6 +66,22 @@ def lagging(items: Iterable[ItemT], by: int) -> Iterator[ItemT]:
         yield held.popleft()
 
 
+class Guard:
+    """A lock for a `with` block. With what it guards, it may be pickled: there it is a new one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+    def __reduce__(self) -> tuple[type[Guard], tuple[()]]:
+        return Guard, ()
+
+
 @contextmanager
 def one_thread_inside() -> Iterator[None]:
     """Keep OpenCV and BLAS from starting threads of their own, which would compete with ours for the cores."""

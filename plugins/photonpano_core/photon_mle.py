@@ -37,6 +37,10 @@ class PhotonMleMerger:
         self._shared: _Shared | None = None
         self._lock = Lock()
 
+    def __reduce__(self) -> tuple[type[PhotonMleMerger], tuple[PhotonMleConfig, Decide | None]]:
+        """Travel without the sums of chunks."""
+        return PhotonMleMerger, (self._config, self._decide)
+
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge a group; see `photonpano.Merger`."""
         if trajectory is None or not self._config.compensate:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from threading import Lock
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from photonpano.source_wrapper import (
     capabilities_of,
     with_capabilities,
 )
+from photonpano.threads import Guard
 from photonpano.values import Decision
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class FilteredSource(SourceWrapper):
         """Take the source, the place in `COLOURS` of the colour of its pixels, (H, W), and the decisions taken so far."""
         super().__init__(source)
         self._colour, self._decisions = colour, decisions
-        self._lock = Lock()
+        self._lock = Guard()
         self._balance: _Balance | None = None
 
     @property
@@ -85,11 +86,20 @@ class FilteredSource(SourceWrapper):
         """See `ColouredSource`."""
         return self._balanced().clear_mix
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Travel with what is known of the colours, so that no frames are read for it again."""
+        self._balanced()
+        return {**self.__dict__, "_colour": partial(_same, self._colour())}
+
     def _balanced(self) -> _Balance:
         with self._lock:
             if self._balance is None:
                 self._balance = _Balance.of(self.wrapped, self._colour(), self._decisions)
             return self._balance
+
+
+def _same(colour: NDArray[np.int8]) -> NDArray[np.int8]:
+    return colour
 
 
 def filtered(source: Source, colour: Callable[[], NDArray[np.int8]], decisions: list[Decision]) -> FilteredSource:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pi
 from photonpano.errors import InputError
 from photonpano.protocols import KnowsSharpViews, KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
 from photonpano.source_wrapper import ArrayT, SharpViewsWrapper, SourceWrapper, TruthWrapper, with_capabilities
+from photonpano.threads import Guard
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, FrameSpan, StreamInfo
 
 _TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
@@ -103,7 +103,7 @@ class CorrectedSource(SourceWrapper):
         index = apply_corrections(source, corrections, blame=blame).index
         self.gather = _Gather(index, source.info.frame_shape)
         self._estimate: _Estimate | None = None
-        self._lock = Lock()
+        self._lock = Guard()
         self.decisions: list[Decision] = []
         self._info = replace(source.info, height=index.shape[0], width=index.shape[1], bayer=None)
 
@@ -130,6 +130,11 @@ class CorrectedSource(SourceWrapper):
                 pixels = apply_corrections(self.wrapped, self._corrections, self._decide, self._blame)
                 self._estimate = _Estimate.of(pixels, self.info.kind == "binary")
             return self._estimate
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Travel with what is estimated of the pixels, so that no frames are read for it again."""
+        self.estimate()
+        return {**self.__dict__, "_corrections": (), "_blame": None}
 
     def _decide(self, what: str, value: float, reason: str) -> None:
         self.decisions.append(Decision(what, value, reason))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import NewType
+from typing import Any, NewType
 
 import numpy as np
 
@@ -54,6 +54,10 @@ class Level:
     interpolator: Interpolator
     origins: Mapping[str, str]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel with what merges and locates; groups are chosen, and motions interpolated, where the loop runs."""
+        return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins)
+
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
         """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator.
 
@@ -89,3 +93,10 @@ class Level:
             information = information * np.outer(units, units)
         residual_px = None if motion.residual_px is None else motion.residual_px / self.scale
         return replace(motion, homography=homography, information=information, residual_px=residual_px)
+
+
+def _for_tasks(
+    number: int, scale: float, merger: Merger, locators: tuple[NamedLocator, ...], origins: Mapping[str, str]
+) -> Level:
+    nothing: Any = None
+    return Level(number, scale, nothing, merger, locators, nothing, origins)

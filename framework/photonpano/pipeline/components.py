@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from photonpano.captures.part import part_of
@@ -123,7 +123,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
 
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
-    capture = cache(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
+    capture = _Once(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
     context = _stage_context(plan, source, decisions, capture)
     made: list[tuple[Choice, Any]] = []
 
@@ -221,7 +221,7 @@ def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) 
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     assert plan.pose is not None
-    capture = cache(lambda: summarise(source, thread_count(plan.run.threads)))
+    capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
     estimator: PoseEstimator = _built(plan.pose, _stage_context(plan, source, decisions, capture))
     return estimator
 
@@ -285,17 +285,46 @@ def _stage_context(
     """
     threads = thread_count(plan.run.threads)
     at_once = partial(in_order, threads=threads)
-    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_recorder(decisions), in_order=at_once)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_Recorder(decisions), in_order=at_once)
     return context if capture is None else replace(context, capture=capture)
 
 
-def _recorder(decisions: list[Decision]) -> Callable[[str, DecisionValue, str], None]:
-    def decide(what: str, value: DecisionValue, reason: str) -> None:
+class _Recorder:
+    """Records decisions; where a component travels to, none."""
+
+    def __init__(self, decisions: list[Decision]) -> None:
+        self._decisions = decisions
+
+    def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
+        """Record a decision."""
         if not isinstance(value, bool | int | float | str):
             raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
-        decisions.append(Decision(what, value, reason))
+        self._decisions.append(Decision(what, value, reason))
 
-    return decide
+    def __reduce__(self) -> tuple[type[_Recorder], tuple[list[Decision]]]:
+        return _Recorder, ([],)
+
+
+class _Once:
+    """Measures a capture at the first call; where a component travels to, it has been measured."""
+
+    def __init__(self, measure: Callable[[], CaptureSummary]) -> None:
+        self._measure = measure
+
+    def __call__(self) -> CaptureSummary:
+        """Return the summary of the capture."""
+        return self._summary
+
+    @cached_property
+    def _summary(self) -> CaptureSummary:
+        return self._measure()
+
+    def __reduce__(self) -> tuple[type[_Once], tuple[Callable[[], CaptureSummary]]]:
+        return _Once, (partial(_itself, self._summary),)
+
+
+def _itself(value: Any) -> Any:
+    return value
 
 
 def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:

@@ -1,0 +1,57 @@
+"""Pack values for another process: everything by value, but for the capture, which is opened there."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from typing import Any
+
+_CAPTURE = "capture"
+
+
+def packed(value: object, capture: object) -> bytes:
+    """Pickle a value.
+
+    Args:
+        value: what it holds of the capture travels as a name.
+        capture: the source that stands for the capture.
+
+    Raises:
+        TypeError: something that the value holds cannot be pickled.
+    """
+    buffer = io.BytesIO()
+    try:
+        _Packer(buffer, capture).dump(value)
+    except (pickle.PicklingError, AttributeError) as error:
+        raise TypeError(str(error)) from error
+    return buffer.getvalue()
+
+
+def unpacked(data: bytes, capture: object) -> Any:
+    """Return a value from what `packed` returned.
+
+    Args:
+        data: the value.
+        capture: takes the place of the capture.
+    """
+    return _Unpacker(io.BytesIO(data), capture).load()
+
+
+class _Packer(pickle.Pickler):
+    def __init__(self, buffer: io.BytesIO, capture: object) -> None:
+        super().__init__(buffer, protocol=pickle.HIGHEST_PROTOCOL)
+        self._capture = capture
+
+    def persistent_id(self, obj: object) -> str | None:
+        return _CAPTURE if obj is self._capture else None
+
+
+class _Unpacker(pickle.Unpickler):
+    def __init__(self, buffer: io.BytesIO, capture: object) -> None:
+        super().__init__(buffer)
+        self._capture = capture
+
+    def persistent_load(self, pid: object) -> object:
+        if pid != _CAPTURE:
+            raise pickle.UnpicklingError(f"unknown object {pid!r}")
+        return self._capture

@@ -1,0 +1,128 @@
+"""Values that travel to other processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import photonpano.pipeline.run as run_module
+from photonpano import FrameSpan, Light, parse_spec, run
+from photonpano.captures.part import part_of
+from photonpano.context import Context
+from photonpano.corrections import ColourFilter, HotPixels, corrected_source, divided_by
+from photonpano.corrections.vignette import Vignette
+from photonpano.execution.packing import packed, unpacked
+from photonpano.geometry import Camera
+from photonpano.lighting import in_light
+from photonpano.motion.attributed_source import AttributedSource, attributed
+from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
+from photonpano.source_wrapper import seen_through
+from photonpano.testing import MemorySource
+
+SHAPE, N = (24, 32), 60
+SPAN = FrameSpan(3, 30)
+VIGNETTE = Vignette(np.linspace(0.5, 1, 24 * 32, dtype=np.float32).reshape(SHAPE), np.full(SHAPE, 0.3, np.float32), ())
+WRAPPERS: dict[str, Callable[[Source], Source]] = {
+    "part": partial(part_of, span=FrameSpan(2, 50)),
+    "hot pixels": partial(corrected_source, corrections=[HotPixels()]),
+    "colours": partial(corrected_source, corrections=[ColourFilter(pattern="rggb", keep="all")]),
+    "vignette": partial(divided_by, vignette=VIGNETTE),
+    "light": partial(in_light, light=Light.of_frames(np.linspace(0.5, 1.5, N))),
+    "camera": partial(seen_through, camera=Camera.of(40.0, SHAPE)),
+}
+
+
+def capture() -> AttributedSource:
+    return attributed(MemorySource(np.random.default_rng(0).random((N, *SHAPE)) < 0.3), "a source of this test")
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_sources_arrive_as_they_left(name: str) -> None:
+    here, there = capture(), capture()
+    sent = WRAPPERS[name](here)
+    data = packed(sent, here)
+    arrived: Source = unpacked(data, there)
+    np.testing.assert_array_equal(arrived.counts(SPAN), sent.counts(SPAN))
+    np.testing.assert_array_equal(arrived.valid, sent.valid)
+    assert arrived.info == sent.info
+    assert isinstance(arrived, PackedSource) == isinstance(sent, PackedSource)
+    assert isinstance(arrived, LinearlyCorrectedSource) == isinstance(sent, LinearlyCorrectedSource)
+    if isinstance(sent, LinearlyCorrectedSource) and isinstance(arrived, LinearlyCorrectedSource):
+        counts = sent.counts(SPAN)
+        np.testing.assert_array_equal(arrived.corrected(counts, 27), sent.corrected(counts, 27))
+    if isinstance(sent, ColouredSource):
+        assert isinstance(arrived, ColouredSource)
+        for colour, source in sent.colours().items():
+            np.testing.assert_array_equal(arrived.colours()[colour].valid, source.valid)
+    assert (light_of(sent) is None) == (light_of(arrived) is None)
+    assert (camera_of(sent) is None) == (camera_of(arrived) is None)
+
+
+def test_frames_do_not_travel() -> None:
+    here = attributed(MemorySource(np.zeros((5000, *SHAPE), bool)), "a source of this test")
+    assert len(packed(part_of(here, FrameSpan(0, 4000)), here)) < 2000
+
+
+def test_what_cannot_travel_is_named() -> None:
+    with pytest.raises(TypeError, match="lambda"):
+        packed(lambda: 0, None)
+
+
+class Elsewhere:
+    """An executor that lets every task see copies alone, as another process would."""
+
+    def __init__(self) -> None:
+        self.capture: Source | None = None
+
+    def copied(self, value: Any) -> Any:
+        return unpacked(packed(value, self.capture), self.capture)
+
+    def share(self, value: Any) -> Any:
+        return self.copied(value)
+
+    def call(self, work: Callable[..., Any], *given: Any) -> Any:
+        return self.copied(work(*given))
+
+    def keep(self, work: Callable[..., Any], *given: Any) -> Any:
+        return self.copied(work(*given))
+
+
+@pytest.mark.parametrize(
+    "extra", [{}, {"merge": {"use": "robust-merge"}, "locate": {"use": "opencv-sift"}}], ids=["default", "sift"]
+)
+def test_run_on_copies_has_the_same_bytes(extra: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = {
+        "use": "simulator",
+        "with": {
+            "scene": {"kind": "street", "width": 400, "height": 300},
+            "path": {"kind": "pan", "length_px": 30},
+            "flux": 1,
+            "n_frames": 400,
+            "frame_shape": [96, 128],
+        },
+    }
+    spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2, **extra}
+    run(parse_spec(spec, output=tmp_path / "here"))
+    elsewhere, begun = Elsewhere(), run_module.begun_run
+
+    @contextmanager
+    def begun_elsewhere(*given: Any, **keys: Any) -> Any:
+        with begun(*given, **keys) as begun_run:
+            source: Any = begun_run.source
+            while not isinstance(source, AttributedSource):
+                source = source.wrapped
+            elsewhere.capture = source
+            yield begun_run
+
+    monkeypatch.setattr(run_module, "begun_run", begun_elsewhere)
+    monkeypatch.setattr(run_module, "Context", lambda *given: Context(*given, executor=elsewhere))
+    run(parse_spec(spec, output=tmp_path / "there"))
+    assert elsewhere.capture is not None
+    for name in ("trajectory.npz", "panorama.tiff"):
+        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
