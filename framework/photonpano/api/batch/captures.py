@@ -10,6 +10,7 @@ from pathlib import Path
 from photonpano.contributions import SourceContribution
 from photonpano.errors import InputError
 from photonpano.paths import given_path, refusal
+from photonpano.record.contents import RECORD
 from photonpano.registry import Catalog
 
 _TRUTH = ".truth.npz"
@@ -121,7 +122,7 @@ def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callabl
     if path.exists() or not glob.has_magic(text):
         return [path]
     matches = sorted(Path(each) for each in glob.glob(str(path), recursive=True))  # noqa: PTH207 - may be absolute
-    captures = [each for each in matches if not each.name.endswith(_TRUTH)]
+    captures = [each for each in matches if not _is_ours(each)]
     if not captures:
         raise InputError(f"nothing matches {text}; check the pattern")
     return captures
@@ -135,12 +136,17 @@ def _captures_in(folder: Path, endings: set[str], is_capture: Callable[[Path], b
         path
         for path in sorted(folder.iterdir())
         if not path.name.startswith(".")
-        and not path.name.endswith(_TRUTH)
+        and not _is_ours(path)
         and ((path.is_file() and path.suffix.lower() in endings) or is_capture(path))
     ]
     if not found:
         raise InputError(f"{folder} is no capture that the spec can read, and there is none in it; name the files")
     return found
+
+
+def _is_ours(path: Path) -> bool:
+    """Return whether a path is a truth beside a capture, or a run folder."""
+    return path.name.endswith(_TRUTH) or (path / RECORD).is_file()
 
 
 def _name(path: Path) -> str:

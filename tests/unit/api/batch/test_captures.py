@@ -16,7 +16,16 @@ Find = Callable[..., dict[str, Path]]
 def find(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Find:
     """Find captures from a folder in which there are some; a folder with a file `is-capture` in it is one."""
     monkeypatch.chdir(tmp_path)
-    for name in ("day/b.npy", "day/a.npy", "day/a.truth.npz", "day/notes.txt", "night/c.npy", "bins/is-capture", "bins/0.bin"):
+    for name in (
+        "day/b.npy",
+        "day/a.npy",
+        "day/a.truth.npz",
+        "day/notes.txt",
+        "night/c.npy",
+        "bins/is-capture",
+        "bins/0.bin",
+        "run/run.json",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "empty").mkdir()
@@ -31,6 +40,7 @@ def find(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Find:
     ("given", "named"),
     [
         (["day/a.npy", "night/c.npy"], {"a": "day/a.npy", "c": "night/c.npy"}),
+        (["[br][iu]n*"], {"bins": "bins"}),
         (["day/*.np?"], {"a": "day/a.npy", "b": "day/b.npy"}),
         (["**/*.npy"], {"a": "day/a.npy", "b": "day/b.npy", "c": "night/c.npy"}),
         (["day"], {"a": "day/a.npy", "b": "day/b.npy"}),
