@@ -58,6 +58,8 @@ def find_captures(
     named: dict[str, Path] = {}
     for path in found.values():
         name = _name(path)
+        if any("\ud800" <= each <= "\udfff" for each in str(path.absolute())):
+            problems.append(f"{str(path)!a} is no text of UTF-8, which results cannot record; rename it")
         if name in named:
             problems.append(
                 f"two captures are called {name}, and would get one run folder: {named[name]} and {path}; rename one of them, "

@@ -79,7 +79,9 @@ def test_all_problems_come_at_once(find: Find) -> None:
     Path("latin.txt").write_bytes("n\xe4chtlich.npy".encode("latin-1"))
     Path("night/a.npy").touch()
     with pytest.raises(InputError) as caught:
-        find("*.mat", "empty", "night", "a\0b", lists=("bad.txt", "none.txt", "data.txt", "latin.txt", "absent.txt"))
+        find(
+            "*.mat", "empty", "night", "a\0b", "caf\udce9", lists=("bad.txt", "none.txt", "data.txt", "latin.txt", "absent.txt")
+        )
     assert str(caught.value).splitlines() == [
         "nothing matches *.mat; check the pattern",
         "empty is no capture that the spec can read, and there is none in it; name the files",
@@ -89,6 +91,7 @@ def test_all_problems_come_at_once(find: Find) -> None:
         "data.txt: not a list of captures, which is text; name captures as arguments",
         "latin.txt: the list is not UTF-8 text; save it as UTF-8, one capture a line",
         "absent.txt: the list of captures cannot be read: No such file or directory",
+        "'caf\\udce9' is no text of UTF-8, which results cannot record; rename it",
         "two captures are called a, and would get one run folder: night/a.npy and day/a.npy; rename one of them, "
         "or run them in two batches",
     ]
