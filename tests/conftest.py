@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +17,31 @@ from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
 from photonpano.testing import KnownMotion, MemorySource
+
+
+@pytest.fixture(scope="session")
+def file_server() -> Callable[..., Any]:
+    """Return the class of servers that serve a folder over HTTP, and as an object store."""
+    pytest.importorskip("aiohttp", reason="URLs need photonpano[http]")
+    spec = importlib.util.spec_from_file_location("file_server", Path(__file__).with_name("file_server.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.FileServer
+
+
+@pytest.fixture
+def object_store(file_server: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Serve the folder `store`, whose folders are buckets, as s3://, for anybody."""
+    s3fs = pytest.importorskip("s3fs", reason="s3:// needs photonpano[s3]")
+    import fsspec
+
+    (tmp_path / "store" / "bucket").mkdir(parents=True)
+    with file_server(tmp_path / "store") as server:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", server.address)
+        monkeypatch.setitem(fsspec.config.conf, "s3", {"anon": True})
+        s3fs.S3FileSystem.clear_instance_cache()
+        yield server
+    s3fs.S3FileSystem.clear_instance_cache()
 
 
 @pytest.fixture(scope="session")

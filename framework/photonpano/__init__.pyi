@@ -38,6 +38,7 @@ from .contributions import Requirement as Requirement
 from .contributions import ResamplerContribution as ResamplerContribution
 from .contributions import SourceContext as SourceContext
 from .contributions import SourceContribution as SourceContribution
+from .contributions import SpecLocation as SpecLocation
 from .contributions import SpecPath as SpecPath
 from .contributions import StageContext as StageContext
 from .errors import CanvasTooLargeError as CanvasTooLargeError
@@ -52,6 +53,8 @@ from .evaluation import Evaluation as Evaluation
 from .evaluation import PoseScore as PoseScore
 from .evaluation import evaluate_poses as evaluate_poses
 from .hookspecs import hookimpl as hookimpl
+from .paths import Location as Location
+from .paths import Url as Url
 from .pipeline.components import open_source as open_source
 from .pipeline.forecast import Forecast as Forecast
 from .pipeline.run import RunResult as RunResult

@@ -105,7 +105,7 @@ def atomic_folder(final: Path) -> Iterator[Path]:
             raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
         with _lent(place, f".{place.name}.", ".partial", folder=True) as temporary:
             yield temporary
-            for file in temporary.iterdir():
+            for file in temporary.rglob("*"):
                 flush(file)
             _rename(temporary, place)
     except OSError as error:

@@ -6,13 +6,26 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Protocol
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetPydanticSchema,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import core_schema
 
 from photonpano.errors import CaptureUnreadError
-from photonpano.paths import given_path, refusal
+from photonpano.paths import Location, Url, given_path, location, refusal
 from photonpano.protocols import Exporter, Interpolator, Locator, Merger, PoseEstimator, Refiner, Renderer, Resampler, Source
+from photonpano.text import install_line
 from photonpano.threads import InOrder
 from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInfo
 
@@ -31,6 +44,8 @@ class Config(BaseModel):
 
 def _relative_to_spec(path: Path, info: ValidationInfo) -> Path:
     directory = (info.context or {}).get("directory")
+    if isinstance(url := location(path), Url):
+        raise ValueError(f"{url} is a URL, and this must be a file: download it, and name the file")
     path = given_path(path)
     path = path if directory is None else Path(directory) / path
     if reason := refusal(path):
@@ -45,7 +60,24 @@ def _relative_to_spec(path: Path, info: ValidationInfo) -> Path:
 SpecPath = Annotated[Path, AfterValidator(_relative_to_spec)]
 """A path in a config: relative paths count from the folder of the spec, and arrive in the component resolved.
 
-Named pipes, devices and sockets are refused: they are not files that can be read twice.
+Named pipes, devices and sockets are refused: they are not files that can be read twice. So are URLs: see `SpecLocation`.
+"""
+
+
+def _url_or(value: Any, path: core_schema.ValidatorFunctionWrapHandler) -> Any:
+    found = location(value) if isinstance(value, str | Path | Url) else value
+    return found if isinstance(found, Url) else path(value)
+
+
+def _location_schema(_: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    as_text = core_schema.to_string_ser_schema(when_used="json")
+    return core_schema.no_info_wrap_validator_function(_url_or, handler.generate_schema(SpecPath), serialization=as_text)
+
+
+SpecLocation = Annotated[Location, GetPydanticSchema(_location_schema)]
+"""A path, as `SpecPath`, or a URL, such as `s3://bucket/cube.npy`, which arrives in the component as a `photonpano.Url`.
+
+It is for sources that read through `photonpano.reading`, which opens both.
 """
 
 
@@ -111,9 +143,7 @@ class Requirement:
 
 def install_command(requirements: Iterable[Requirement]) -> str:
     """Return the line that installs libraries, from an index and from a checkout of photonpano."""
-    from_index = " ".join(f'"{install}"' for install in dict.fromkeys(each.install for each in requirements))
-    in_checkout = from_index.replace('"photonpano[', '".[')
-    return f"pip install {from_index}" + (f" (in a checkout: pip install {in_checkout})" if in_checkout != from_index else "")
+    return install_line(each.install for each in requirements)
 
 
 def no_problems(*_: Any) -> Sequence[str]:
@@ -200,6 +230,21 @@ def _not_ours(_: Path) -> None:
     """Recognise nothing: the default `recognise` of a source."""
 
 
+class WriteFrames(Protocol):
+    """Writes binary frames as a capture."""
+
+    def __call__(self, folder: Path, info: StreamInfo, frames: Iterable[NDArray[np.uint8]], *, compressed: bool) -> None:
+        """Write a capture into an empty folder, which gets its name once this returns.
+
+        Args:
+            folder: the folder.
+            info: frames, size and rate.
+            frames: all packed frames in order, some at a time: (n, height, ceil(width / 8)), as from `PackedSource.packed`.
+            compressed: whether to compress them.
+        """
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class SourceContribution(Contribution):
     """Offers a source.
@@ -210,6 +255,9 @@ class SourceContribution(Contribution):
         check: finds problems of a config without reading the capture, such as a missing file.
         recognise: returns the keys of a capture if it is one of this source, for specs that leave the choice to `auto`. It
             reads names, sizes and a few megabytes at most, imports nothing heavy, and raises nothing.
+        write: writes binary frames as a capture that this source reads, for `photonpano convert` to a name with one of its
+            `suffixes`; None if it cannot.
+        opens_urls: whether its path may be a `photonpano.Url`: it is a `SpecLocation`, and `recognise` gets one as well.
         suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
             the message has the problems of the sources with its ending.
     """
@@ -217,7 +265,9 @@ class SourceContribution(Contribution):
     kind: ClassVar[str] = "source"
     build: Callable[[Any, SourceContext], Source]
     check: Callable[[Any], Sequence[str]] = no_problems
-    recognise: Callable[[Path], Recognised | None] = _not_ours
+    recognise: Callable[[Any], Recognised | None] = _not_ours
+    write: WriteFrames | None = None
+    opens_urls: bool = False
     suffixes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -17,6 +17,13 @@ def listed(words: Iterable[str], last: str = "and") -> str:
     return f" {last} ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
+def install_line(installs: Iterable[str]) -> str:
+    """Return the line that installs extras and libraries, such as `photonpano[s3]`, from an index and from a checkout."""
+    from_index = " ".join(f'"{install}"' for install in dict.fromkeys(installs))
+    in_checkout = from_index.replace('"photonpano[', '".[')
+    return f"pip install {from_index}" + (f" (in a checkout: pip install {in_checkout})" if in_checkout != from_index else "")
+
+
 def three_digits(value: float) -> str:
     """Write a number to three digits, without zeros at the end of its decimals."""
     decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2

@@ -5,14 +5,23 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath, StreamInfo
+from photonpano import (
+    Config,
+    FrameSpan,
+    InputError,
+    Location,
+    Recognised,
+    SourceContribution,
+    SpecLocation,
+    StreamInfo,
+    Url,
+)
 from photonpano.photometry import BinarySumResponse
 from photonpano.reading import (
     BinarySource,
@@ -21,6 +30,7 @@ from photonpano.reading import (
     FrameLayout,
     NpyHeader,
     OpenFiles,
+    Pieces,
     frames_are_last,
     gzipped_npy_header,
     is_gzip,
@@ -47,7 +57,9 @@ _NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use pa
 class NpyConfig(Config):
     """A capture in one .npy file: integers or bool (frames, height, width), a pixel to a value."""
 
-    path: SpecPath = Field(description="the .npy file; a file compressed with gzip is unpacked once, to a file beside it")
+    path: SpecLocation = Field(
+        description="the .npy file, or its URL; a file compressed with gzip is unpacked once, to a file beside it"
+    )
     holds: Literal["bits", "sums"] = Field(
         description="bits: binary frames, of 0 and 1, of 0 and 255, or bool; sums: each frame is the sum of binary frames"
     )
@@ -73,7 +85,7 @@ class NpyConfig(Config):
 class _Values:
     """Reads the values of frames in a .npy file, from any thread."""
 
-    def __init__(self, path: Path, header: NpyHeader, frames_last: bool) -> None:
+    def __init__(self, path: Location, header: NpyHeader, frames_last: bool) -> None:
         n_frames, height, width = header.shape[-1:] + header.shape[:-1] if frames_last else header.shape
         self.path = path
         self.shape = n_frames, height, width
@@ -81,19 +93,36 @@ class _Values:
         self.files = OpenFiles()
         self._header = header
         # Frames along the last axis are scattered over the file.
-        self._scattered = np.memmap(path, header.dtype, "r", header.offset, header.shape) if frames_last else None
+        self._scattered = None
+        if frames_last:
+            if isinstance(path, Url):
+                raise InputError(
+                    f"{path} has its frames along the last axis, scattered over the file; download it, and convert it"
+                )
+            self._scattered = np.memmap(path, header.dtype, "r", header.offset, header.shape)
+        self._remote = None
+        if isinstance(path, Url):
+            self._remote = Pieces([*range(0, n_frames, max(1, _READ_BYTES // self.frame_bytes)), n_frames], self._stored)
 
     def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
         """Yield the frames of a span, (n, H, W), a few at a time, and their places in the span."""
+        if self._remote is not None:
+            shape = self.shape[1:]
+            yield from ((place, stored.view(self._header.dtype).reshape(-1, *shape)) for place, stored in self._remote.of(span))
+            return
         for block in span.blocks(max(1, _READ_BYTES // self.frame_bytes)):
             yield slice(block.start - span.start, block.stop - span.start), self._read(block)
 
     def _read(self, span: FrameSpan) -> NDArray[Any]:
         if self._scattered is not None:
             return np.ascontiguousarray(np.moveaxis(self._scattered[..., span.start : span.stop], -1, 0))
-        values = np.empty((len(span), *self.shape[1:]), self._header.dtype)
-        self.files.read(self.path, self._header.offset + span.start * self.frame_bytes, values.view(np.uint8))
-        return values
+        return self._stored(span).view(self._header.dtype).reshape(-1, *self.shape[1:])
+
+    def _stored(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the bytes of the frames of a span: (n, bytes of a frame)."""
+        stored = np.empty((len(span), self.frame_bytes), np.uint8)
+        self.files.read(self.path, self._header.offset + span.start * self.frame_bytes, stored)
+        return stored
 
     def require(self, wrong: NDArray[np.bool_], values: NDArray[Any], first: int, remedy: str) -> None:
         """Raise for the first of the values, of frames from `first` on, that is wrong."""
@@ -103,6 +132,12 @@ class _Values:
                 f"{self.path} holds the value {values[frame, row, column]} in frame {first + frame}, row {row}, column "
                 f"{column}; {remedy}"
             )
+
+    def close(self) -> None:
+        """Close the file."""
+        self.files.close()
+        if self._remote is not None:
+            self._remote.close()
 
 
 class NpyBits(BinarySource):
@@ -127,7 +162,7 @@ class NpyBits(BinarySource):
 
     def close(self) -> None:
         """Close the file."""
-        self._values.files.close()
+        self._values.close()
 
 
 class NpySums(Closing):
@@ -171,10 +206,10 @@ class NpySums(Closing):
 
     def close(self) -> None:
         """Close the file."""
-        self._values.files.close()
+        self._values.close()
 
 
-def contents_of(path: Path, header: NpyHeader) -> Content | None:
+def contents_of(path: Location, header: NpyHeader) -> Content | None:
     """Return what the values of an array are, if they are bool or whole numbers, and not bytes of eight pixels each."""
     if header.dtype.kind not in "bui" or len(header.shape) != 3 or min(header.shape) < 1 or header.fortran_order:
         return None
@@ -182,7 +217,7 @@ def contents_of(path: Path, header: NpyHeader) -> Content | None:
     return unpacked_content(samples) if samples else None
 
 
-def section_for(path: Path, holds: str, highest: int = 1) -> str:
+def section_for(path: Location, holds: str, highest: int = 1) -> str:
     """Return the section of a spec that reads such a capture; `highest` is the largest value that was seen in it."""
     written = str(path) if _PLAIN.fullmatch(str(path)) else json.dumps(str(path), ensure_ascii=False)
     if holds == "bits":
@@ -220,7 +255,7 @@ def _header(config: NpyConfig) -> NpyHeader:
 _TYPES = {"bits": "bool", "sums": "numpy.uint16"}
 
 
-def _frames_are_last(path: Path, header: NpyHeader) -> bool:
+def _frames_are_last(path: Location, header: NpyHeader) -> bool:
     samples = sampled_frames(path, header)
     return bool(samples) and frames_are_last(samples, header.shape)
 
@@ -248,9 +283,9 @@ def _check(config: NpyConfig) -> Sequence[str]:
     return objections(_read_some, config)
 
 
-def _recognise(path: Path) -> Recognised | None:
+def _recognise(path: Location) -> Recognised | None:
     """Take .npy files of bits. The number of frames in a sum stands in no file."""
-    if not path.is_file() or (path.parent / "transforms.json").exists():
+    if not isinstance(path, Url) and (not path.is_file() or (path.parent / "transforms.json").exists()):
         return None
     try:
         header = gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
@@ -259,7 +294,7 @@ def _recognise(path: Path) -> Recognised | None:
         return None
     if content is None or content.holds != "bits":
         return None
-    keys = {"path": str(path), "holds": "bits"}
+    keys = {"path": path, "holds": "bits"}
     because = f"{header.dtype} of shape {header.shape} in a .npy file, with the values 0 and {content.highest} only"
     if not _frames_are_last(path, header):
         return Recognised(keys, because)
@@ -273,5 +308,6 @@ NPY = SourceContribution(
     build=lambda config, _: _open(config),
     check=_check,
     recognise=_recognise,
+    opens_urls=True,
     suffixes=(".npy", ".gz"),
 )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photonpano import Config, InputError, Recognised, SourceContribution, SpecPath
+from photonpano import Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
 from photonpano.photometry import packed_along_width, reversed_bits
 from photonpano.reading import (
     FrameFile,
@@ -39,7 +38,9 @@ _CHANNELS = 3
 class PackedNpyConfig(Config):
     """A capture in one .npy file: uint8 (frames, height, ceil(width / 8)), as `numpy.packbits(cube, axis=-1)` makes it."""
 
-    path: SpecPath = Field(description="the .npy file; a file compressed with gzip is unpacked once, to a file beside it")
+    path: SpecLocation = Field(
+        description="the .npy file, or its URL; a file compressed with gzip is unpacked once, to a file beside it"
+    )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
     width: int | None = Field(
         None, ge=1, description="columns of a frame, in px; needed only if the width is not a multiple of eight"
@@ -147,7 +148,7 @@ def _frame_shape(config: PackedNpyConfig, header: NpyHeader) -> tuple[int, int]:
     return n_rows, width
 
 
-def _remedy(path: Path, header: NpyHeader) -> str:
+def _remedy(path: Location, header: NpyHeader) -> str:
     """Return what to do with an array that is not uint8."""
     content = contents_of(path, header)
     if content is None:
@@ -181,14 +182,14 @@ def _require_layout(config: PackedNpyConfig) -> None:
         raise _frames_last(path, header, "frames", f"numpy.packbits({frames_first}, axis=-1)")
 
 
-def _frames_last(path: Path, header: NpyHeader, a_byte_holds: str, repacked: str) -> InputError:
+def _frames_last(path: Location, header: NpyHeader, a_byte_holds: str, repacked: str) -> InputError:
     return InputError(
         f"{path} has its frames along the last axis of {header.shape[:3]}, where values are most alike, and a byte holds eight "
         f"{a_byte_holds}; save {repacked} to another file, or write bit_order: big if it is right"
     )
 
 
-def _samples(path: Path, header: NpyHeader, channel: int | None) -> list[NDArray[np.uint8]]:
+def _samples(path: Location, header: NpyHeader, channel: int | None) -> list[NDArray[np.uint8]]:
     samples: list[NDArray[Any]] = sampled_frames(path, header)
     return samples if channel is None else [each[..., channel] for each in samples]
 
@@ -206,15 +207,15 @@ def _check(config: PackedNpyConfig) -> Sequence[str]:
     return objections(_require_layout, config)
 
 
-def _recognise(path: Path) -> Recognised | None:
+def _recognise(path: Location) -> Recognised | None:
     """Take .npy files of packed frames, and not those that a transforms.json beside them describes."""
-    if not path.is_file() or (path.parent / "transforms.json").exists():
+    if not isinstance(path, Url) and (not path.is_file() or (path.parent / "transforms.json").exists()):
         return None
     found = with_channel(lambda channel: _layout(PackedNpyConfig(path=path, channel=channel)))
     if found is None:
         return None
     (header, _), channel = found
-    keys: dict[str, Any] = {"path": str(path)} | channel.keys
+    keys: dict[str, Any] = {"path": path} | channel.keys
     because = f"uint8 of shape {header.shape} in a .npy file{channel.clause}"
     samples = _samples(path, header, channel.keys.get("channel"))
     if not samples:
@@ -233,5 +234,6 @@ PACKED_NPY = SourceContribution(
     build=lambda config, _: _open(config),
     check=_check,
     recognise=_recognise,
+    opens_urls=True,
     suffixes=(".npy", ".gz"),
 )

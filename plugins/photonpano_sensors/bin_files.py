@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from pydantic import Field
 
-from photonpano import Config, InputError, SpecPath
-from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, objections
+from photonpano import Config, InputError, Location, SpecLocation
+from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, objections, size_of
 
 
 class BinConfig(Config):
     """A capture in .bin files."""
 
-    path: SpecPath = Field(description="a .bin file, or a folder of them, nested or not, in natural order (0, 2, 10)")
+    path: SpecLocation = Field(
+        description="a .bin file, or a folder of them, or the URL of either; nested or not, in natural order (0, 2, 10)"
+    )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
 
 
@@ -28,7 +29,7 @@ def checked(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Se
     return objections(frame_files, config.path, layout, footer_bytes)
 
 
-def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[FrameFile]:
+def frame_files(path: Location, layout: FrameLayout, footer_bytes: int = 0) -> list[FrameFile]:
     """Return the files of a capture with the number of frames that follows from their sizes.
 
     Args:
@@ -41,7 +42,7 @@ def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[
             first, unless it is the last and shorter: frames are missing, or the order is wrong.
     """
     files = files_in(path, ".bin")
-    sizes = [file.stat().st_size for file in files]
+    sizes = [size_of(file) for file in files]
     found = []
     for file, size in zip(files, sizes, strict=True):
         n_frames, rest = divmod(size, layout.stored_bytes)
@@ -61,10 +62,10 @@ def frame_files(path: Path, layout: FrameLayout, footer_bytes: int = 0) -> list[
     return found
 
 
-def sizes_of(path: Path) -> list[int]:
+def sizes_of(path: Location) -> list[int]:
     """Return the sizes in bytes of the .bin files at a path, in order; an empty list if there are none."""
     try:
         files = files_in(path, ".bin")
-        return [file.stat().st_size for file in files if file.suffix.lower() == ".bin"]
+        return [size_of(file) for file in files if file.suffix.lower() == ".bin"]
     except (InputError, OSError):
         return []

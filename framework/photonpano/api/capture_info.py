@@ -11,6 +11,7 @@ from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons, saturated_share, summarise
 from photonpano.corrections import CorrectedSource, FilteredSource, HotPixels, without_still_pixels
 from photonpano.errors import InputError
+from photonpano.paths import Url
 from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.protocols import Source
 from photonpano.registry import Catalog
@@ -140,7 +141,8 @@ def percent(share: float) -> str:
 
 def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Catalog | None) -> tuple[int | None, str]:
     """Return the group size that `auto` chooses, whatever the spec says, and the reason."""
-    spec = {"version": 1, "source": plan.document["source"], "resample": {"use": "midpoint"}, "levels": 1}
+    source_section = {"use": plan.source.contribution.name, "with": plan.source.config.model_dump(by_alias=True)}
+    spec = {"version": 1, "source": source_section, "resample": {"use": "midpoint"}, "levels": 1}
     try:
         decisions = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
     except InputError as error:
@@ -183,4 +185,6 @@ def _relative(value: Any) -> Any:
         return [_relative(item) for item in value]
     if isinstance(value, Path):
         return str(value.relative_to(Path.cwd()) if value.is_relative_to(Path.cwd()) else value)
+    if isinstance(value, Url):
+        return str(value)
     return value

@@ -7,12 +7,15 @@ import os
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from pydantic import BaseModel
 
+from photonpano.errors import InputError
+from photonpano.paths import Location, Url
 from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source
+from photonpano.reading.remote import remote_file
 from photonpano.specs.plan import Plan
 
 _PLACES, _FRAMES = 16, 4
@@ -23,11 +26,13 @@ class FileRecord(TypedDict):
     """A file that the source or a correction reads, or a folder of them.
 
     `bytes` is the size of all its files, `modified` the latest of their times, ISO 8601 in UTC; None where there is none.
+    `etag` is the mark that a server gives the content of a URL; other files have none.
     """
 
     path: str
     bytes: int | None
     modified: str | None
+    etag: NotRequired[str | None]
 
 
 class CaptureRecord(TypedDict):
@@ -51,14 +56,18 @@ def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
     """
     suffixes = tuple(plan.source.contribution.suffixes)  # type: ignore[attr-defined]  # those of a source
     return {
-        "files": [_file(path, suffixes) for path in capture_files(plan)],
+        "files": [_remote(path) if isinstance(path, Url) else _file(path, suffixes) for path in _locations(plan)],
         "frames_sha256": frames_sha256(source),
         "pixels_sha256": _pixels_sha256(source),
     }
 
 
 def capture_files(plan: Plan) -> list[Path]:
-    """Return the files and folders that the source and the corrections of a plan name."""
+    """Return the files and folders that the source and the corrections of a plan name; URLs are none."""
+    return [path for path in _locations(plan) if isinstance(path, Path)]
+
+
+def _locations(plan: Plan) -> list[Location]:
     return list(dict.fromkeys([*_paths(plan.source.config), *_paths(plan.corrections)]))
 
 
@@ -81,6 +90,8 @@ def changes(old: CaptureRecord, new: CaptureRecord) -> list[str]:
             found.append(f"{path} is read as well")
         elif file["bytes"] != before[path]["bytes"]:
             found.append(f"{path} has another size")
+        elif file.get("etag") != before[path].get("etag"):
+            found.append(f"{path} has another content, by its ETag")
         elif file["modified"] != before[path]["modified"]:
             found.append(f"{path} was written at {file['modified']}, not {before[path]['modified']}")
     if old["frames_sha256"] != new["frames_sha256"]:
@@ -98,9 +109,11 @@ def _pixels_sha256(source: Source) -> str:
     return digest.hexdigest()
 
 
-def _paths(value: Any) -> Iterator[Path]:
-    """Yield the paths in a config, at any depth."""
-    if isinstance(value, Path):
+def _paths(value: Any) -> Iterator[Location]:
+    """Yield the paths and URLs in a config, at any depth."""
+    if isinstance(value, Url):
+        yield value
+    elif isinstance(value, Path):
         yield Path(os.path.normpath(value.absolute()))
     elif isinstance(value, BaseModel):
         for name in type(value).model_fields:
@@ -122,11 +135,23 @@ def _file(path: Path, suffixes: tuple[str, ...]) -> FileRecord:
     return {"path": str(path), "bytes": size, "modified": f"{seconds}.{latest % 10**9:09d}Z"}
 
 
+def _remote(url: Url) -> FileRecord:
+    """Describe a URL, as far as its server does. A folder in an object store is neither a file, nor has it a size."""
+    try:
+        found = remote_file(url)
+    except InputError:
+        return {"path": str(url), "bytes": None, "modified": None}
+    modified = None if found.modified is None else found.modified.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return {"path": str(url), "bytes": found.size, "modified": modified, "etag": found.etag}
+
+
 def _files(path: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
     """Yield a file; or those in a folder with one of the suffixes, without hidden ones and those of run folders."""
     if not path.is_dir():
         yield path
         return
+    if path.name.lower().endswith(suffixes):  # the folder itself is the capture
+        suffixes = ()
     for folder, inner, names in os.walk(path):
         if "run.json" in names:
             inner.clear()

@@ -1,22 +1,24 @@
-"""Write a binary source as a packed .npy file, with its truth beside it."""
+"""Write a binary source as a packed .npy file, or as a folder, with its truth beside it."""
 
 from __future__ import annotations
 
 import io
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.atomic import atomic_path, require_space, resumable_path
+from photonpano.atomic import atomic_folder, atomic_path, require_space, resumable_path
 from photonpano.errors import InputError, OutputError, PluginError
 from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
 from photonpano.threads import in_order
-from photonpano.values import FrameSpan
+from photonpano.values import FrameSpan, StreamInfo
+
+FolderWriter = Callable[[Path, StreamInfo, Iterable[NDArray[np.uint8]]], None]
 
 _BLOCK_BYTES = 8 * 1024**2
 """Bytes of the frames that are read at once, packed if the source is."""
@@ -25,6 +27,67 @@ _BLOCK_BYTES = 8 * 1024**2
 def truth_path(path: Path) -> Path:
     """Return where the truth of a capture lies: `cube.truth.npz` for `cube.npy`."""
     return path.with_name(f"{path.stem}.truth.npz")
+
+
+def write_folder(
+    source: Source,
+    path: Path,
+    write: FolderWriter,
+    progress: Callable[[int], object] | None = None,
+    threads: int = 2,
+) -> tuple[Path, ...]:
+    """Write a binary source as a folder, whole or not at all, in constant memory; its truth as `write_packed` does.
+
+    Args:
+        source: the capture.
+        path: the folder, which must not be there.
+        write: writes the frames into an empty folder: the `write` of a source, with its last argument.
+        progress: called with the number of frames written since the last call.
+        threads: how many threads read the source.
+
+    Returns:
+        The folder, and the file of the truth if there is one.
+
+    Raises:
+        InputError: as `write_packed`.
+        OutputError: there is something under that name, or the folder cannot be written, or does not fit on the disk.
+        PluginError: as `write_packed`.
+    """
+    _require_bits(source, path)
+    packed, truth = PackedFrames(source), _truth_of(source)
+    with atomic_folder(path) as folder:
+        require_space(path, packed.n_bytes + sum(array.nbytes for array in truth.values()))
+        write(folder, source.info, _counted(in_order(packed.of, packed.blocks(0), threads), progress))
+        return (path, *_write_truth(path, truth))
+
+
+def _counted(blocks: Iterator[NDArray[np.uint8]], progress: Callable[[int], object] | None) -> Iterator[NDArray[np.uint8]]:
+    for frames in blocks:
+        yield frames
+        if progress is not None:
+            progress(len(frames))
+
+
+def _truth_of(source: Source) -> Mapping[str, NDArray[Any]]:
+    return source.truth() if isinstance(source, KnowsTruth) else {}
+
+
+def _write_truth(path: Path, truth: Mapping[str, NDArray[Any]]) -> tuple[Path, ...]:
+    if not truth:
+        return ()
+    with atomic_path(truth_path(path)) as temporary:
+        np.savez(temporary, **truth)  # type: ignore[arg-type]  # the stubs take the names for other parameters
+    return (truth_path(path),)
+
+
+def _require_bits(source: Source, path: Path) -> None:
+    if source.info.kind != "binary":
+        raise InputError(f"cannot write {path}: packed captures hold binary frames, and this source gives intensities")
+    if isinstance(source, LinearlyCorrectedSource):
+        raise InputError(
+            f"cannot write {path}: some corrections change sums of frames, and not the frames; "
+            "leave them to the specs that read the file"
+        )
 
 
 def write_packed(
@@ -54,24 +117,14 @@ def write_packed(
             left under the final names then, nor when the source fails.
         PluginError: the source returns frames of another shape than it promises.
     """
-    if source.info.kind != "binary":
-        raise InputError(f"cannot write {path}: packed .npy files hold binary frames, and this source gives intensities")
-    if isinstance(source, LinearlyCorrectedSource):
-        raise InputError(
-            f"cannot write {path}: some corrections change sums of frames, and not the frames; "
-            "leave them to the specs that read the file"
-        )
+    _require_bits(source, path)
     if path.suffix != ".npy":
         raise OutputError(f"cannot write {path}: a packed capture is a .npy file; name it {path.name}.npy")
-    truth = source.truth() if isinstance(source, KnowsTruth) else {}
+    truth = _truth_of(source)
     truth_bytes = sum(array.nbytes for array in truth.values())
     with (atomic_path if resumed is None else resumable_path)(path) as temporary:
         _write_capture(source, path, temporary, truth_bytes, progress, threads, resumed)
-        if not truth:
-            return (path,)
-        with atomic_path(truth_path(path)) as temporary_truth:
-            np.savez(temporary_truth, **truth)  # type: ignore[arg-type]  # the stubs take the names for other parameters
-    return path, truth_path(path)
+        return (path, *_write_truth(path, truth))
 
 
 def _write_capture(

@@ -26,7 +26,7 @@ Overrides = Annotated[
     ),
 ]
 CapturePath = Annotated[
-    Path, typer.Argument(metavar="PATH", help="A capture (a file or a folder), or a spec (.yaml).", show_default=False)
+    str, typer.Argument(metavar="PATH", help="A capture (a file, a folder, or a URL), or a spec (.yaml).", show_default=False)
 ]
 SourceName = Annotated[
     str | None,
@@ -63,7 +63,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
 @contextmanager
 def capture_plan(
-    path: Path,
+    path: str | Path,
     source: str | None = None,
     keys: Sequence[str] | None = None,
     corrections: Sequence[str] | None = None,
@@ -74,7 +74,7 @@ def capture_plan(
     Errors of the options, in making the plan and in the block, name the option instead of a key of a spec that nobody wrote.
 
     Args:
-        path: the capture, or a spec.
+        path: the capture, which may be a URL, or a spec.
         source: the source that reads it.
         keys: its keys, such as `frame_rate_hz=96800`.
         corrections: items of the spec's list of corrections, in YAML; they replace those of a spec.
@@ -96,7 +96,7 @@ def capture_plan(
         changes.append(f"source.use={source}")
     if corrections:
         changes.append(f"corrections=[{', '.join(corrections)}]")
-    if path.suffix.lower() in specs.SPEC_SUFFIXES:
+    if Path(path).suffix.lower() in specs.SPEC_SUFFIXES:
         yield specs.load_spec(path, changes, catalog=catalog)
         return
     try:

@@ -9,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from photonpano.api.captures import WrittenCapture
 
@@ -17,6 +18,11 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
     """Align rows of text in columns: two spaces apart, no line wrapped, no trailing spaces."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+
+
+def _size(path: Path) -> int:
+    """Return the bytes of a file, or of the files in a folder."""
+    return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def print_written(written: WrittenCapture) -> None:
@@ -31,11 +37,9 @@ def print_written(written: WrittenCapture) -> None:
         mask = "mask them with `corrections`"
         warn(f"{written.n_masked} pixels of the capture are masked, and {written.path} holds no mask; {mask}")
     files = [(written.path, str(written.info)), (written.truth, "the truth: motion and scene")]
-    rows = [[str(file), decimal(file.stat().st_size), text] for file, text in files if file]
     if written.sharp:
-        pictures = list(written.sharp.iterdir())
-        size = decimal(sum(file.stat().st_size for file in pictures))
-        rows.append([str(written.sharp), size, f"{counted(len(pictures), 'frame')} without noise"])
+        files.append((written.sharp, f"{counted(len(list(written.sharp.iterdir())), 'frame')} without noise"))
+    rows = [[str(file), decimal(_size(file)), text] for file, text in files if file]
     typer.echo(columns(rows))
     typer.echo(f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}")
     held = ZipFile(written.truth).namelist() if written.truth else ()

@@ -14,6 +14,8 @@ from photonpano.reading.files import (
     read_start,
     reading,
     require_readable,
+    require_there,
+    size_of,
 )
 from photonpano.reading.filter_arrays import COLOURS, bayer_array, read_filter_array
 from photonpano.reading.first_look import look_first
@@ -21,7 +23,9 @@ from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, un
 from photonpano.reading.npy import NpyHeader, npy_header, require_frames, require_whole
 from photonpano.reading.packed_files import FrameFile, PackedFileSource
 from photonpano.reading.packed_layout import FrameLayout
+from photonpano.reading.pieces import Pieces
 from photonpano.reading.pixel_order import OtherOrder, PixelOrder, other_order
+from photonpano.reading.remote import library, read_range
 from photonpano.reading.sampling import sampled_frames, sampled_spans
 from photonpano.reading.single_frame_source import SingleFrameSource
 from photonpano.source_wrapper import Closing
@@ -38,6 +42,7 @@ __all__ = [
     "OpenFiles",
     "OtherOrder",
     "PackedFileSource",
+    "Pieces",
     "PixelOrder",
     "SingleFrameSource",
     "bayer_array",
@@ -45,6 +50,7 @@ __all__ = [
     "frames_are_last",
     "gzipped_npy_header",
     "is_gzip",
+    "library",
     "look_first",
     "missing_file",
     "natural_order",
@@ -57,13 +63,16 @@ __all__ = [
     "read_filter_array",
     "read_json",
     "read_picture",
+    "read_range",
     "read_start",
     "reading",
     "require_frames",
     "require_readable",
+    "require_there",
     "require_whole",
     "sampled_frames",
     "sampled_spans",
+    "size_of",
     "unpacked",
     "unpacked_content",
     "unpacked_start",

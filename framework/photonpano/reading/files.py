@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from pathlib import Path
-from typing import ParamSpec, TypeVar
+from pathlib import Path, PurePath, PurePosixPath
+from typing import ParamSpec, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from photonpano.errors import InputError, PhotonpanoError
-from photonpano.paths import refusal
+from photonpano.paths import Location, Url, refusal
+from photonpano.reading.remote import read_range, remote_files_in
+from photonpano.reading.remote import size_of as remote_size
 
 Model = TypeVar("Model", bound=BaseModel)
 P = ParamSpec("P")
@@ -85,7 +87,40 @@ def require_readable(path: Path) -> None:
             os.close(os.open(path, os.O_RDONLY))
 
 
-def files_in(path: Path, suffix: str) -> list[Path]:
+def size_of(path: Location) -> int:
+    """Return the size of a file in bytes.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read in parts.
+    """
+    if isinstance(path, Url):
+        return remote_size(path)
+    with reading(path):
+        return path.stat().st_size
+
+
+def require_there(path: Location) -> None:
+    """Refuse a file or folder that is missing, or that may not be opened. Nothing is asked of a URL: its reader does.
+
+    Raises:
+        InputError: it is so.
+    """
+    if isinstance(path, Url):
+        return
+    if not path.exists():
+        raise InputError(missing_file(path, "file or folder"))
+    require_readable(path)
+
+
+@overload
+def files_in(path: Path, suffix: str) -> list[Path]: ...
+
+
+@overload
+def files_in(path: Location, suffix: str) -> list[Location]: ...
+
+
+def files_in(path: Location, suffix: str) -> Sequence[Location]:
     """Return the files of a capture: the file itself, or those of a folder, nested ones too, in natural order (0, 2, 10).
 
     Hidden files are left out.
@@ -97,6 +132,11 @@ def files_in(path: Path, suffix: str) -> list[Path]:
     Raises:
         InputError: there is no such file or folder, or no such file in the folder.
     """
+    if isinstance(path, Url):
+        urls = remote_files_in(path, suffix)
+        if not urls:
+            raise InputError(f"there is no {suffix} file below {path}; check the address")
+        return sorted(urls, key=lambda url: natural_order(PurePosixPath(str(url))))
     with reading(path):
         if path.is_file():
             return [path]
@@ -113,7 +153,7 @@ def files_in(path: Path, suffix: str) -> list[Path]:
     return [path / file for file in sorted(found, key=natural_order)]
 
 
-def natural_order(path: Path) -> list[tuple[list[tuple[str, int]], str]]:
+def natural_order(path: PurePath) -> list[tuple[list[tuple[str, int]], str]]:
     """Return a key that sorts paths with their numbers as numbers, so that 10 comes after 2."""
     return [([(text, int(digits or 0)) for text, digits in _TEXT_AND_NUMBER.findall(part)], part) for part in path.parts]
 
@@ -134,8 +174,13 @@ def read_json(path: Path, model: type[Model]) -> Model:
         raise InputError(f"{path} is wrong{where and f' at {where}'}: {first['msg']}; write it again") from error
 
 
-def read_start(path: Path, n_bytes: int) -> bytes:
+def read_start(path: Location, n_bytes: int) -> bytes:
     """Return the first bytes of a file; none if it cannot be read, or is no regular file."""
+    if isinstance(path, Url):
+        try:
+            return read_range(path, 0, n_bytes)
+        except InputError:
+            return b""
     if refusal(path):
         return b""
     try:
@@ -151,12 +196,18 @@ class OpenFiles:
     def __init__(self) -> None:
         self._opened = lru_cache(_MOST_OPEN)(_OpenFile)
 
-    def read(self, path: Path, position: int, target: NDArray[np.uint8]) -> None:
+    def read(self, path: Location, position: int, target: NDArray[np.uint8]) -> None:
         """Fill a contiguous array with the bytes of a file from a position on.
 
         Raises:
             InputError: the file cannot be read, or has become shorter.
         """
+        if isinstance(path, Url):
+            data = read_range(path, position, position + target.nbytes)
+            if len(data) != target.nbytes:
+                raise InputError(f"{path} is shorter than it should be; copy or record it again")
+            target.reshape(-1)[:] = np.frombuffer(data, np.uint8)
+            return
         with reading(path):
             file = self._opened(path)
             left = target.reshape(-1).data

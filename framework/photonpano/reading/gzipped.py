@@ -12,6 +12,7 @@ from pathlib import Path
 from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError
 from photonpano.locks import hold
+from photonpano.paths import Location, Url
 from photonpano.reading.files import read_start, reading
 from photonpano.reading.npy import NpyHeader, read_npy_header
 
@@ -20,9 +21,20 @@ logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1024**2
 
 
-def is_gzip(path: Path) -> bool:
+def is_gzip(path: Location) -> bool:
     """Return whether a file is compressed with gzip, by its first bytes."""
     return read_start(path, 2) == b"\x1f\x8b"
+
+
+def local(path: Location) -> Path:
+    """Return the path of a compressed file.
+
+    Raises:
+        InputError: it is a URL: a compressed file can only be read from its beginning.
+    """
+    if isinstance(path, Url):
+        raise InputError(f"{path} is compressed with gzip, and cannot be read in parts; unpack it there, or download it")
+    return path
 
 
 def unpacked_start(path: Path, n_bytes: int) -> bytes:
@@ -36,12 +48,13 @@ def unpacked_start(path: Path, n_bytes: int) -> bytes:
         return b""
 
 
-def gzipped_npy_header(path: Path) -> NpyHeader:
+def gzipped_npy_header(path: Location) -> NpyHeader:
     """Read the header of the array in a .npy.gz file, without its data.
 
     Raises:
-        InputError: the file cannot be read, or holds something else.
+        InputError: the file cannot be read, or holds something else; or it is a URL.
     """
+    path = local(path)
     try:
         with gzip.open(path) as file:
             header = read_npy_header(file)
@@ -52,7 +65,7 @@ def gzipped_npy_header(path: Path) -> NpyHeader:
     return header
 
 
-def unpacked(path: Path) -> Path:
+def unpacked(path: Location) -> Path:
     """Return the path of a .npy file with the content of a .npy.gz file.
 
     For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it is there with the
@@ -62,6 +75,7 @@ def unpacked(path: Path) -> Path:
         InputError: the file is damaged, or holds something else.
         OutputError: the unpacked file cannot be written, or does not fit on its disk.
     """
+    path = local(path)
     promised = gzipped_npy_header(path).file_bytes
     target = unpacked_path(path)
     if not _is_content(target, path, promised):

@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 import operator
 from gzip import GzipFile
-from pathlib import Path
+from io import BytesIO
 from typing import IO, NamedTuple
 
 import numpy as np
 
 from photonpano.errors import InputError
-from photonpano.reading.files import reading
+from photonpano.paths import Location, Url
+from photonpano.reading.files import read_start, reading, size_of
+from photonpano.reading.remote import read_range
+
+_HEADER_BYTES = 4096
+"""Bytes of a URL that are read for the header, which has 128 for any capture."""
 
 
 class NpyHeader(NamedTuple):
@@ -35,18 +40,22 @@ class NpyHeader(NamedTuple):
         return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
 
-def npy_header(path: Path) -> NpyHeader:
+def npy_header(path: Location) -> NpyHeader:
     """Read the header of a .npy file.
 
     Raises:
         InputError: the file cannot be read, or is something else.
     """
-    if path.is_dir():
+    if isinstance(path, Url):
+        start = read_range(path, 0, _HEADER_BYTES)
+        header = read_npy_header(BytesIO(start))
+    elif path.is_dir():
         raise InputError(f"{path} is a folder; name the .npy file in it")
-    with reading(path), path.open("rb") as file:
-        header = read_npy_header(file)
+    else:
+        with reading(path), path.open("rb") as file:
+            header = read_npy_header(file)
     if header is None:
-        raise InputError(f"{path} is not a .npy file{_guess(path)}")
+        raise InputError(f"{path} is not a .npy file{_guess(read_start(path, 4))}")
     return header
 
 
@@ -68,13 +77,13 @@ def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
         return None
 
 
-def require_whole(path: Path, header: NpyHeader) -> None:
+def require_whole(path: Location, header: NpyHeader) -> None:
     """Refuse a .npy file that is shorter than its header promises.
 
     Raises:
         InputError: the file is shorter.
     """
-    size = path.stat().st_size
+    size = size_of(path)
     if size < header.file_bytes:
         raise InputError(
             f"{path} is cut short: its header {header.shape} promises {header.file_bytes} bytes, the file has {size}; "
@@ -82,7 +91,7 @@ def require_whole(path: Path, header: NpyHeader) -> None:
         )
 
 
-def require_frames(path: Path, header: NpyHeader, axes: str) -> None:
+def require_frames(path: Location, header: NpyHeader, axes: str) -> None:
     """Refuse an array without values, or one that is not in C order.
 
     Args:
@@ -99,9 +108,7 @@ def require_frames(path: Path, header: NpyHeader, axes: str) -> None:
         raise InputError(f"{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)")
 
 
-def _guess(path: Path) -> str:
-    with path.open("rb") as file:
-        start = file.read(4)
+def _guess(start: bytes) -> str:
     if not start:
         return ": it is empty"
     if start.startswith(b"\x1f\x8b"):

@@ -5,19 +5,22 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
-from pathlib import Path
+from itertools import accumulate, pairwise
 from threading import local
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.paths import Location, Url
 from photonpano.reading.binary_source import BinarySource
 from photonpano.reading.packed_layout import FrameLayout
+from photonpano.reading.pieces import Pieces
 from photonpano.values import FrameSpan
 
 _READ_BYTES = 1024**2
 """Bytes read at once: they stay in the cache of a core until they are summed."""
+_PIECE_BYTES = 4 * 1024**2
+"""Bytes fetched from a URL at once: a request takes milliseconds, whatever it asks for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +28,12 @@ class FrameFile:
     """Consecutive frames in a file.
 
     Attributes:
-        path: the file.
+        path: the file, or its URL.
         n_frames: number of the frames.
         offset: start of the first of them, in bytes.
     """
 
-    path: Path
+    path: Location
     n_frames: int
     offset: int = 0
 
@@ -58,9 +61,17 @@ class PackedFileSource(BinarySource):
         self._starts = list(accumulate((file.n_frames for file in files), initial=0))
         self._buffers = local()
         super().__init__(self._starts[-1], layout, frame_rate_hz)
+        self._remote = None
+        if any(isinstance(file.path, Url) for file in files):
+            step = max(1, _PIECE_BYTES // layout.stored_bytes)
+            starts = [first for start, stop in pairwise(self._starts) for first in range(start, stop, step)]
+            self._remote = Pieces([*starts, self._starts[-1]], self._fetched)
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, a few at a time: see `BinarySource`."""
+        if self._remote is not None:
+            yield from ((place, self.layout.rows(stored)) for place, stored in self._remote.of(span))
+            return
         step = max(1, _READ_BYTES // self.layout.stored_bytes)
         index, start = bisect_right(self._starts, span.start) - 1, span.start
         while start < span.stop:
@@ -70,10 +81,19 @@ class PackedFileSource(BinarySource):
             start = stop
 
     def _rows(self, index: int, first: int, n_frames: int) -> NDArray[np.uint8]:
-        file, frame_bytes = self._parts[index], self.layout.stored_bytes
-        target = self._buffer(n_frames * frame_bytes)
-        self.files.read(file.path, file.offset + first * frame_bytes, target)
-        return self.layout.rows(target.reshape(n_frames, *self.layout.stored_shape))
+        target = self._buffer(n_frames * self.layout.stored_bytes)
+        return self.layout.rows(self._read(index, first, target).reshape(n_frames, *self.layout.stored_shape))
+
+    def _fetched(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the stored frames of a span within one file: (n, *stored_shape)."""
+        index = bisect_right(self._starts, span.start) - 1
+        stored = np.empty((len(span), *self.layout.stored_shape), np.uint8)
+        return self._read(index, span.start - self._starts[index], stored)
+
+    def _read(self, index: int, first: int, target: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        file = self._parts[index]
+        self.files.read(file.path, file.offset + first * self.layout.stored_bytes, target)
+        return target
 
     def _buffer(self, size: int) -> NDArray[np.uint8]:
         """Return a buffer of the thread."""
@@ -81,3 +101,9 @@ class PackedFileSource(BinarySource):
         if buffer is None or len(buffer) < size:
             buffer = self._buffers.bytes = np.empty(size, np.uint8)
         return buffer[:size]
+
+    def close(self) -> None:
+        """Close the files."""
+        super().close()
+        if self._remote is not None:
+            self._remote.close()

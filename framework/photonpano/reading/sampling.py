@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.reading.gzipped import is_gzip, unpacked_start
+from photonpano.paths import Location, Url
+from photonpano.reading.files import OpenFiles, size_of
+from photonpano.reading.gzipped import is_gzip, local, unpacked_start
 from photonpano.reading.npy import NpyHeader
 from photonpano.values import FrameSpan
 
@@ -20,7 +21,7 @@ _SHORTEST_RUN = 16
 """Frames of a run, even if only some columns of them can be read."""
 
 
-def sampled_frames(path: Path, header: NpyHeader) -> list[NDArray[Any]]:
+def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
     """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
 
     Args:
@@ -34,15 +35,22 @@ def sampled_frames(path: Path, header: NpyHeader) -> list[NDArray[Any]]:
     n_frames, n_rows, n_columns, *_ = header.shape
     values_of_frame = int(np.prod(header.shape[1:]))
     if is_gzip(path):
-        start = unpacked_start(path, header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
+        start = unpacked_start(local(path), header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
         whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
         frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
         return [frames.reshape(whole, *header.shape[1:])] if whole else []
-    if path.stat().st_size < header.file_bytes:
+    if size_of(path) < header.file_bytes:
         return []
     columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))
+    spans = sampled_spans(n_frames, n_rows * columns)
+    if isinstance(path, Url):
+        files = OpenFiles()
+        samples = [np.empty((len(span), *header.shape[1:]), header.dtype) for span in spans]
+        for span, sample in zip(spans, samples, strict=True):
+            files.read(path, header.offset + span.start * sample[0].nbytes, sample.view(np.uint8))
+        return [sample[:, :, :columns] for sample in samples]
     stored = np.memmap(path, header.dtype, "r", header.offset, header.shape)
-    return [np.array(stored[each.start : each.stop, :, :columns]) for each in sampled_spans(n_frames, n_rows * columns)]
+    return [np.array(stored[each.start : each.stop, :, :columns]) for each in spans]
 
 
 def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ConfigDict, Field
 
-from photonpano.contributions import Config, Recognised, SourceContribution, SpecPath
+from photonpano.contributions import Config, Recognised, SourceContribution, SpecLocation
 from photonpano.errors import described
 from photonpano.hookspecs import hookimpl
 from photonpano.interrupts import is_interrupt
-from photonpano.reading import missing_file, objections, require_readable
+from photonpano.paths import Location, Url
+from photonpano.reading import objections, require_there
 from photonpano.specs.aliases import LocatorAlias, SourceAlias
 from photonpano.specs.checks import complaints
 from photonpano.specs.plan import Choice
@@ -26,7 +27,6 @@ from photonpano.values import Decision
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from photonpano.registry import Catalog, Entry
 
@@ -47,7 +47,9 @@ class AutoConfig(Config):
     # For editors: the other keys are those of the source that recognises the path.
     model_config = ConfigDict(json_schema_extra={"additionalProperties": True})
 
-    path: SpecPath = Field(description="the file or folder; other keys are passed to the source that recognises it")
+    path: SpecLocation = Field(
+        description="the file or folder, or its URL; other keys are passed to the source that recognises it"
+    )
 
 
 class ChainConfig(Config):
@@ -92,10 +94,7 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
         return None
     assert isinstance(written, dict)
     path = config.path
-    if not path.exists():
-        spec.wrong(f"{keys}.path", missing_file(path, "file or folder"))
-        return None
-    if unreadable := objections(require_readable, path):
+    if unreadable := objections(require_there, path):
         spec.wrong(f"{keys}.path", unreadable[0])
         return None
     recognised, failures = ask_sources(spec.catalog, path)
@@ -105,9 +104,12 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
             # The path is named once; each line begins with its last part.
-            near = [line.replace(str(path), path.name, 1) for line in _near_misses(spec, written, path)]
-            lines = [*(near or _known_endings(spec.catalog)), *failures]
+            near = dict(_near_misses(spec, written, path))
+            lines = [f"{name}: {line.replace(str(path), path.name or str(path), 1)}" for line, name in near.items()]
+            lines = [*(lines or _known_endings(spec.catalog)), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
+            if isinstance(path, Url) and len(near) == 1:  # all say the same, such as that there is nothing
+                (message,) = near
         spec.wrong(f"{keys}.path", message)
         return None
     for failure in failures:
@@ -123,12 +125,14 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
     return section | {"use": entry.name, "with": found.data | others}
 
 
-def ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
+def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
     """Show a path to all sources: return those that recognise it, and a clause for each that raised or broke its contract."""
     recognised: list[tuple[Entry, Recognised]] = []
     failures: list[str] = []
     for entry in catalog.rows:
         if not isinstance(entry.contribution, SourceContribution):
+            continue
+        if isinstance(path, Url) and not entry.contribution.opens_urls:
             continue
         try:
             answer = entry.contribution.recognise(path)
@@ -147,14 +151,21 @@ def ask_sources(catalog: Catalog, path: Path) -> tuple[list[tuple[Entry, Recogni
     return recognised, failures
 
 
-def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Path) -> Iterator[str]:
-    """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept."""
-    endings = {each.suffix.lower() for each in ([path] if path.is_file() else islice(path.rglob("*"), _SEARCHED))}
+def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Location) -> Iterator[tuple[str, str]]:
+    """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept.
+
+    Returns:
+        Each problem, with the name of the source.
+    """
+    files = [path] if isinstance(path, Url) or path.is_file() else islice(path.rglob("*"), _SEARCHED)
+    endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}
     for entry in spec.catalog.rows:
         contribution = entry.contribution
         if not isinstance(contribution, SourceContribution) or isinstance(contribution, SourceAlias):
             continue
         if contribution.suffixes and not endings & {*contribution.suffixes}:
+            continue
+        if isinstance(path, Url) and not contribution.opens_urls:
             continue
         try:
             config = validate(contribution.config, written, "", replace(spec, problems=[]))
@@ -163,7 +174,7 @@ def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Path) -> Iter
                 raise
             config = None
         if config is not None:
-            yield from (f"{entry.name}: {each}" for each in complaints(Choice(contribution, config, entry.origin)))
+            yield from ((each, entry.name) for each in complaints(Choice(contribution, config, entry.origin)))
 
 
 def _known_endings(catalog: Catalog) -> list[str]:
@@ -173,8 +184,10 @@ def _known_endings(catalog: Catalog) -> list[str]:
     return [f"the names of files of captures end in {listed(endings)}"] if endings else []
 
 
-def _contents(path: Path) -> str:
+def _contents(path: Location) -> str:
     """Describe a file or folder that no source recognises."""
+    if isinstance(path, Url):
+        return "a URL"
     if path.is_file():
         return f"a file of {path.stat().st_size:,} bytes"
     try:

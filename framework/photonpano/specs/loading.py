@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem, SpecError
-from photonpano.paths import refusal
+from photonpano.paths import Location, location, refusal
 from photonpano.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
 from photonpano.specs.resolution import resolve
@@ -79,7 +79,7 @@ def parse_spec(
 
 
 def capture_plan(
-    path: str | Path,
+    path: str | Location,
     keys: Mapping[str, Any] | None = None,
     *,
     source: str = "auto",
@@ -90,7 +90,7 @@ def capture_plan(
     """Make the plan of a capture without a spec.
 
     Args:
-        path: the file or folder, relative to the current folder.
+        path: the file or folder, relative to the current folder, or its URL.
         keys: keys of its source, such as `{"frame_rate_hz": 96_800}`.
         source: the source that reads it; by default the one that recognises it.
         corrections: a list of corrections, as in a spec; `auto` by default.
@@ -165,7 +165,7 @@ def _capture(spec: WrittenSpec) -> str | None:
         node = node.get(key) if isinstance(node, dict) else None
     if not isinstance(node, str):
         return None
-    path = Path(node)
+    path = Path(str(location(node)))  # without the secrets of a URL
     return (
         "-".join(part for part in (*path.parts[:-1][-1:], path.name.split(".")[0]) if part not in ("", "/", ".", "..")) or None
     )

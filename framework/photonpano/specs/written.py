@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem
+from photonpano.paths import Url
 from photonpano.registry.catalog import Catalog
 from photonpano.text import listed, suggestion
 
@@ -184,6 +185,8 @@ def _plain(data: object, where: str, spec: WrittenSpec) -> Any:
             return float(data)
         case Path():
             return _plain(str(data), where, spec)
+        case Url():
+            return _plain(data.address, where, spec)
         case list() | tuple():
             return [_plain(item, joined(where, index), spec) for index, item in enumerate(data)]
         case Mapping():

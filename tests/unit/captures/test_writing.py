@@ -151,7 +151,7 @@ def test_intensities_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         write_packed(RandomSource(5, 6, 19, kind="intensity"), tmp_path / "cube.npy")
     assert str(caught.value) == (
-        f"cannot write {tmp_path / 'cube.npy'}: packed .npy files hold binary frames, and this source gives intensities"
+        f"cannot write {tmp_path / 'cube.npy'}: packed captures hold binary frames, and this source gives intensities"
     )
 
 

@@ -89,7 +89,7 @@ def test_convert_refuses_intensities(cube: Path, invoke: Callable[..., Any], mon
     result = invoke("convert", "cube.npy", "out.npy", "--source", "grey")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == (
-        "error: cannot write out.npy: packed .npy files hold binary frames, and this source gives intensities\n"
+        "error: cannot write out.npy: packed captures hold binary frames, and this source gives intensities\n"
     )
 
 
@@ -150,3 +150,45 @@ def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any
     before = cube.read_bytes()
     assert invoke("convert", "cube.npy", "cube.npy").exit_code == 0
     assert cube.read_bytes() == before
+
+
+def test_convert_writes_a_zarr_array_that_opens_by_itself(cube: Path, invoke: Callable[..., Any]) -> None:
+    result = invoke("convert", "cube.npy", "out.zarr", "--with", "frame_rate_hz=96800")
+    assert (result.exit_code, result.stderr) == (0, "")
+    size, rest = result.stdout.removeprefix("out.zarr  ").split("  ", 1)
+    assert size.startswith("384.")
+    assert rest == (
+        "200 binary frames of 96x160 at 96,800 Hz\n\nIn a spec in this folder:\n\nsource: {use: zarr, with: {path: out.zarr}}\n"
+    )
+    assert "200 binary frames of 96x160 at 96,800 Hz" in invoke("info", "out.zarr").stdout
+    assert invoke("convert", "out.zarr", "again.npy").exit_code == 0
+    assert (cube.parent / "again.npy").read_bytes() == cube.read_bytes()
+
+
+def test_convert_compresses_arrays_alone(cube: Path, invoke: Callable[..., Any]) -> None:
+    pytest.importorskip("numcodecs", reason="compression needs photonpano[zarr]")
+    result = invoke("convert", "cube.npy", "out.npy", "--compress")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr == "error: cannot compress out.npy: packed .npy files are not compressed; name it out.zarr\n"
+    assert invoke("convert", "cube.npy", "out.zarr", "--compress").exit_code == 0
+    assert invoke("convert", "out.zarr", "again.npy").exit_code == 0
+    assert (cube.parent / "again.npy").read_bytes() == cube.read_bytes()
+
+
+def test_array_that_cannot_be_written_leaves_nothing(
+    cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (cube.parent / "taken.zarr").mkdir()
+    (cube.parent / "taken.zarr" / "mine").touch()
+    taken = invoke("convert", "cube.npy", "taken.zarr")
+    assert (taken.exit_code, taken.stderr) == (
+        1,
+        "error: cannot write taken.zarr: it is there already; choose another folder, or remove it\n",
+    )
+    before = sorted(cube.parent.iterdir())
+    monkeypatch.setattr("photonpano.captures.writing._BLOCK_BYTES", 96 * 20)
+    monkeypatch.setattr(Path, "write_bytes", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    full = invoke("convert", "cube.npy", "out.zarr")
+    assert full.exit_code == 1
+    assert full.stderr == ("error: cannot write out.zarr: No space left on device; free some space or choose another folder\n")
+    assert sorted(cube.parent.iterdir()) == before
