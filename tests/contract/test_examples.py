@@ -14,7 +14,7 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from photonpano import open_source, parse_spec
+from photonpano import capture_plan, convert, open_source, parse_spec
 from photonpano.captures.writing import truth_path
 from photonpano.cli.app import app
 
@@ -62,6 +62,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "swissspad": UNREFINED | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
     "sums": UNREFINED | {"resample.with.group_size": 25},
     "visionsim": UNREFINED,
+    "zarr": UNREFINED | {"resample.with.group_size": 50},
+    "vanvleck": UNREFINED | {"resample.with.group_size": 50},
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
     "colour": SMALL_STREET | UNREFINED | {"resample.with.group_size": 60},
@@ -118,6 +120,8 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
         shutil.copy(truth_path(small_capture), truth_path(capture))
     frames = np.unpackbits(np.load(small_capture), axis=-1)
     np.save(folder / "sums.npy", frames[::2] + frames[1::2])
+    convert(capture_plan(small_capture, {"frame_rate_hz": 96800}, corrections=[]), folder / "capture.zarr")
+    write_as_published(frames, folder)
     visionsim = folder / "visionsim"
     visionsim.mkdir()
     shutil.copy(small_capture, visionsim / "frames.npy")
@@ -132,6 +136,22 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
     blocks = cv2.resize(rng.uniform(0, 255, (40, 60)), (900, 600), interpolation=cv2.INTER_NEAREST)
     cv2.imwrite(str(folder / "photograph.jpg"), blocks + rng.normal(0, 10, blocks.shape))
     return folder
+
+
+def write_as_published(frames: np.ndarray, folder: Path) -> None:
+    """Write frames as the captures of the paper are laid out: with hot pixels, and one pixel in 16 behind a colour filter."""
+    rng = np.random.default_rng(0)
+    colours = np.eye(3, dtype=np.uint8)[rng.integers(0, 3, frames.shape[1:])] * 255
+    coloured = rng.random(frames.shape[1:]) < 1 / 16
+    hot = rng.random(frames.shape[1:]) < 0.002
+    dimmed = frames & ~(coloured & (rng.random(frames.shape) < 0.7)) | hot
+    capture = folder / "quantavision" / "pano" / "vanvleck"
+    capture.mkdir(parents=True)
+    np.save(capture / "binary.npy", np.packbits(dimmed, axis=-1))
+    (capture / "arguments.json").write_text("{}")
+    (folder / "masks").mkdir()
+    np.save(folder / "masks" / "hot.npy", hot)
+    cv2.imwrite(str(folder / "masks" / "filters.png"), np.where(coloured[..., None], colours, 255))
 
 
 def test_every_example_spec_is_in_this_file():

@@ -15,7 +15,23 @@ import photonpano
 import photonpano.geometry
 import photonpano.locating
 
-HEAVY = ("cv2", "h5py", "numba", "scipy", "skimage", "matplotlib", "tifffile", "torch", "kornia", "pycolmap")
+HEAVY = (
+    "cv2",
+    "h5py",
+    "numba",
+    "scipy",
+    "skimage",
+    "matplotlib",
+    "tifffile",
+    "torch",
+    "kornia",
+    "pycolmap",
+    "fsspec",
+    "aiohttp",
+    "s3fs",
+    "zarr",
+    "numcodecs",
+)
 COMMANDS = ["--help", "plugins list", "plugins show direct", "schema", "check scan.yaml"]
 HELP_SECONDS = 0.5
 ROOT = Path(__file__).parents[2]
@@ -61,6 +77,7 @@ def test_dir_of_lazy_package_lists_public_names(package: ModuleType) -> None:
         "import photonpano_opencv.hooks",
         "import photonpano_sensors.hooks",
         "import photonpano_simulator.hooks",
+        "import photonpano_zarr.hooks",
         "import photonpano.geometry",
         "import photonpano.photometry",
         "from photonpano.registry import discover; discover()",

@@ -1,0 +1,40 @@
+"""What this plugin contributes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from photonpano import Location, Recognised, SourceContribution, Url, hookimpl
+from photonpano.reading import objections
+from photonpano_zarr.configs import ZarrConfig
+from photonpano_zarr.source import opened, require_layout
+from photonpano_zarr.writing import write
+
+
+def _check(config: ZarrConfig) -> Sequence[str]:
+    return objections(require_layout, config)
+
+
+def _recognise(path: Location) -> Recognised | None:
+    """Take arrays that open without further keys."""
+    if path.suffix.lower() != ".zarr" and (isinstance(path, Url) or not (path / "zarr.json").is_file()):
+        return None
+    if _check(ZarrConfig(path=path)):
+        return None
+    return Recognised({"path": path}, "an array of packed frames of zarr version 3")
+
+
+@hookimpl
+def photonpano_sources() -> Iterator[SourceContribution]:
+    """Offer the source of zarr arrays."""
+    yield SourceContribution(
+        name="zarr",
+        summary="Binary frames in a zarr array, eight pixels to a byte, in a folder or an object store",
+        config=ZarrConfig,
+        build=lambda config, _: opened(config),
+        check=_check,
+        recognise=_recognise,
+        opens_urls=True,
+        suffixes=(".zarr",),
+        write=write,
+    )

@@ -1,0 +1,185 @@
+"""Open a zarr array of packed binary frames."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import FrameSpan, InputError, Location, Source, Url
+from photonpano.reading import (
+    BinarySource,
+    FrameFile,
+    FrameLayout,
+    PackedFileSource,
+    Pieces,
+    library,
+    other_order,
+    read_range,
+    reading,
+    sampled_spans,
+    unpacked_content,
+)
+from photonpano_zarr.configs import ZarrConfig
+from photonpano_zarr.metadata import Metadata, read_attributes, read_metadata
+
+_MOST_BYTES = 2 * 1024**3
+"""The largest chunk that is read: a larger one is a mistake, or damage."""
+
+
+def opened(config: ZarrConfig) -> Source:
+    """Open an array.
+
+    Raises:
+        InputError: it is missing, incomplete, or something else, or does not agree with the config.
+    """
+    array, (metadata, layout, frame_rate_hz) = config.path, read_layout(config)
+    if metadata.compressors or not metadata.has_whole_frames:
+        return _Chunks(array, metadata, layout, frame_rate_hz)
+    # Without compression, a chunk is a file of frames.
+    step, n_frames = metadata.chunk_shape[0], metadata.shape[0]
+    files = [
+        FrameFile(metadata.chunk(array, index), min(step, n_frames - index * step))
+        for index in range(metadata.chunks_of_frames)
+    ]
+    return PackedFileSource(files, layout, frame_rate_hz)
+
+
+def read_layout(config: ZarrConfig) -> tuple[Metadata, FrameLayout, float | None]:
+    """Return the metadata of an array, the layout of its frames, and their rate in Hz.
+
+    Raises:
+        InputError: as `opened`.
+    """
+    array, metadata = config.path, read_metadata(config.path)
+    own = read_attributes(array, metadata)
+    _, height, row_bytes = metadata.shape
+    width = config.width or (own.width if own else 8 * row_bytes)
+    if -(-width // 8) != row_bytes:
+        remedy = "correct the width" if config.width else "write the right width in the spec"
+        raise InputError(
+            f"{array} has rows of {row_bytes} bytes, which hold a width of {8 * row_bytes - 7} to {8 * row_bytes}, not "
+            f"{width}; {remedy}"
+        )
+    _require_whole(array, metadata)
+    layout = FrameLayout((height, width), (height, row_bytes), config.bit_order or (own.bit_order if own else "big"))
+    return metadata, layout, config.frame_rate_hz or (own.frame_rate_hz if own else None)
+
+
+def require_layout(config: ZarrConfig) -> None:
+    """Refuse an array that `opened` refuses, or that others wrote and whose frames show that they are packed in another way.
+
+    Raises:
+        InputError: it is so.
+    """
+    array, (metadata, _, _) = config.path, read_layout(config)
+    if config.bit_order is not None or read_attributes(array, metadata) is not None:
+        return
+    with opened(config) as source:
+        assert isinstance(source, BinarySource)
+        spans = sampled_spans(source.info.n_frames, metadata.shape[1] * metadata.shape[2])
+        samples = [source.packed(span) for span in spans]
+    if content := unpacked_content(samples):
+        raise InputError(
+            f"{array} is not packed: its values are {'0 and ' if content.holds == 'bits' else 'sums up to '}{content.highest}; "
+            "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)"
+        )
+    if other := other_order(samples):
+        along_width = other.order.packed_along == "width"
+        remedy = f"write bit_order: {other.order.bit_order}" if along_width else "pack frames along the width"
+        raise InputError(f"{array} is packed in another order: {other}; {remedy}, or write bit_order: big if it is right")
+
+
+def _require_whole(array: Location, metadata: Metadata) -> None:
+    """Refuse an array in a folder that lacks a chunk. Zarr itself would give zeros for it."""
+    if isinstance(array, Url):
+        return
+    sizes = None if metadata.compressors else int(np.prod(metadata.chunk_shape))
+    for index in range(metadata.chunks_of_frames):
+        for tile in metadata.tiles():
+            path = metadata.chunk(array, index, *tile)
+            assert isinstance(path, Path)
+            try:
+                size = path.stat().st_size
+            except OSError as error:
+                raise InputError(
+                    f"{array} is incomplete: there is no chunk {path.relative_to(array)}; copy it again, or write it with all "
+                    "chunks (write_empty_chunks)"
+                ) from error
+            if sizes not in (None, size):
+                raise InputError(f"{path} has {size:,} bytes, and a chunk has {sizes:,}; copy the array again")
+
+
+class _Chunks(BinarySource):
+    """Frames in chunks that are compressed, or contain parts of frames. A chunk is read whole, and the last ones are kept.
+
+    Raises:
+        InputError: when frames are read: a chunk is missing or damaged, or its codec is not installed.
+    """
+
+    def __init__(self, array: Location, metadata: Metadata, layout: FrameLayout, frame_rate_hz: float | None) -> None:
+        super().__init__(metadata.shape[0], layout, frame_rate_hz)
+        self._array, self._metadata = array, metadata
+        self._decoders = [_decoder(array, codec.name, codec.configuration) for codec in reversed(metadata.compressors)]
+        starts = range(0, metadata.shape[0], metadata.chunk_shape[0])
+        self._pieces = Pieces([*starts, metadata.shape[0]], self._frames, in_parts=False)
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span, chunk by chunk: see `BinarySource`."""
+        return self._pieces.of(span)
+
+    def _frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of one chunk along the axis of the frames: (n, rows, bytes of a row)."""
+        index, (_, height, width) = span.start // self._metadata.chunk_shape[0], self._metadata.chunk_shape
+        if self._metadata.has_whole_frames:
+            return self._chunk(index)[: len(span)]
+        frames = np.empty((len(span), *self._metadata.shape[1:]), np.uint8)
+        for row, column in self._metadata.tiles():
+            part = frames[:, row * height : (row + 1) * height, column * width : (column + 1) * width]
+            part[...] = self._chunk(index, row, column)[: part.shape[0], : part.shape[1], : part.shape[2]]
+        return frames
+
+    def _chunk(self, *place: int) -> NDArray[np.uint8]:
+        path, shape = self._metadata.chunk(self._array, *place), self._metadata.chunk_shape
+        data: Any = _content(path)
+        try:
+            for decode in self._decoders:
+                data = decode(data)
+            return np.frombuffer(data, np.uint8).reshape(shape)
+        except Exception as error:  # codecs raise nearly anything for damaged data
+            raise InputError(f"{path} is damaged: it cannot be decompressed to a chunk of {shape}; copy it again") from error
+
+    def close(self) -> None:
+        """Forget the chunks."""
+        super().close()
+        self._pieces.close()
+
+
+def _content(path: Location) -> bytes:
+    if isinstance(path, Url):
+        return read_range(path, 0, _MOST_BYTES)
+    with reading(path):
+        return path.read_bytes()
+
+
+def _decoder(array: Location, name: str, configuration: dict[str, Any]) -> Any:
+    """Return a function that takes back what a codec did to bytes."""
+    if name == "gzip":
+        return lambda data: zlib.decompress(data, wbits=31)
+    if name == "crc32c":
+        return _without_checksum
+    library("numcodecs", "photonpano[zarr]", f"{array}, compressed with {name},")
+    import numcodecs.blosc
+    import numcodecs.zstd
+
+    del configuration  # the compressed data contain it
+    return numcodecs.blosc.Blosc().decode if name == "blosc" else numcodecs.zstd.Zstd().decode
+
+
+def _without_checksum(data: Any) -> Any:
+    """Return data without the four bytes of their checksum, which no small library computes."""
+    return memoryview(data)[:-4]

@@ -1,0 +1,247 @@
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError, SourceContext, StreamInfo, Url, discover
+from photonpano_zarr import writing
+from photonpano_zarr.configs import ZarrConfig
+
+ZARR = discover().find("source", "zarr").contribution
+FRAMES = np.random.default_rng(0).integers(0, 2, (53, 6, 19), dtype=np.uint8)
+PACKED = np.packbits(FRAMES, axis=-1)
+
+
+def opened(path: Path, **keys: Any) -> Any:
+    return ZARR.build(ZarrConfig(path=path, **keys), SourceContext())
+
+
+def problem(path: Path, **keys: Any) -> str:
+    """Return what `check` says, which opening the array raises, too."""
+    (found,) = ZARR.check(ZarrConfig(path=path, **keys))
+    with pytest.raises(InputError) as caught:
+        opened(path, **keys)
+    assert str(caught.value) == found
+    return found.replace(str(path), path.name)
+
+
+@pytest.fixture
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Write an array in chunks of ten frames."""
+    monkeypatch.setattr(writing, "_CHUNK_BYTES", 10 * 6 * 3)
+
+    def written(compressed: bool = False, blocks: tuple[int, ...] = (7, 30)) -> Path:
+        if compressed:
+            pytest.importorskip("numcodecs", reason="compression needs photonpano[zarr]")
+        path = tmp_path / ("compressed.zarr" if compressed else "cube.zarr")
+        path.mkdir()
+        ZARR.write(path, StreamInfo(53, 6, 19, 96800), np.split(PACKED, blocks), compressed=compressed)
+        return path
+
+    return written
+
+
+def changed(path: Path, **entries: Any) -> Path:
+    metadata = json.loads((path / "zarr.json").read_text())
+    (path / "zarr.json").write_text(json.dumps(metadata | entries))
+    return path
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("blocks", [(), (10, 20), (1, 2, 3, 52), (7, 30)])
+def test_frames_are_those_that_were_written(written: Any, compressed: bool, blocks: tuple[int, ...]) -> None:
+    with opened(written(compressed, blocks)) as source:
+        assert source.info == StreamInfo(53, 6, 19, 96800)
+        for span in (FrameSpan(0, 53), FrameSpan(9, 11), FrameSpan(50, 53)):
+            np.testing.assert_array_equal(source.frames(span), FRAMES[span.start : span.stop])
+            np.testing.assert_array_equal(source.packed(span), PACKED[span.start : span.stop])
+            np.testing.assert_array_equal(source.counts(span), FRAMES[span.start : span.stop].sum(axis=0))
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_zarr_python_reads_what_is_written(written: Any, compressed: bool) -> None:
+    zarr = pytest.importorskip("zarr", reason="the other reader is not installed")
+    array = zarr.open_array(written(compressed), mode="r")
+    np.testing.assert_array_equal(array[:], PACKED)
+    assert array.chunks == (10, 6, 3)
+    assert array.attrs["photonpano"] == {
+        "version": 1,
+        "kind": "binary",
+        "width": 19,
+        "bit_order": "big",
+        "frame_rate_hz": 96800,
+    }
+
+
+@pytest.mark.parametrize("chunks", [(10, 6, 3), (10, 4, 2), (60, 6, 3), (1, 1, 1)])
+@pytest.mark.parametrize("codec", ["none", "zstd", "gzip", "blosc"])
+def test_arrays_of_zarr_python_are_read(tmp_path: Path, chunks: tuple[int, ...], codec: str) -> None:
+    zarr = pytest.importorskip("zarr", reason="the other writer is not installed")
+    codecs = {"none": None, "zstd": zarr.codecs.ZstdCodec(), "gzip": zarr.codecs.GzipCodec(), "blosc": zarr.codecs.BloscCodec()}
+    array = zarr.create_array(
+        tmp_path / "cube.zarr",
+        shape=PACKED.shape,
+        chunks=chunks,
+        dtype="uint8",
+        compressors=codecs[codec],
+        config={"write_empty_chunks": True},
+    )
+    array[:] = PACKED
+    with opened(tmp_path / "cube.zarr", width=19, frame_rate_hz=1000) as source:
+        assert source.info == StreamInfo(53, 6, 19, 1000)
+        np.testing.assert_array_equal(source.frames(FrameSpan(5, 53)), FRAMES[5:])
+
+
+def test_no_library_is_needed_without_compression(written: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, compressed = written(), written(compressed=True)
+    monkeypatch.setitem(sys.modules, "numcodecs", None)
+    with opened(plain) as source:
+        assert source.counts(FrameSpan(0, 53)).sum() == FRAMES.sum()
+    with pytest.raises(
+        InputError, match=r'compressed with zstd, needs numcodecs, which is not installed: pip install "photonpano\[zarr\]"'
+    ):
+        opened(compressed)
+    with pytest.raises(
+        InputError, match=r'compressing cube.zarr needs numcodecs, which is not installed: pip install "photonpano\['
+    ):
+        ZARR.write(plain, StreamInfo(53, 6, 19, None), [PACKED], compressed=True)
+
+
+def test_keys_of_a_spec_override_the_attributes(written: Any) -> None:
+    with opened(written(), width=20, frame_rate_hz=5.0, bit_order="little") as source:
+        assert (source.info.width, source.info.frame_rate_hz) == (20, 5)
+
+
+def test_missing_or_short_chunk_is_named_before_the_run(written: Any) -> None:
+    path = written()
+    (path / "c.3.0.0").write_bytes(b"short")
+    assert problem(path) == "cube.zarr/c.3.0.0 has 5 bytes, and a chunk has 180; copy the array again"
+    (path / "c.3.0.0").unlink()
+    assert problem(path) == (
+        "cube.zarr is incomplete: there is no chunk c.3.0.0; copy it again, or write it with all chunks (write_empty_chunks)"
+    )
+
+
+def test_damaged_chunk_is_named_when_it_is_read(written: Any) -> None:
+    path = written(compressed=True)
+    chunk = path / "c.3.0.0"
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    chunk.write_bytes(data)
+    with opened(path) as source:
+        source.counts(FrameSpan(0, 30))
+        with pytest.raises(
+            InputError, match=r"c\.3\.0\.0 is damaged: it cannot be decompressed to a chunk of \(10, 6, 3\); copy it again"
+        ):
+            source.counts(FrameSpan(29, 31))
+
+
+def test_wrong_metadata_are_refused_with_the_way_out(written: Any, tmp_path: Path) -> None:
+    path = written()
+    whole = json.loads((path / "zarr.json").read_text())
+    layout = "a capture is uint8 (frames, height, bytes of a row), as from numpy.packbits(cube, axis=-1)"
+    assert problem(changed(path, data_type="float32")) == f"cube.zarr holds float32 values, not bytes of eight pixels; {layout}"
+    assert problem(changed(path, **whole | {"shape": [53, 18]})) == f"cube.zarr has the shape (53, 18); {layout}"
+    assert problem(changed(path, **whole | {"shape": [0, 6, 3]})) == "cube.zarr is empty: its shape is (0, 6, 3)"
+    assert problem(changed(path, **whole), width=30) == (
+        "cube.zarr has rows of 3 bytes, which hold a width of 17 to 24, not 30; correct the width"
+    )
+    own = {"photonpano": {"version": 1, "width": 30}}
+    assert problem(changed(path, **whole | {"attributes": own})).endswith("not 30; write the right width in the spec")
+    newer = {"photonpano": {"version": 2}}
+    assert problem(changed(path, **whole | {"attributes": newer})) == (
+        "cube.zarr was written by a newer photonpano, as version 2; update this one"
+    )
+    damaged = {"photonpano": {"version": 1, "width": "wide"}}
+    assert problem(changed(path, **whole | {"attributes": damaged})).startswith(
+        "cube.zarr/zarr.json is wrong at attributes.photonpano.width: "
+    )
+    shards = [{"name": "sharding_indexed", "configuration": {}}]
+    assert problem(changed(path, **whole | {"codecs": shards})) == (
+        "cube.zarr has chunks that are regular, with the codecs sharding_indexed; captures are read from regular chunks with "
+        "the codecs bytes, zstd, blosc, gzip, crc32c: write it again without others, such as shards"
+    )
+    grid = {"name": "regular", "configuration": {"chunk_shape": [0, 6, 3]}}
+    assert "is wrong at chunk_grid: expected three sizes" in problem(changed(path, **whole | {"chunk_grid": grid}))
+    (path / "zarr.json").write_text("{")
+    assert problem(path).startswith("cube.zarr/zarr.json is wrong at its JSON: Invalid JSON")
+    (path / "zarr.json").unlink()
+    assert problem(path) == "cube.zarr is no zarr array: there is no zarr.json in it; name the folder of an array"
+    (path / ".zarray").write_text("{}")
+    assert problem(path) == (
+        "cube.zarr is zarr version 2, and captures are version 3; convert it with: zarr migrate v3 cube.zarr"
+    )
+    assert problem(tmp_path / "none.zarr") == "there is no folder none.zarr; check the path"
+
+
+def test_group_is_refused_with_the_names_of_its_arrays(written: Any) -> None:
+    path = written()
+    (path.parent / "zarr.json").write_text(json.dumps({"zarr_format": 3, "node_type": "group"}))
+    assert problem(path.parent).endswith("is a zarr group, not an array; name the array in it: cube.zarr")
+
+
+@pytest.fixture
+def foreign(tmp_path: Path) -> Any:
+    """Write an array as other programs do, without our attributes."""
+    zarr = pytest.importorskip("zarr", reason="the other writer is not installed")
+
+    def foreign(values: np.ndarray) -> Path:
+        path = tmp_path / "foreign.zarr"
+        array = zarr.create_array(path, shape=values.shape, chunks=(100, *values.shape[1:]), dtype=values.dtype, overwrite=True)
+        array[:] = values
+        return path
+
+    return foreign
+
+
+def test_arrays_of_others_are_looked_at(foreign: Any) -> None:
+    rng = np.random.default_rng(0)
+    clouds = np.exp(cv2.GaussianBlur(rng.standard_normal((64, 96)), (0, 0), 2.5) * 6)
+    frames = (rng.random((400, 64, 96)) < 1 - np.exp(-0.3 * clouds)).astype(np.uint8)
+    (bits,) = ZARR.check(ZarrConfig(path=foreign(frames)))
+    assert bits.endswith(
+        "is not packed: its values are 0 and 1; pack frames of zeros and ones with numpy.packbits(cube, axis=-1)"
+    )
+    assert ZARR.check(ZarrConfig(path=foreign(np.packbits(frames, axis=-1)))) == ()
+    path = foreign(np.packbits(frames, axis=-1, bitorder="little"))
+    (little,) = ZARR.check(ZarrConfig(path=path))
+    assert "is packed in another order: pixels correlate by" in little
+    assert little.endswith("; write bit_order: little, or write bit_order: big if it is right")
+    assert ZARR.check(ZarrConfig(path=path, bit_order="little")) == ()
+
+
+def test_recognises_arrays_and_nothing_else(written: Any, tmp_path: Path) -> None:
+    path = written()
+    found = ZARR.recognise(path)
+    assert found is not None
+    assert found.keys == {"path": path}
+    for other in (tmp_path, path / "zarr.json", tmp_path / "none.zarr", Url("http://127.0.0.1:1/cube.npy")):
+        assert ZARR.recognise(other) is None
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_arrays_are_read_over_http(written: Any, compressed: bool, file_server: Any) -> None:
+    path = written(compressed)
+    with file_server(path.parent) as server, opened(Url(f"{server.address}/{path.name}")) as source:
+        np.testing.assert_array_equal(source.frames(FrameSpan(7, 53)), FRAMES[7:])
+    (path / "c.0.0.0").unlink()
+    with file_server(path.parent) as server, opened(Url(f"{server.address}/{path.name}")) as source:
+        source.counts(FrameSpan(10, 53))
+        with pytest.raises(InputError, match=rf"there is no {server.address}/{path.name}/c.0.0.0; check the server"):
+            source.counts(FrameSpan(0, 5))
+
+
+def test_wrong_urls_are_refused(written: Any, file_server: Any) -> None:
+    path = written()
+    with file_server(path.parent) as server:
+        (missing,) = ZARR.check(ZarrConfig(path=Url(f"{server.address}/none.zarr")))
+        assert missing == f"there is no {server.address}/none.zarr/zarr.json; check the server or bucket, and the path"
+        (path / "zarr.json").rename(path / ".zarray")
+        (old,) = ZARR.check(ZarrConfig(path=Url(f"{server.address}/cube.zarr")))
+        assert "is zarr version 2" in old
