@@ -257,7 +257,7 @@ class SourceContribution(Contribution):
             reads names, sizes and a few megabytes at most, imports nothing heavy, and raises nothing.
         write: writes binary frames as a capture that this source reads, for `photonpano convert` to a name with one of its
             `suffixes`; None if it cannot.
-        opens_urls: whether its path may be a `photonpano.Url`: it is a `SpecLocation`, and `recognise` gets one as well.
+        recognises_urls: whether `recognise` also gets a `photonpano.Url`, which a path of the type `SpecLocation` may be.
         suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
             the message has the problems of the sources with its ending.
     """
@@ -267,7 +267,7 @@ class SourceContribution(Contribution):
     check: Callable[[Any], Sequence[str]] = no_problems
     recognise: Callable[[Any], Recognised | None] = _not_ours
     write: WriteFrames | None = None
-    opens_urls: bool = False
+    recognises_urls: bool = False
     suffixes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

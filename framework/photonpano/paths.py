@@ -88,6 +88,11 @@ def location(text: str | Path | Url) -> Location:
     return Path(text) if found is None else Url(f"{found[1]}://{found[2]}")
 
 
+def as_written(place: Location) -> str:
+    """Return a path or URL as a spec names it: a URL with its secrets."""
+    return place.address if isinstance(place, Url) else str(place)
+
+
 def given_path(path: Path) -> Path:
     """Return a path that a user has written, with its home folder filled in.
 

@@ -31,6 +31,7 @@ from photonpano.reading import (
     NpyHeader,
     OpenFiles,
     Pieces,
+    as_written,
     frames_are_last,
     gzipped_npy_header,
     is_gzip,
@@ -294,7 +295,7 @@ def _recognise(path: Location) -> Recognised | None:
         return None
     if content is None or content.holds != "bits":
         return None
-    keys = {"path": path, "holds": "bits"}
+    keys = {"path": as_written(path), "holds": "bits"}
     because = f"{header.dtype} of shape {header.shape} in a .npy file, with the values 0 and {content.highest} only"
     if not _frames_are_last(path, header):
         return Recognised(keys, because)
@@ -308,6 +309,6 @@ NPY = SourceContribution(
     build=lambda config, _: _open(config),
     check=_check,
     recognise=_recognise,
-    opens_urls=True,
+    recognises_urls=True,
     suffixes=(".npy", ".gz"),
 )

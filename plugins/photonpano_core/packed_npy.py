@@ -17,6 +17,7 @@ from photonpano.reading import (
     NpyHeader,
     PackedFileSource,
     PixelOrder,
+    as_written,
     gzipped_npy_header,
     is_gzip,
     npy_header,
@@ -215,7 +216,7 @@ def _recognise(path: Location) -> Recognised | None:
     if found is None:
         return None
     (header, _), channel = found
-    keys: dict[str, Any] = {"path": path} | channel.keys
+    keys: dict[str, Any] = {"path": as_written(path)} | channel.keys
     because = f"uint8 of shape {header.shape} in a .npy file{channel.clause}"
     samples = _samples(path, header, channel.keys.get("channel"))
     if not samples:
@@ -234,6 +235,6 @@ PACKED_NPY = SourceContribution(
     build=lambda config, _: _open(config),
     check=_check,
     recognise=_recognise,
-    opens_urls=True,
+    recognises_urls=True,
     suffixes=(".npy", ".gz"),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from photonpano import Location, Recognised, SourceContribution, Url, hookimpl
-from photonpano.reading import objections
+from photonpano.reading import as_written, objections
 from photonpano_zarr.configs import ZarrConfig
 from photonpano_zarr.source import opened, require_layout
 from photonpano_zarr.writing import write
@@ -21,7 +21,7 @@ def _recognise(path: Location) -> Recognised | None:
         return None
     if _check(ZarrConfig(path=path)):
         return None
-    return Recognised({"path": path}, "an array of packed frames of zarr version 3")
+    return Recognised({"path": as_written(path)}, "an array of packed frames of zarr version 3")
 
 
 @hookimpl
@@ -34,7 +34,7 @@ def photonpano_sources() -> Iterator[SourceContribution]:
         build=lambda config, _: opened(config),
         check=_check,
         recognise=_recognise,
-        opens_urls=True,
+        recognises_urls=True,
         suffixes=(".zarr",),
         write=write,
     )

@@ -12,6 +12,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import photonpano
+from photonpano.reading.remote import LIBRARIES
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -47,6 +48,8 @@ def test_every_extra_is_what_a_component_asks_for() -> None:
     """What is said of a missing library, `pip install "photonpano[kornia]"`, names an extra that there is, and none is idle."""
     rows = [entry for entry in photonpano.discover().rows if entry.origin.plugin == "photonpano"]
     asked = {requirement.install for entry in rows for requirement in entry.contribution.requires}
+    asked |= {install for _, install in LIBRARIES.values() if install.startswith("photonpano[")}
+    asked.add("photonpano[zarr]")  # for compressed arrays alone
     extras = {f"photonpano[{name}]" for name in PROJECT["project"]["optional-dependencies"] if name not in ("dev", "testing")}
     assert asked == extras
 

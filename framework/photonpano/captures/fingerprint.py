@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 from pydantic import BaseModel
@@ -26,13 +26,13 @@ class FileRecord(TypedDict):
     """A file that the source or a correction reads, or a folder of them.
 
     `bytes` is the size of all its files, `modified` the latest of their times, ISO 8601 in UTC; None where there is none.
-    `etag` is the mark that a server gives the content of a URL; other files have none.
+    `etag` is the mark that a server gives the content of a URL; None for other files.
     """
 
     path: str
     bytes: int | None
     modified: str | None
-    etag: NotRequired[str | None]
+    etag: str | None
 
 
 class CaptureRecord(TypedDict):
@@ -128,11 +128,11 @@ def _paths(value: Any) -> Iterator[Location]:
 def _file(path: Path, suffixes: tuple[str, ...]) -> FileRecord:
     stats = [file.stat() for file in _files(path, suffixes) if file.is_file()]
     if not stats:
-        return {"path": str(path), "bytes": None, "modified": None}
+        return {"path": str(path), "bytes": None, "modified": None, "etag": None}
     latest = max(stat.st_mtime_ns for stat in stats)
     seconds = datetime.fromtimestamp(latest // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     size = sum(stat.st_size for stat in stats)
-    return {"path": str(path), "bytes": size, "modified": f"{seconds}.{latest % 10**9:09d}Z"}
+    return {"path": str(path), "bytes": size, "modified": f"{seconds}.{latest % 10**9:09d}Z", "etag": None}
 
 
 def _remote(url: Url) -> FileRecord:
@@ -140,7 +140,7 @@ def _remote(url: Url) -> FileRecord:
     try:
         found = remote_file(url)
     except InputError:
-        return {"path": str(url), "bytes": None, "modified": None}
+        return {"path": str(url), "bytes": None, "modified": None, "etag": None}
     modified = None if found.modified is None else found.modified.strftime("%Y-%m-%dT%H:%M:%SZ")
     return {"path": str(url), "bytes": found.size, "modified": modified, "etag": found.etag}
 

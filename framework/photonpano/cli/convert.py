@@ -19,7 +19,7 @@ def convert(
     corrections: Corrections = None,
     compress: Annotated[bool, typer.Option("--compress", help="Compress the chunks of a zarr array.")] = False,
 ) -> None:
-    """Convert a capture of binary frames to a packed .npy file, or to a zarr array.
+    """Convert binary frames to a packed .npy file or a zarr array.
 
     Eight pixels are packed into a byte. The only corrections are those of --correct, or of the spec. If the conversion to a
     .npy file is interrupted, the frames written so far stay in CUBE.npy.part, and the same command continues from there. A zarr

@@ -1,5 +1,6 @@
 """What sources share that read captures from files: packed frames, .npy headers, arrays, files in order."""
 
+from photonpano.paths import as_written
 from photonpano.reading.array_content import Content, frames_are_last, packed_frames_are_last, unpacked_content
 from photonpano.reading.arrays import read_array, read_arrays, read_picture
 from photonpano.reading.binary_source import BinarySource
@@ -45,6 +46,7 @@ __all__ = [
     "Pieces",
     "PixelOrder",
     "SingleFrameSource",
+    "as_written",
     "bayer_array",
     "files_in",
     "frames_are_last",

@@ -14,11 +14,11 @@ from photonpano.errors import InputError, PhotonpanoError
 from photonpano.paths import Url
 from photonpano.text import install_line
 
-_LIBRARIES = {
+LIBRARIES = {
     "s3": ("s3fs", "photonpano[s3]"),
     "s3a": ("s3fs", "photonpano[s3]"),
-    "gs": ("gcsfs", "photonpano[gs]"),
-    "gcs": ("gcsfs", "photonpano[gs]"),
+    "gs": ("gcsfs", "gcsfs"),
+    "gcs": ("gcsfs", "gcsfs"),
     "http": ("aiohttp", "photonpano[http]"),
     "https": ("aiohttp", "photonpano[http]"),
 }
@@ -128,7 +128,7 @@ def remote_files_in(url: Url, suffix: str) -> list[Url]:
 
 def _file_system(url: Url) -> tuple[Any, str]:
     """Return the file system of fsspec for a URL, which is kept for the next call, and the path in it."""
-    module, install = _LIBRARIES.get(url.scheme, ("fsspec", "photonpano[http]"))
+    module, install = LIBRARIES.get(url.scheme, ("fsspec", "photonpano[http]"))
     library(module, install, str(url))
     fsspec = library("fsspec", install, str(url))
     if url.scheme not in fsspec.available_protocols():

@@ -104,12 +104,12 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
             # The path is named once; each line begins with its last part.
-            near = dict(_near_misses(spec, written, path))
-            lines = [f"{name}: {line.replace(str(path), path.name or str(path), 1)}" for line, name in near.items()]
+            near = list(_near_misses(spec, written, path))
+            lines = [f"{name}: {line.replace(str(path), path.name or str(path), 1)}" for name, line in near]
             lines = [*(lines or _known_endings(spec.catalog)), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
-            if isinstance(path, Url) and len(near) == 1:  # all say the same, such as that there is nothing
-                (message,) = near
+            if isinstance(path, Url) and len({line for _, line in near}) == 1:  # such as that there is nothing
+                message = near[0][1]
         spec.wrong(f"{keys}.path", message)
         return None
     for failure in failures:
@@ -132,7 +132,7 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
     for entry in catalog.rows:
         if not isinstance(entry.contribution, SourceContribution):
             continue
-        if isinstance(path, Url) and not entry.contribution.opens_urls:
+        if isinstance(path, Url) and not entry.contribution.recognises_urls:
             continue
         try:
             answer = entry.contribution.recognise(path)
@@ -155,7 +155,7 @@ def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Location) -> 
     """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept.
 
     Returns:
-        Each problem, with the name of the source.
+        The name of the source, and the problem.
     """
     files = [path] if isinstance(path, Url) or path.is_file() else islice(path.rglob("*"), _SEARCHED)
     endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}
@@ -165,7 +165,7 @@ def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Location) -> 
             continue
         if contribution.suffixes and not endings & {*contribution.suffixes}:
             continue
-        if isinstance(path, Url) and not contribution.opens_urls:
+        if isinstance(path, Url) and not contribution.recognises_urls:
             continue
         try:
             config = validate(contribution.config, written, "", replace(spec, problems=[]))
@@ -174,7 +174,7 @@ def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Location) -> 
                 raise
             config = None
         if config is not None:
-            yield from ((each, entry.name) for each in complaints(Choice(contribution, config, entry.origin)))
+            yield from ((entry.name, each) for each in complaints(Choice(contribution, config, entry.origin)))
 
 
 def _known_endings(catalog: Catalog) -> list[str]:
