@@ -109,7 +109,7 @@ class LocalFlowConfig(Config):
         description="difference of the parts, in standard deviations of the photon noise, above which a pixel moves by itself",
     )
     tolerated_px: float = Field(
-        0.2, ge=0, le=8, description="error of the global motion, in px of a frame, that does not count as such a difference"
+        0.3, ge=0, le=8, description="error of the global motion, in px of a frame, that does not count as such a difference"
     )
     tolerance_px: Tolerance = 0.5
 

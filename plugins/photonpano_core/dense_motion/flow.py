@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import Image, MotionField
-from photonpano_core.dense_motion.polynomials import fit_each
+from photonpano_core.dense_motion.polynomials import add_moments, fit_each
 from photonpano_core.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures, blurred
 
 _ROUNDS = 3, 9, 17
@@ -117,11 +117,7 @@ def _fitted(times: list[float], flows: list[Image], trusts: list[Image], degree:
     moments = np.zeros((2 * degree - 1, *moving.shape), np.float32)
     right = np.zeros((degree, *moving.shape, 2), np.float32)
     for time, flow, trust in zip(times, flows, trusts, strict=True):
-        for d in range(len(moments)):
-            moments[d] += np.float32(time ** (d + 2)) * trust
-        trusted = trust[..., None] * flow
-        for d in range(degree):
-            right[d] += np.float32(time ** (d + 1)) * trusted
+        add_moments(np.float32(time), flow, trust, moments, right)
     for each in (*moments, *right):
         each[...] = blurred(each, _SMOOTHING_PX * SCALE)
     coefficients = np.zeros_like(right)

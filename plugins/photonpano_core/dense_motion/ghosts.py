@@ -18,6 +18,10 @@ _WINDOW_PX = 2.0
 """Standard deviation of the window over which differences are summed up, in px of a frame."""
 _SMALLEST_PX = 16
 """Fewer connected pixels, of a frame, are a false alarm: less than the window."""
+_WEAKER = 0.6
+"""Share of the threshold from which on a pixel moves if it is connected with one that exceeds the threshold."""
+_GAP_PX = 6
+"""Radius of the disc by which gaps are closed, in px of a frame: where texture is missing, nothing shows that it moves."""
 _FEWEST = 0.5
 """Fewest degrees of freedom, on average over the window, of a pixel that is tested."""
 
@@ -32,7 +36,8 @@ class GhostMap:
     Attributes:
         significance: (H, W) float32, at least 0: by how many standard deviations of photon noise the sub-exposures differ from
             each other; 0 where fewer than two saw a pixel.
-        moving: (H, W) bool, where it exceeds the threshold, over an area of some pixels.
+        moving: (H, W) bool, where it exceeds the threshold, over an area of some pixels, with connected pixels of slightly less
+            significance, and gaps between these.
     """
 
     significance: Image
@@ -70,7 +75,20 @@ def compared(parts: SubExposures, n: int, threshold: float, tolerated_px: float)
     spread = np.float32(2 / 9 * correlated) / freedom
     significance = np.maximum((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread), 0)
     significance = np.where(freedom > _FEWEST, significance, np.float32(0)).astype(np.float32)
-    return GhostMap(significance, _without_specks(significance > threshold, _SMALLEST_PX * SCALE**2))
+    return GhostMap(significance, _moving(significance, threshold))
+
+
+def _moving(significance: Image, threshold: float) -> BoolArray:
+    """Return the pixels that move: see `GhostMap`."""
+    likely = (significance > _WEAKER * threshold).astype(np.uint8)
+    _, labels, _, _ = cv2.connectedComponentsWithStats(likely, connectivity=8)
+    certain = _without_specks(significance > threshold, _SMALLEST_PX * SCALE**2)
+    found = np.isin(labels, np.unique(labels[certain])) & (likely > 0)
+    gap = round(_GAP_PX * SCALE)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * gap + 1, 2 * gap + 1))
+    # Gaps at the border of the image are closed as well.
+    padded = cv2.copyMakeBorder(found.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[gap:-gap, gap:-gap] > 0)
 
 
 def _without_specks(found: BoolArray, smallest: float) -> BoolArray:

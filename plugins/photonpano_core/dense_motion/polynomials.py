@@ -9,6 +9,40 @@ from photonpano.compiling import compiled
 
 
 @compiled
+def add_moments(
+    time: np.float32,
+    value: NDArray[np.float32],
+    trust: NDArray[np.float32],
+    moments: NDArray[np.float32],
+    right: NDArray[np.float32],
+) -> None:
+    """Add the values of pixels at a time to the sums from which `fit_each` fits polynomials.
+
+    Args:
+        time: of the values.
+        value: (H, W, 2), x and y.
+        trust: (H, W), weights.
+        moments: (2 D - 1, H, W) sums that are added to.
+        right: (D, H, W, 2) sums that are added to.
+    """
+    for row in range(trust.shape[0]):
+        weights, xy = trust[row], value[row]
+        power = time
+        for d in range(len(moments)):
+            power *= time
+            to = moments[d, row]
+            for i in range(len(to)):
+                to[i] += power * weights[i]
+        power = np.float32(1)
+        for d in range(len(right)):
+            power *= time
+            into = right[d, row]
+            for i in range(len(into)):
+                into[i, 0] += power * weights[i] * xy[i, 0]
+                into[i, 1] += power * weights[i] * xy[i, 1]
+
+
+@compiled
 def fit_each(
     moments: NDArray[np.float32], right: NDArray[np.float32], prior: float, where: NDArray[np.bool_], found: NDArray[np.float32]
 ) -> None:
