@@ -191,7 +191,7 @@ def test_changes_at_a_url_are_seen(server: Any, cube: Path) -> None:
     assert changes(before, now()) == [f"{server.address}/cube.npy has another content, by its ETag"]
 
 
-def test_run_at_a_url_continues_and_records_no_secrets(
+def test_finished_run_at_a_url_is_taken_while_unchanged_and_records_no_secrets(
     server: Any, cube: Path, small_capture: Path, small_spec: dict[str, Any], tmp_path: Path
 ) -> None:
     cube.write_bytes(small_capture.read_bytes())
@@ -204,5 +204,10 @@ def test_run_at_a_url_continues_and_records_no_secrets(
     texts = [path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert not any(b"secret" in text for text in texts)
     assert record["capture"]["files"][0]["path"] == f"{server.address}/cube.npy"
+    assert run(plan, resume=True).was_finished
+    frames = np.load(small_capture)
+    frames[0] ^= 0xFF
+    np.save(cube, frames)
+    assert not run(plan, resume=True).was_finished, "the capture has changed"
     default = parse_spec(small_spec, overrides=[f"source.with.path={secret}"]).output.directory
     assert default.name == f"spec-{server.address[7:]}-cube"
