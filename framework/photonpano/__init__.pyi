@@ -26,6 +26,8 @@ from .api.video import Video as Video
 from .api.video import video as video
 from .context import Progress as Progress
 from .contributions import Config as Config
+from .contributions import ExecutorContext as ExecutorContext
+from .contributions import ExecutorContribution as ExecutorContribution
 from .contributions import ExporterContribution as ExporterContribution
 from .contributions import InterpolatorContribution as InterpolatorContribution
 from .contributions import LocatorContribution as LocatorContribution
@@ -52,6 +54,7 @@ from .errors import SpecError as SpecError
 from .evaluation import Evaluation as Evaluation
 from .evaluation import PoseScore as PoseScore
 from .evaluation import evaluate_poses as evaluate_poses
+from .execution import Executor as Executor
 from .hookspecs import hookimpl as hookimpl
 from .paths import Location as Location
 from .paths import Url as Url

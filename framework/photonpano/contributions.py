@@ -23,6 +23,7 @@ from pydantic import (
 from pydantic_core import core_schema
 
 from photonpano.errors import CaptureUnreadError
+from photonpano.execution import CaptureElsewhere, Executor
 from photonpano.paths import Location, Url, given_path, location, refusal
 from photonpano.protocols import Exporter, Interpolator, Locator, Merger, PoseEstimator, Refiner, Renderer, Resampler, Source
 from photonpano.text import install_line
@@ -388,3 +389,27 @@ class PoseEstimatorContribution(StageContribution):
 
     kind: ClassVar[str] = "pose-estimator"
     build: Callable[[Any, StageContext], PoseEstimator]
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorContext:
+    """The run for which an executor is built.
+
+    Attributes:
+        threads: the number of threads of the run.
+        capture: what stands for the capture in tasks of other processes.
+        versions: what each worker must have alike, by its name: photonpano, the plugins of the run, and the libraries that its
+            results depend on. It can be called in any process.
+    """
+
+    threads: int
+    capture: CaptureElsewhere
+    versions: Callable[[], Mapping[str, str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutorContribution(Contribution):
+    """Offers an executor. Experimental: the record may change with any version."""
+
+    kind: ClassVar[str] = "executor"
+    build: Callable[[Any, ExecutorContext], Executor]

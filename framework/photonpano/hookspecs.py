@@ -18,6 +18,7 @@ from typing import Any
 import pluggy
 
 from photonpano.contributions import (
+    ExecutorContribution,
     ExporterContribution,
     InterpolatorContribution,
     LocatorContribution,
@@ -373,6 +374,49 @@ def photonpano_pose_estimators() -> Iterable[PoseEstimatorContribution]:  # type
                 summary="Finds no pose at all",
                 config=NeverFoundConfig,
                 build=lambda config, context: NeverFound(),
+            )
+        ```
+    """
+
+
+@hookspec
+def photonpano_executors() -> Iterable[ExecutorContribution]:  # type: ignore[empty-body]
+    """Offer executors: they work on the tasks of a run, such as those of a level. Experimental.
+
+    One for other processes is a `photonpano.execution.Remote` around something that passes tasks on: see `Workers`.
+
+    Example:
+        ```python
+        from photonpano import Config, ExecutorContribution, hookimpl
+
+
+        class OneByOne:
+            under_way = 1
+
+            def share(self, value):
+                return value
+
+            def call(self, work, *given):
+                return work(*given)
+
+            def keep(self, work, *given):
+                return work(*given)
+
+            def close(self):
+                pass
+
+
+        class OneByOneConfig(Config):
+            pass
+
+
+        @hookimpl
+        def photonpano_executors():
+            yield ExecutorContribution(
+                name="one-by-one",
+                summary="Works on one task after the other",
+                config=OneByOneConfig,
+                build=lambda config, context: OneByOne(),
             )
         ```
     """

@@ -16,6 +16,11 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
+def interrupted() -> bool:
+    """Return whether a signal has interrupted the program, which then ends."""
+    return bool(_noted)
+
+
 def interrupted_by() -> int:
     """Return the number of the signal that has interrupted the program first; that of Ctrl-C if none was noted."""
     return _noted[0] if _noted else signal.SIGINT

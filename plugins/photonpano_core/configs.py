@@ -176,3 +176,7 @@ class ExrConfig(Config):
 
 class RadianceConfig(Config):
     """A Radiance picture."""
+
+
+class ThreadsConfig(Config):
+    """`threads`, the executor, has no keys."""

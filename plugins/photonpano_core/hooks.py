@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 from photonpano import (
+    ExecutorContribution,
     ExporterContribution,
     InterpolatorContribution,
     MergerContribution,
@@ -31,6 +32,7 @@ from photonpano_core.configs import (
     SplatConfig,
     StratifiedConfig,
     SuperResolutionConfig,
+    ThreadsConfig,
 )
 from photonpano_core.constant_groups import ConstantGroupsResampler
 from photonpano_core.group_size import AutoResampler
@@ -44,7 +46,18 @@ from photonpano_core.stratified import StratifiedResampler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from photonpano import Exporter, Interpolator, Merger, Refiner, Renderer, Resampler, StageContext, StreamInfo
+    from photonpano import (
+        Executor,
+        ExecutorContext,
+        Exporter,
+        Interpolator,
+        Merger,
+        Refiner,
+        Renderer,
+        Resampler,
+        StageContext,
+        StreamInfo,
+    )
 
 Grouped = TypeVar("Grouped", bound=GroupedConfig)
 
@@ -304,6 +317,23 @@ def photonpano_exporters() -> Iterator[ExporterContribution]:
         suffix=".hdr",
         build=_radiance,
     )
+
+
+@hookimpl
+def photonpano_executors() -> Iterator[ExecutorContribution]:
+    """Offer the threads of this process."""
+    yield ExecutorContribution(
+        name="threads",
+        summary="Threads of this process, as many as run.threads says",
+        config=ThreadsConfig,
+        build=_threads,
+    )
+
+
+def _threads(_: ThreadsConfig, context: ExecutorContext) -> Executor:
+    from photonpano.execution import Here
+
+    return Here(context.threads)
 
 
 def _exr(config: ExrConfig, _: StageContext) -> Exporter:

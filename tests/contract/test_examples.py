@@ -64,6 +64,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "visionsim": UNREFINED,
     "zarr": UNREFINED | {"resample.with.group_size": 50},
     "vanvleck": UNREFINED | {"resample.with.group_size": 50},
+    "cluster": UNREFINED | {"levels": 2},
     "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
     "colour": SMALL_STREET | UNREFINED | {"resample.with.group_size": 60},
@@ -90,7 +91,14 @@ RUNS: dict[str, dict[str, Any]] = {
 """Specs to run, with overrides that make them small."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
-NEEDS = {"colmap": "pycolmap", "poses": "pycolmap", "stratified-poses": "gtsam", "high-speed-video": "av", "kornia": "kornia"}
+NEEDS = {
+    "cluster": "distributed",
+    "colmap": "pycolmap",
+    "poses": "pycolmap",
+    "stratified-poses": "gtsam",
+    "high-speed-video": "av",
+    "kornia": "kornia",
+}
 """Optional libraries of specs, which run only if the library is installed."""
 REPORTS = {"scan", "revisits", "high-speed-video"}
 """Specs whose reports are drawn; those of others show no more."""

@@ -30,6 +30,7 @@ KINDS = {
     "photonpano_renderers": ("renderer", "nearest-pixel"),
     "photonpano_exporters": ("exporter", "pgm"),
     "photonpano_pose_estimators": ("pose-estimator", "never-posed"),
+    "photonpano_executors": ("executor", "one-by-one"),
 }
 
 
@@ -87,6 +88,14 @@ def test_stage_example_locates_all_exposures(section: str, small_spec: dict[str,
     record = run(plan).record
     assert {"stage": section, "use": name, "plugin": f"example_of_{hook}", "version": "unreleased"} in record["plugins"]
     assert record["levels"][0]["located"] == 6
+
+
+def test_executor_example_has_the_same_results(small_spec: dict[str, Any], tmp_path: Path) -> None:
+    catalog = discover().including(example_of("photonpano_executors"))
+    for name, settings in (("threads", {}), ("one by one", {"executor": "one-by-one"})):
+        run(parse_spec(small_spec | {"run": settings, "levels": 1}, output=tmp_path / name, catalog=catalog))
+    for file in ("trajectory.npz", "panorama.tiff"):
+        assert (tmp_path / "one by one" / file).read_bytes() == (tmp_path / "threads" / file).read_bytes()
 
 
 def test_merger_example_masks_invalid_pixels(memory_source: type) -> None:

@@ -29,6 +29,7 @@ class KindName(StrEnum):
     RENDERER = "renderer"
     EXPORTER = "exporter"
     POSE_ESTIMATOR = "pose-estimator"
+    EXECUTOR = "executor"
 
 
 _KIND_NAMES = ", ".join(KindName)

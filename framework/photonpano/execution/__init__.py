@@ -2,5 +2,6 @@
 
 from photonpano.execution.here import Here
 from photonpano.execution.protocol import Executor
+from photonpano.execution.remote import CaptureElsewhere, Pending, Remote, Workers
 
-__all__ = ["Executor", "Here"]
+__all__ = ["CaptureElsewhere", "Executor", "Here", "Pending", "Remote", "Workers"]

@@ -1,4 +1,4 @@
-"""The executor of a single machine: tasks are worked on by the threads that ask for it."""
+"""The executor of a single process: tasks are worked on by the threads that ask for it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ ResultT = TypeVar("ResultT")
 class Here:
     """Works on each task in the thread that calls; see `Executor`."""
 
+    def __init__(self, threads: int = 1) -> None:
+        """Take the number of threads of the run."""
+        self.under_way = threads
+
     def share(self, value: ValueT) -> ValueT:
         """Return the value itself."""
         return value
@@ -23,3 +27,6 @@ class Here:
     def keep(self, work: Callable[..., tuple[ValueT, ResultT]], *given: Any) -> tuple[ValueT, ResultT]:
         """Work on a task with two results."""
         return work(*given)
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonpano.captures.part import part_of
 from photonpano.contributions import (
+    ExecutorContext,
     ExporterContribution,
     PartOfCapture,
     RendererContribution,
@@ -56,8 +57,8 @@ def open_source(plan: Plan) -> Iterator[Source]:
         InputError: the capture cannot be used as it is.
         SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
     """
-    built = build_source(plan)
-    with without_still_pixels(built) if plan.corrects_itself else built as source:
+    opened = build_source(plan)
+    with without_still_pixels(opened) if plan.corrects_itself else opened as source:
         problems = check_stream(plan, source.info)
         if plan.render.white_balance != "none" and not isinstance(source, ColouredSource):
             message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
@@ -76,8 +77,8 @@ def build_source(plan: Plan) -> Source:
         SpecError: a correction does not suit the capture, or its file is not what it should be.
     """
     try:
-        built = _built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
-        source = _part(plan, attributed(built, plan.source.label))
+        opened = built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
+        source = _part(plan, attributed(opened, plan.source.label))
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
@@ -131,7 +132,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
         for known, value in made:
             if known.contribution is choice.contribution and known.config == choice.config:
                 return value
-        value = _built(choice, context)
+        value = built(choice, context)
         made.append((choice, value))
         return value
 
@@ -162,7 +163,7 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
     from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
 
     context = _stage_context(plan, source, decisions)
-    return tuple(NamedRefiner(choice.contribution.name, _built(choice, context), choice.label) for choice in plan.refine)
+    return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
 
 
 def build_renderer(
@@ -189,7 +190,7 @@ def build_renderer(
             "the frames that saw it; render with {use: merge} to divide by it"
         )
     any_canvas = contribution.renders_on_any_canvas
-    return AttributedRenderer(_built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
+    return AttributedRenderer(built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
 
 
 def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
@@ -206,7 +207,7 @@ def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tu
     exporters = []
     for choice in plan.formats:
         assert isinstance(choice.contribution, ExporterContribution)
-        exporters.append(AttributedExporter(_built(choice, context), choice.label, choice.contribution.suffix))
+        exporters.append(AttributedExporter(built(choice, context), choice.label, choice.contribution.suffix))
     return tuple(exporters)
 
 
@@ -222,7 +223,7 @@ def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) 
 
     assert plan.pose is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
-    estimator: PoseEstimator = _built(plan.pose, _stage_context(plan, source, decisions, capture))
+    estimator: PoseEstimator = built(plan.pose, _stage_context(plan, source, decisions, capture))
     return estimator
 
 
@@ -249,7 +250,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     context = StageContext(source.info, source.response, plan.run.seed)
     foreseen: list[tuple[Group, ...] | str] = []
     for number, level in enumerate(plan.levels, start=1):
-        resampler: Resampler = _built(level.resample, context)
+        resampler: Resampler = built(level.resample, context)
         try:
             with attributing(level.resample.label, f"level {number}"):
                 foreseen.append(require_groups(resampler.groups(source.info.n_frames, number), source.info.n_frames))
@@ -266,7 +267,7 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     """
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
-    resampler: Resampler = _built(choice, _stage_context(plan, source, decisions, lambda: capture))
+    resampler: Resampler = built(choice, _stage_context(plan, source, decisions, lambda: capture))
     with attributing(choice.label, "level 1"):
         require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
     return decisions
@@ -336,15 +337,20 @@ def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:
         yield (name if seen[name] == 1 else f"{name} {seen[name]}"), choice
 
 
-def _built(choice: Choice, context: SourceContext | StageContext) -> Any:
+def built(choice: Choice, context: SourceContext | StageContext | ExecutorContext) -> Any:
+    """Build a component.
+
+    Raises:
+        PluginError: a library is missing, or the plugin failed in its own way.
+    """
     contribution = choice.contribution
     who = choice.label
     for requirement in contribution.requires:
         if importlib.util.find_spec(requirement.module) is None:
             raise PluginError(f"{who} needs {requirement.module}, which is not installed: {install_command([requirement])}")
     try:
-        built = contribution.build(choice.config, context)
-        lacking = [name for name in KINDS[contribution.kind].methods if not callable(getattr(built, name, None))]
+        component = contribution.build(choice.config, context)
+        lacking = [name for name in KINDS[contribution.kind].methods if not callable(getattr(component, name, None))]
     except PhotonpanoError:
         raise
     except BaseException as error:
@@ -352,5 +358,5 @@ def _built(choice: Choice, context: SourceContext | StageContext) -> Any:
             raise
         raise PluginError(f"{who} could not be built: {described(error)}") from error
     if lacking:
-        raise PluginError(f"{who} could not be built: build returned {shown(built)}, which has no {listed(lacking, 'nor')}")
-    return built
+        raise PluginError(f"{who} could not be built: build returned {shown(component)}, which has no {listed(lacking, 'nor')}")
+    return component

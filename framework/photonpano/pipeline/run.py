@@ -13,6 +13,7 @@ from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
 from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
+from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_run import run_poses
 from photonpano.pipeline.rendering import render_into
@@ -24,7 +25,6 @@ from photonpano.report import render_report
 from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
-from photonpano.threads import thread_count
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def run(
         poses, was_finished = run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keeps_work)
         return RunResult(plan.output.directory, poses, None, was_finished)
     observers = Observers(plan.observers, plan.output.directory)
-    context = Context(thread_count(plan.run.threads), progress or Quiet(), observers.level_finished)
+    context = Context(progress=progress or Quiet(), on_level=observers.level_finished)
     with begun_run(plan, observers, context.progress, overwrite=overwrite) as begun, ExitStack() as stack:
         source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
         depends_on = run_fingerprint(plan, source)
@@ -88,7 +88,8 @@ def run(
         decisions = first_decisions(plan, source)
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
-        context = replace(context, checkpoints=work.checkpoints)
+        executor = stack.enter_context(executor_of(plan, source))
+        context = replace(context, threads=executor.under_way, checkpoints=work.checkpoints, executor=executor)
         with naming_obstacles(source, decisions):
             found = estimate(plan, source, decisions, context)
         source, context = found.source, found.context

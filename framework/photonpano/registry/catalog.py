@@ -157,7 +157,8 @@ class Catalog:
         """Look a component up, whether or not its libraries are installed: see `Entry.unavailable`.
 
         Args:
-            kind: "source", "resampler", "merger", "locator", "interpolator", "refiner", "renderer" or "exporter".
+            kind: "source", "resampler", "merger", "locator", "interpolator", "refiner", "renderer", "exporter",
+                "pose-estimator" or "executor".
             name: the name of the component in specs.
 
         Raises:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from photonpano.contributions import (
     Contribution,
+    ExecutorContribution,
     ExporterContribution,
     InterpolatorContribution,
     LocatorContribution,
@@ -53,6 +54,7 @@ KINDS: Mapping[str, Kind] = {
         Kind("renderer", "render", "photonpano_renderers", RendererContribution, ("render",)),
         Kind("exporter", "output.formats", "photonpano_exporters", ExporterContribution, ("export",)),
         Kind("pose-estimator", "pose", "photonpano_pose_estimators", PoseEstimatorContribution, ("estimate",)),
+        Kind("executor", "run.executor", "photonpano_executors", ExecutorContribution, ("share", "call", "keep", "close")),
     )
 }
 """All kinds by name, in the order in which a run needs them."""

@@ -98,6 +98,11 @@ class ComponentResolver:
         chosen = {"use": DEFAULTS["render"]} | {key: value for key, value in (data or {}).items() if key in CHOICE}
         return self.component(KIND_OF["render"], chosen, "render")
 
+    def executor(self, data: Any) -> Choice | None:
+        """Resolve the executor, a key of the section `run`; None for threads, without a plugin."""
+        written = data.get("executor") if isinstance(data, dict) else None
+        return None if written is None else self.item(KIND_OF["run.executor"], written, "run.executor")
+
     def formats(self, data: Any) -> tuple[Choice, ...]:
         """Resolve the exporters; two of them cannot write the same file."""
         where, found = "output.formats", dict[str, Choice]()

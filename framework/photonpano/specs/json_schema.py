@@ -16,7 +16,7 @@ from photonpano.specs.components import DEFAULT_FALLBACK, DEFAULT_REFINER, DEFAU
 from photonpano.specs.corrections import AUTO
 from photonpano.specs.pose import PANORAMA_ONLY
 from photonpano.specs.resolution import LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
-from photonpano.specs.settings import LevelSettings, LightSettings, OutputSettings, RenderSettings
+from photonpano.specs.settings import LevelSettings, LightSettings, OutputSettings, RenderSettings, RunSettings
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -38,6 +38,8 @@ POSE = (
     "sections of the panorama do not apply then. Experimental"
 )
 """The description of the pose estimator."""
+EXECUTOR = "what works on the tasks of the run: a name, or {use, with}; by default threads of this process"
+"""The description of the executor."""
 FORMATS = "further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}"
 """The description of the formats."""
 
@@ -74,6 +76,9 @@ def json_schema(catalog: Catalog) -> Schema:
     sections["source"]["required"] = ["use"]
     formats = _one_or_list(_item(KINDS["exporter"], entries, schemas))
     del sections[KINDS["exporter"].section]
+    executor = {"description": EXECUTOR} | _item(KINDS["executor"], entries, schemas)
+    del sections[KINDS["executor"].section]
+    definitions[RunSettings.__name__]["properties"]["executor"] = executor
     definitions[OutputSettings.__name__]["properties"]["formats"] = {"description": FORMATS} | formats
     rendering = _rendering(sections.pop("render"), definitions[_definition(schemas[RenderSettings])])
     return {

@@ -87,6 +87,7 @@ class Plan:
         observers: the plugins that watch the run.
         decisions: choices that the spec leaves open and that reading it made: the source that recognises the capture.
         corrects_itself: `corrections` is `auto`: the run masks what stands still, and divides by a vignette.
+        executor: works on the tasks of the run; None for threads of this process.
         pose: the pose estimator, which takes the place of the levels, of refiners and of the panorama; None for a panorama.
     """
 
@@ -96,6 +97,7 @@ class Plan:
     refine: tuple[Choice, ...]
     renderer: Choice
     formats: tuple[Choice, ...]
+    executor: Choice | None
     until_converged: bool
     motion: MotionSettings
     camera: CameraSettings

@@ -106,6 +106,7 @@ class _Resolver:
         levels = [self.level(data, f"levels.{index}", stages) for index, data in enumerate(written)]
         renderer = self.components.renderer(root.get("render"))
         formats = self.components.formats(written_formats(root))
+        executor = self.components.executor(root.get("run"))
         pose = self.components.item(KIND_OF["pose"], {} if root["pose"] is None else root["pose"], "pose") if posed else None
         self.spell_out_light(root)
         settings = self.settings(root, posed)
@@ -124,6 +125,7 @@ class _Resolver:
             **{name: section.model_dump(mode="json") for name, section in settings.items()},
         }
         document["render"] = _component(renderer) | document["render"]
+        document["run"] |= {} if executor is None else {"executor": _component(executor)}
         document["output"] |= {"formats": [_component(each) for each in formats]}
         if posed:
             document = document_of_poses(document)
@@ -136,6 +138,7 @@ class _Resolver:
             () if posed else tuple(filter(None, refine)),
             renderer,
             formats,
+            executor,
             until_converged,
             **settings,
             document=document,
@@ -203,6 +206,8 @@ class _Resolver:
             for index, item in enumerate(_as_list(written_formats(root)))
             if isinstance(item, dict)
         }
+        if isinstance(root.get("run"), dict) and isinstance(root["run"].get("executor"), dict):
+            keys["run.executor.with"] = keys_of(KIND_OF["run.executor"], root["run"]["executor"].get("use"))
         keys |= {name: model.model_fields for name, model in SETTINGS.items()} | {"locate": ("fallback",)}
         found = {name: [""] for name in SECTIONS}
         for section, own in keys.items():
@@ -243,7 +248,7 @@ class _Resolver:
 
 def _settings(name: str, data: Any) -> Any:
     """Return the framework's own keys of a section, without those that choose components."""
-    others = {"render": CHOICE, "output": ("formats",)}.get(name, ())
+    others = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}.get(name, ())
     return {key: value for key, value in data.items() if key not in others} if isinstance(data, dict) else data
 
 

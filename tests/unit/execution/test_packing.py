@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -14,13 +14,13 @@ import pytest
 import photonpano.pipeline.run as run_module
 from photonpano import FrameSpan, Light, parse_spec, run
 from photonpano.captures.part import part_of
-from photonpano.context import Context
 from photonpano.corrections import ColourFilter, HotPixels, corrected_source, divided_by
 from photonpano.corrections.vignette import Vignette
 from photonpano.execution.packing import packed, unpacked
 from photonpano.geometry import Camera
 from photonpano.lighting import in_light
 from photonpano.motion.attributed_source import AttributedSource, attributed
+from photonpano.pipeline.executors import as_read
 from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
 from photonpano.source_wrapper import seen_through
 from photonpano.testing import MemorySource
@@ -77,6 +77,8 @@ def test_what_cannot_travel_is_named() -> None:
 class Elsewhere:
     """An executor that lets every task see copies alone, as another process would."""
 
+    under_way = 2
+
     def __init__(self) -> None:
         self.capture: Source | None = None
 
@@ -109,19 +111,14 @@ def test_run_on_copies_has_the_same_bytes(extra: dict[str, Any], tmp_path: Path,
     }
     spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2, **extra}
     run(parse_spec(spec, output=tmp_path / "here"))
-    elsewhere, begun = Elsewhere(), run_module.begun_run
+    elsewhere = Elsewhere()
 
     @contextmanager
-    def begun_elsewhere(*given: Any, **keys: Any) -> Any:
-        with begun(*given, **keys) as begun_run:
-            source: Any = begun_run.source
-            while not isinstance(source, AttributedSource):
-                source = source.wrapped
-            elsewhere.capture = source
-            yield begun_run
+    def executor_elsewhere(_: Any, source: Source) -> Iterator[Elsewhere]:
+        elsewhere.capture = as_read(source)
+        yield elsewhere
 
-    monkeypatch.setattr(run_module, "begun_run", begun_elsewhere)
-    monkeypatch.setattr(run_module, "Context", lambda *given: Context(*given, executor=elsewhere))
+    monkeypatch.setattr(run_module, "executor_of", executor_elsewhere)
     run(parse_spec(spec, output=tmp_path / "there"))
     assert elsewhere.capture is not None
     for name in ("trajectory.npz", "panorama.tiff"):

@@ -75,7 +75,7 @@ def test_framework_offers_names_through_its_own_entry_point(kind, name):
             "@hookimpl\ndef photonpano_source(): return []",
             "there is no hook 'photonpano_source'; known: photonpano_sources, photonpano_resamplers, photonpano_mergers, "
             "photonpano_locators, photonpano_interpolators, photonpano_refiners, photonpano_renderers, photonpano_exporters, "
-            "photonpano_pose_estimators, photonpano_run_started, photonpano_stage_finished and "
+            "photonpano_pose_estimators, photonpano_executors, photonpano_run_started, photonpano_stage_finished and "
             "photonpano_run_finished",
         ),
         ("def photonpano_sources(): return []", "photonpano_sources is not marked with @photonpano.hookimpl"),
@@ -199,7 +199,7 @@ def test_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
     catalog = discover()
     assert {row.origin.plugin for row in catalog.rows} == {"alpha"}
     disabled = [row.origin.entry_point.partition(" = ")[0] for row in catalog.disabled]
-    assert disabled == ["colmap", "core", "direct", "framework", "kornia", "opencv", "sensors", "simulator"]
+    assert disabled == ["colmap", "core", "dask", "direct", "framework", "kornia", "opencv", "sensors", "simulator", "zarr"]
 
 
 def test_unknown_name_mentions_disabled_plugins(install, monkeypatch):
@@ -233,7 +233,7 @@ def test_disabling_unknown_plugin_is_logged(words, message, install, monkeypatch
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     discover()
-    known = "alpha, colmap, core, direct, framework, kornia, opencv, photonpano, sensors and simulator"
+    known = "alpha, colmap, core, dask, direct, framework, kornia, opencv, photonpano, sensors, simulator and zarr"
     assert caplog.messages == [f"PHOTONPANO_DISABLE_PLUGINS {message.format(known=known)}"]
 
 

@@ -41,8 +41,8 @@ def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
 
 
 def _without_machine(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a spec as plain data, without what results do not depend on: the run folder, and the number of threads."""
-    run = {key: value for key, value in document["run"].items() if key != "threads"}
+    """Return a spec as plain data, without what results do not depend on: the run folder, threads, and executor."""
+    run = {key: value for key, value in document["run"].items() if key not in ("threads", "executor")}
     plain: dict[str, Any] = json.loads(json.dumps({**document, "run": run}))
     plain.pop("output", None)
     return plain

@@ -1,0 +1,168 @@
+"""The executor of other processes: it packs tasks, and leaves it to a cluster where they are worked on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from operator import itemgetter
+from typing import Any, Protocol, TypeVar
+
+from photonpano.execution.packing import packed, unpacked
+from photonpano.interrupts import interrupted
+
+_LOOK_S = 0.2
+"""How often threads that wait look whether the program was interrupted."""
+ValueT = TypeVar("ValueT")
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaptureElsewhere:
+    """What stands for a capture in tasks.
+
+    Attributes:
+        source: the capture in this process.
+        opener: opens it in another one; can be pickled, and tells by `==` whether it is the same capture.
+    """
+
+    source: object
+    opener: Callable[[], object]
+
+
+class Pending(Protocol):
+    """A result that a worker holds, or will."""
+
+    def result(self) -> Any:
+        """Wait for the result, and fetch it.
+
+        Raises:
+            Exception: what the task raised.
+        """
+        ...
+
+
+class Workers(Protocol):
+    """Processes, here or on other machines, that work on tasks. May be called from several threads."""
+
+    def submit(self, function: Callable[..., Any], *given: Any) -> Pending:
+        """Have a worker call a function, as soon as there is one.
+
+        Args:
+            function: of a module that workers can import.
+            given: its arguments; a `Pending` is replaced by its result, which travels from worker to worker alone.
+        """
+        ...
+
+    @property
+    def under_way(self) -> int:
+        """How many tasks are worth having under way at once: more than there are workers, so that none waits for the next."""
+        ...
+
+    def wait(self, pending: Pending, seconds: float) -> bool:
+        """Wait for a task; return whether it has ended after so many seconds."""
+        ...
+
+    def close(self) -> None:
+        """Cancel what is under way, and end the processes that were started."""
+        ...
+
+
+class Remote:
+    """Has workers work on tasks: see `Executor`.
+
+    What is given to a task travels as a pickle, but the capture does not: each worker opens it itself.
+    """
+
+    def __init__(self, workers: Workers, capture: CaptureElsewhere) -> None:
+        """Take what works on the tasks, and what stands for the capture."""
+        self._workers, self._capture, self._opener = workers, capture.source, capture.opener
+
+    @property
+    def under_way(self) -> int:
+        """How many tasks are worth having under way at once."""
+        return self._workers.under_way
+
+    def share(self, value: ValueT) -> ValueT:
+        """Return what stands for a value in tasks: it travels to each worker once."""
+        standin: Any = _StandIn(self._workers.submit(_Shared, packed(value, self._capture), self._opener))
+        return standin  # type: ignore[no-any-return]
+
+    def call(self, work: Callable[..., ResultT], *given: Any) -> ResultT:
+        """Work on a task, and return its result."""
+        result: ResultT = self._awaited(self._submitted(work, *given))
+        return result
+
+    def keep(self, work: Callable[..., tuple[ValueT, ResultT]], *given: Any) -> tuple[ValueT, ResultT]:
+        """Work on a task with two results; the first stays where it was made."""
+        both = self._submitted(work, *given)
+        kept: Any = _StandIn(self._workers.submit(_first, both))
+        return kept, self._awaited(self._workers.submit(_second, both))
+
+    def close(self) -> None:
+        """End the processes that were started."""
+        self._workers.close()
+
+    def _awaited(self, pending: Pending) -> Any:
+        """Wait for a result. Once the program is interrupted, its threads do not wait any longer."""
+        while not self._workers.wait(pending, _LOOK_S):
+            if interrupted():
+                raise KeyboardInterrupt
+        return pending.result()
+
+    def _submitted(self, work: Any, *given: Any) -> Pending:
+        parts = [
+            each.pending if isinstance(each, _StandIn) else _Sent(packed(each, self._capture), self._opener)
+            for each in (work, *given)
+        ]
+        return self._workers.submit(_work, *parts)
+
+
+_first, _second = itemgetter(0), itemgetter(1)
+
+
+class _StandIn:
+    """Stands for a value that workers have."""
+
+    def __init__(self, pending: Pending) -> None:
+        self.pending = pending
+
+
+class _Sent:
+    """A value on its way to a task."""
+
+    def __init__(self, data: bytes, opener: Callable[[], object]) -> None:
+        self._data, self._opener = data, opener
+
+    def value(self) -> Any:
+        """Return the value, in the process of a worker."""
+        return unpacked(self._data, _opened(self._opener))
+
+
+class _Shared(_Sent):
+    """A value on its way to several tasks; each worker unpacks it once."""
+
+    def __init__(self, data: bytes, opener: Callable[[], object]) -> None:
+        super().__init__(data, opener)
+        self._value: Any = None
+
+    def value(self) -> Any:
+        """Return the value, in the process of a worker."""
+        if self._value is None:
+            self._value = super().value()
+        return self._value
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Shared, (self._data, self._opener)
+
+
+@cache
+def _opened(opener: Callable[[], object]) -> object:
+    """Open a capture once in the process of a worker."""
+    return opener()
+
+
+def _work(*given: Any) -> Any:
+    """Work on a task, in the process of a worker."""
+    work, *values = (each.value() if isinstance(each, _Sent) else each for each in given)
+    return work(*values)

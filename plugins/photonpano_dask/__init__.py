@@ -1,0 +1,1 @@
+"""Runs on clusters, with dask.distributed."""

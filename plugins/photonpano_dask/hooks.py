@@ -1,0 +1,32 @@
+"""Hooks of the plugin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from photonpano import ExecutorContribution, Requirement, hookimpl
+from photonpano_dask.configs import DaskConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from photonpano import Executor, ExecutorContext
+
+
+@hookimpl
+def photonpano_executors() -> Iterator[ExecutorContribution]:
+    """Offer the workers of dask."""
+    yield ExecutorContribution(
+        name="dask",
+        summary="Workers of a dask cluster, or processes of this machine",
+        config=DaskConfig,
+        build=_build,
+        requires=(Requirement("distributed", "photonpano[dask]"),),
+    )
+
+
+def _build(config: DaskConfig, context: ExecutorContext) -> Executor:
+    from photonpano.execution import Remote
+    from photonpano_dask.workers import workers_of
+
+    return Remote(workers_of(config, context), context.capture)

@@ -1,0 +1,92 @@
+"""Workers of a dask cluster."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import dask
+from distributed import Client, Future, LocalCluster, wait
+
+from photonpano import ExecutorContext, InputError
+from photonpano_dask.configs import DaskConfig
+
+_AHEAD = 2
+"""Tasks under way for each thread of a worker: one is worked on while the next travels."""
+_PATIENCE_S = 10
+"""How long a scheduler may take to answer."""
+_QUIET = {"distributed.worker.daemon": True, "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s"}
+
+
+def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
+    """Connect to a scheduler, or start workers on this machine.
+
+    Raises:
+        InputError: no scheduler answers, it has no workers, or they have other versions than this process.
+    """
+    cluster: LocalCluster | None = None
+    with dask.config.set(_QUIET):
+        if config.address is None:
+            number = config.workers or context.threads
+            cluster = LocalCluster(
+                n_workers=number, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+            )
+            client = Client(cluster)
+        else:
+            try:
+                client = Client(config.address, timeout=_PATIENCE_S)
+            except (OSError, ValueError) as error:
+                raise InputError(
+                    f"no dask scheduler answers at {config.address} ({error}); start one with `dask scheduler`, and workers "
+                    "with `dask worker`, or leave out run.executor.with.address"
+                ) from error
+    workers = DaskWorkers(client, cluster)
+    try:
+        _require_same_versions(client, context.versions, config.address)
+    except BaseException:
+        workers.close()
+        raise
+    return workers
+
+
+def _require_same_versions(client: Client, versions: Callable[[], Mapping[str, str]], address: str | None) -> None:
+    here = versions()
+    there: Mapping[str, Mapping[str, str]] = client.run(versions)
+    if not there:
+        raise InputError(f"the dask scheduler at {address} has no workers; start some with `dask worker {address}`")
+    for worker, found in there.items():
+        different = [f"{name} {found[name]} (here {here[name]})" for name in here if found[name] != here[name]]
+        if different:
+            raise InputError(
+                f"the dask worker {worker} has other versions: {', '.join(different)}; install the same there, since results "
+                "must not depend on the worker"
+            )
+
+
+class DaskWorkers:
+    """The workers of a dask cluster: see `photonpano.execution.Workers`."""
+
+    def __init__(self, client: Client, cluster: LocalCluster | None = None) -> None:
+        """Take the client of the scheduler, and the cluster that ends with it."""
+        self._client, self._cluster = client, cluster
+        self.under_way = _AHEAD * max(1, sum(client.nthreads().values()))
+
+    def submit(self, function: Callable[..., Any], *given: Any) -> Future:
+        """Have a worker call a function: see `Workers`."""
+        # Tasks are not pure: a key that is computed from large arguments takes time, and none is submitted twice.
+        return self._client.submit(function, *given, pure=False)
+
+    def wait(self, pending: Future, seconds: float) -> bool:
+        """Wait for a task: see `Workers`."""
+        try:
+            wait([pending], timeout=seconds)
+        except TimeoutError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Cancel what is under way, and end the processes that were started."""
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()

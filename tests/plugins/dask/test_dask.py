@@ -1,0 +1,117 @@
+"""Runs on the workers of dask have the same results as runs on threads."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from photonpano import ExecutorContext, InputError, SpecError, parse_spec, run, simulate
+from photonpano.context import Quiet
+from photonpano.execution import CaptureElsewhere
+
+pytest.importorskip("distributed")
+
+import psutil
+
+from photonpano_dask import workers
+from photonpano_dask.configs import DaskConfig
+
+FILES = "trajectory.npz", "panorama.tiff"
+CONTEXT = ExecutorContext(2, CaptureElsewhere(None, lambda: None), lambda: {"photonpano": "0.1.0", "numpy": "2.4.6"})
+
+
+class Killing(Quiet):
+    """Kills a worker in the middle of each of some stages."""
+
+    def __init__(self, *stages: str) -> None:
+        self.stages, self.killed = list(stages), list[str]()
+
+    @contextmanager
+    def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+        del total, unit
+
+        def advance(_: int) -> None:
+            if title in self.stages:
+                self.stages.remove(title)
+                processes = [each for each in psutil.Process().children(recursive=True) if "spawn_main" in str(each.cmdline())]
+                os.kill(processes[0].pid, signal.SIGKILL)
+                self.killed.append(title)
+
+        yield advance
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The spec of a capture in a file, of 400 frames."""
+    capture = {
+        "use": "simulator",
+        "with": {
+            "scene": {"kind": "street", "width": 400, "height": 300},
+            "path": {"kind": "pan", "length_px": 30},
+            "flux": 1,
+            "n_frames": 400,
+            "frame_shape": [96, 128],
+        },
+    }
+    folder = tmp_path_factory.mktemp("capture")
+
+    simulate(parse_spec({"version": 1, "source": capture}), folder / "cube.npy")
+    source = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy")}}
+    return {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2}
+
+
+@pytest.mark.filterwarnings("default")
+def test_same_bytes_as_on_threads_though_workers_are_killed(spec: dict[str, Any], tmp_path: Path) -> None:
+    run(parse_spec(spec, output=tmp_path / "threads"))
+    elsewhere = {"run": {"executor": {"use": "dask", "with": {"workers": 2}}}}
+    killing = Killing("level 1: merge and locate", "level 2: merge and locate", "residuals", "panorama")
+    run(parse_spec(spec | elsewhere, output=tmp_path / "dask"), killing)
+    assert len(killing.killed) == 4
+    for name in FILES:
+        assert (tmp_path / "dask" / name).read_bytes() == (tmp_path / "threads" / name).read_bytes()
+    assert not [each for each in psutil.Process().children(recursive=True) if "spawn_main" in str(each.cmdline())]
+
+
+def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
+    with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127.0.0.1:9 .*start one with `dask scheduler`"):
+        workers.workers_of(DaskConfig(address="tcp://127.0.0.1:9"), CONTEXT)
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        ({}, "the dask scheduler at tcp://a:1 has no workers; start some with `dask worker tcp://a:1`"),
+        (
+            {"tcp://b:2": {"photonpano": "0.2.0", "numpy": "missing"}},
+            "the dask worker tcp://b:2 has other versions: photonpano 0.2.0 (here 0.1.0), numpy missing (here 2.4.6); install "
+            "the same there, since results must not depend on the worker",
+        ),
+    ],
+)
+def test_workers_that_cannot_do_the_run_are_named(found: dict[str, Any], message: str) -> None:
+    client: Any = SimpleNamespace(run=lambda _: found)
+    with pytest.raises(InputError) as caught:
+        workers._require_same_versions(client, CONTEXT.versions, "tcp://a:1")
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"address": "host"}, "expected an address such as tcp://host:8786, got 'host'"),
+        ({"address": "tcp://a:1", "workers": 2}, "the scheduler at the address has its own; remove one"),
+        ({"workers": 0}, "expected an integer from 1 to 1024 or null, got 0"),
+    ],
+)
+def test_wrong_keys_are_named(keys: dict[str, Any], message: str, spec: dict[str, Any]) -> None:
+    with pytest.raises(SpecError) as caught:
+        parse_spec(spec | {"run": {"executor": {"use": "dask", "with": keys}}})
+    assert message in str(caught.value)
