@@ -398,13 +398,13 @@ class ExecutorContext:
     Attributes:
         threads: the number of threads of the run.
         capture: what stands for the capture in tasks of other processes.
-        versions: what each worker must have alike, by its name: photonpano, the plugins of the run, and the libraries that its
-            results depend on. It can be called in any process.
+        needs: tells what a process has of what the run needs, by name: versions of photonpano, of the plugins of the run and of
+            libraries, and a hash of the capture. It can be pickled, and must return the same in each process.
     """
 
     threads: int
     capture: CaptureElsewhere
-    versions: Callable[[], Mapping[str, str]]
+    needs: Callable[[], Mapping[str, str]]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
     """Connect to a scheduler, or start workers on this machine.
 
     Raises:
-        InputError: no scheduler answers, it has no workers, or they have other versions than this process.
+        InputError: no scheduler answers, it has no workers, or they differ from this process.
     """
     cluster: LocalCluster | None = None
     with dask.config.set(_QUIET):
@@ -43,24 +43,24 @@ def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
                 ) from error
     workers = DaskWorkers(client, cluster)
     try:
-        _require_same_versions(client, context.versions, config.address)
+        _require_alike(client, context.needs, config.address)
     except BaseException:
         workers.close()
         raise
     return workers
 
 
-def _require_same_versions(client: Client, versions: Callable[[], Mapping[str, str]], address: str | None) -> None:
-    here = versions()
-    there: Mapping[str, Mapping[str, str]] = client.run(versions)
+def _require_alike(client: Client, needs: Callable[[], Mapping[str, str]], address: str | None) -> None:
+    here = needs()
+    there: Mapping[str, Mapping[str, str]] = client.run(needs)
     if not there:
         raise InputError(f"the dask scheduler at {address} has no workers; start some with `dask worker {address}`")
     for worker, found in there.items():
         different = [f"{name} {found[name]} (here {here[name]})" for name in here if found[name] != here[name]]
         if different:
             raise InputError(
-                f"the dask worker {worker} has other versions: {', '.join(different)}; install the same there, since results "
-                "must not depend on the worker"
+                f"the dask worker {worker} differs from this process: {', '.join(different)}; it needs the same versions, and "
+                "must find the same capture at its path, since results must not depend on the worker"
             )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from operator import itemgetter
 from typing import Any, Protocol, TypeVar
 
@@ -136,7 +136,7 @@ class _Sent:
 
     def value(self) -> Any:
         """Return the value, in the process of a worker."""
-        return unpacked(self._data, _opened(self._opener))
+        return unpacked(self._data, opened(self._opener))
 
 
 class _Shared(_Sent):
@@ -156,9 +156,9 @@ class _Shared(_Sent):
         return _Shared, (self._data, self._opener)
 
 
-@cache
-def _opened(opener: Callable[[], object]) -> object:
-    """Open a capture once in the process of a worker."""
+@lru_cache(maxsize=1)
+def opened(opener: Callable[[], object]) -> object:
+    """Open a capture in the process of a worker, once as long as tasks of one run come."""
     return opener()
 
 

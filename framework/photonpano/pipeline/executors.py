@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
+from uuid import uuid4
 
 from photonpano.contributions import ExecutorContext
+from photonpano.errors import PhotonpanoError
 from photonpano.execution import CaptureElsewhere, Executor, Here
+from photonpano.execution.remote import opened
 from photonpano.motion.attributed_source import AttributedSource
 from photonpano.pipeline.components import build_source, built
 from photonpano.protocols import Source
@@ -19,6 +24,7 @@ from photonpano.source_wrapper import SourceWrapper
 from photonpano.specs.loading import parse_spec
 from photonpano.specs.plan import Plan
 from photonpano.threads import thread_count
+from photonpano.values import FrameSpan
 
 
 @contextmanager
@@ -33,10 +39,12 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
         yield Here(thread_count(plan.run.threads))
         return
     document = {key: plan.document[key] for key in ("version", "source")} | {"run": {"seed": plan.run.seed}}
-    capture = CaptureElsewhere(as_read(source), CaptureOpener(json.dumps(document, sort_keys=True)))
+    # Workers may live longer than a run, and files change: each run has the capture opened anew.
+    opener = CaptureOpener(json.dumps(document, sort_keys=True), uuid4().hex)
     names = ("photonpano", *library_versions(plan), *(each["plugin"] for each in plugin_records(plan)))
-    versions = InstalledVersions(tuple(dict.fromkeys(names)))
-    executor: Executor = built(plan.executor, ExecutorContext(thread_count(plan.run.threads), capture, versions))
+    needs = Needs(tuple(dict.fromkeys(names)), opener)
+    context = ExecutorContext(thread_count(plan.run.threads), CaptureElsewhere(as_read(source), opener), needs)
+    executor: Executor = built(plan.executor, context)
     try:
         yield executor
     finally:
@@ -56,9 +64,11 @@ class CaptureOpener:
 
     Attributes:
         document: the sections of a resolved spec that name it, as JSON.
+        run: distinguishes the run.
     """
 
     document: str
+    run: str
 
     def __call__(self) -> Source:
         """Open the capture."""
@@ -71,18 +81,32 @@ class CaptureOpener:
 
 
 @dataclass(frozen=True, slots=True)
-class InstalledVersions:
-    """Tells which versions of some distributions a process has.
+class Needs:
+    """Tells what a process has of what a run needs: versions of distributions, and the capture.
 
     Attributes:
         names: of the distributions; "python" stands for itself.
+        opener: opens the capture.
     """
 
     names: tuple[str, ...]
+    opener: CaptureOpener
 
     def __call__(self) -> dict[str, str]:
-        """Return the versions by name."""
-        return {name: _version(name) for name in self.names}
+        """Return versions by name, and a hash of some frames of the capture, or why it cannot be opened."""
+        try:
+            capture = _hash_of(opened(self.opener))
+        except PhotonpanoError as error:
+            capture = str(error)
+        return {name: _version(name) for name in self.names} | {"capture": capture}
+
+
+def _hash_of(source: Any) -> str:
+    """Return a hash of what describes a capture, and of its first, middle and last frame."""
+    digest, last = hashlib.sha256(repr(source.info).encode()), source.info.n_frames - 1
+    for frame in (0, last // 2, last):
+        digest.update(source.counts(FrameSpan(frame, frame + 1)).tobytes())
+    return digest.hexdigest()[:12]
 
 
 def _version(name: str) -> str:

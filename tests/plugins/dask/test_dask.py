@@ -91,15 +91,16 @@ def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch
         ({}, "the dask scheduler at tcp://a:1 has no workers; start some with `dask worker tcp://a:1`"),
         (
             {"tcp://b:2": {"photonpano": "0.2.0", "numpy": "missing"}},
-            "the dask worker tcp://b:2 has other versions: photonpano 0.2.0 (here 0.1.0), numpy missing (here 2.4.6); install "
-            "the same there, since results must not depend on the worker",
+            "the dask worker tcp://b:2 differs from this process: photonpano 0.2.0 (here 0.1.0), numpy missing (here 2.4.6); "
+            "it needs the same versions, and must find the same capture at its path, since results must not depend on "
+            "the worker",
         ),
     ],
 )
 def test_workers_that_cannot_do_the_run_are_named(found: dict[str, Any], message: str) -> None:
     client: Any = SimpleNamespace(run=lambda _: found)
     with pytest.raises(InputError) as caught:
-        workers._require_same_versions(client, CONTEXT.versions, "tcp://a:1")
+        workers._require_alike(client, CONTEXT.needs, "tcp://a:1")
     assert str(caught.value) == message
 
 

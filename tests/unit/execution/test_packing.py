@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -20,7 +21,7 @@ from photonpano.execution.packing import packed, unpacked
 from photonpano.geometry import Camera
 from photonpano.lighting import in_light
 from photonpano.motion.attributed_source import AttributedSource, attributed
-from photonpano.pipeline.executors import as_read
+from photonpano.pipeline.executors import CaptureOpener, Needs, as_read
 from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
 from photonpano.source_wrapper import seen_through
 from photonpano.testing import MemorySource
@@ -123,3 +124,20 @@ def test_run_on_copies_has_the_same_bytes(extra: dict[str, Any], tmp_path: Path,
     assert elsewhere.capture is not None
     for name in ("trajectory.npz", "panorama.tiff"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_needs_tell_another_capture_from_this_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+
+    def needs(name: str) -> dict[str, str]:
+        document = {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(tmp_path / name)}}}
+        return Needs(("python", "photonpano", "no-such-thing"), CaptureOpener(json.dumps(document), "run"))()
+
+    for name in ("one.npy", "other.npy"):
+        np.save(tmp_path / name, rng.integers(0, 256, (9, 16, 4), dtype=np.uint8))
+    here, there, nowhere = (needs(name) for name in ("one.npy", "other.npy", "none.npy"))
+    assert here["no-such-thing"] == "missing"
+    assert here["python"] == there["python"]
+    assert here["capture"] != there["capture"]
+    assert here == needs("one.npy")
+    assert "there is no file" in nowhere["capture"]
