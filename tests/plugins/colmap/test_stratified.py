@@ -9,6 +9,7 @@ import pytest
 
 from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
 from photonpano.context import Quiet
+from photonpano.evaluation import pose_errors
 from photonpano.geometry import camera_matrix, rotation_matrices
 from photonpano.testing import MemorySource
 from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
@@ -224,6 +225,23 @@ def test_lens_that_distorts_is_refused() -> None:
     estimator = StratifiedEstimator(StratifiedPoseConfig(group_size=20), context)
     with pytest.raises(LocationError, match="through a lens that distorts; leave out"):
         estimator.estimate(source, CameraGuess(FOCAL_PX, distortion=(-0.1, 0, 0, 0)), Quiet())
+
+
+def test_frames_that_show_nothing_are_lost_and_the_others_refined() -> None:
+    frames = capture().frames(FrameSpan(0, N_FRAMES)).copy()
+    frames[140:160] = 0
+    source = MemorySource(frames)
+    config, context = StratifiedPoseConfig(group_size=20, levels=2), StageContext(source.info, source.response, 0, 2)
+    estimate = StratifiedEstimator(config, context).estimate(source, CameraGuess(FOCAL_PX), Quiet())
+    lit = frames.any(axis=(1, 2))
+    np.testing.assert_array_equal(estimate.located, lit)
+    assert np.isnan(estimate.camera_from_world[~lit]).all()
+    assert [each.span for each in estimate.lost] == [FrameSpan(140, 160)]
+    score = pose_errors(estimate.camera_from_world, true_poses(), lit, 10, estimate.std_position)
+    assert score.ate_share < 0.01
+    assert score.turns_deg < 0.3
+    assert score.honest_shares is not None
+    assert score.honest_shares[2] > 0.9
 
 
 def _seen_points() -> np.ndarray:
