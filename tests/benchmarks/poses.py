@@ -4,9 +4,9 @@
     python tests/benchmarks/poses.py --work FOLDER --only room-1 --flux 0.3
 
 Five simulated captures of 10,000 frames of 254 x 496 pixels, held by a hand with a tremor of 2 px, at three light levels. Each
-method is a run of the program as users start it: seconds and the largest memory are those of its process. COLMAP on sharp
-frames gets every 200th frame without noise and without blur, and is scored at these. Captures and results stay in the folder,
-and what is there already is not measured again. With a capture of 160 MB each, the whole table takes two hours.
+method is a run of the program as users start it; the seconds and the memory that are printed are those of its process. COLMAP
+on sharp frames gets every 200th frame without noise and without blur, and is scored at these. Captures and results stay in the
+folder, and what is there already is not measured again. With captures of 160 MB, the whole table takes an hour.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from photonpano import CameraGuess, evaluate_poses
+from photonpano.evaluation.pose_inputs import load_true_poses
 from photonpano.evaluation.poses import PoseScore, pose_errors
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
@@ -41,8 +42,8 @@ FLUXES = ("0.3", "0.1", "0.05")
 SHARP, AVERAGES, STRATIFIED = "sharp frames", "colmap-averages", "stratified-pose"
 METHODS = (SHARP, AVERAGES, STRATIFIED)
 HEADER = [
-    "| Capture | Method | ATE, % of the path | Rotation, degrees | RPE, degrees | Located | Within 2 std | Time, memory |",
-    "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    "| Capture, flux | COLMAP on sharp frames | `colmap-averages` | `stratified-pose` | Within 2 std | Located |",
+    "| --- | --- | --- | --- | --- | --- |",
 ]
 
 
@@ -66,7 +67,7 @@ def simulated(scene: str, flux: str, work: Path, n_frames: int = N_FRAMES) -> Pa
         spec = work / f"{cube.stem}.yaml"
         spec.write_text(json.dumps({"version": 1, "source": source}))
         command = ["simulate", str(spec), "--output", str(cube)]
-        _program(*command, *(["--sharp-every", str(SHARP_EVERY)] if flux == FLUXES[0] else []))
+        _program(*command, "--sharp-every", str(SHARP_EVERY))
     return cube
 
 
@@ -89,7 +90,7 @@ def measured(scene: str, flux: str, method: str, work: Path, n_frames: int = N_F
     if method == SHARP:
         return _figures(_sharp(cube, truth))
     folder = work / f"{cube.stem}-{method}"
-    spec = folder.with_suffix(".yaml")
+    spec = work / f"{folder.name}.yaml"
     source = {"use": "packed-npy", "with": {"path": str(cube), "width": SHAPE[1]}}
     spec.write_text(json.dumps({"version": 1, "source": source, "pose": {"use": method}, "camera": {"focal_px": FOCAL_PX}}))
     status, seconds, memory, text = _program("run", str(spec), "--output", str(folder), "--overwrite")
@@ -105,8 +106,7 @@ def _sharp(cube: Path, truth: Path) -> PoseScore:
     config = ColmapAveragesConfig()
     found = reconstruct([(picture, everywhere) for picture in pictures], CameraGuess(focal_px=FOCAL_PX), config, 0)
     piece = found.pieces[0]
-    with np.load(truth) as stored:
-        true = stored["camera_from_world"][::SHARP_EVERY]
+    true = load_true_poses(truth).camera_from_world[::SHARP_EVERY]
     poses, located = np.full(true.shape, np.nan), np.zeros(len(true), np.bool_)
     poses[piece.images], located[piece.images] = piece.poses, True
     return pose_errors(poses, true, located, 1)
@@ -116,6 +116,7 @@ def _figures(score: PoseScore) -> dict[str, Any]:
     return {
         "ate": 100 * score.ate_share,
         "rotation": score.rotation_deg,
+        "turned": score.turns_deg,
         "rpe": score.rpe_deg,
         "located": 100 * score.located_share,
         "within": None if score.honest_shares is None else 100 * score.honest_shares[1],
@@ -123,18 +124,20 @@ def _figures(score: PoseScore) -> dict[str, Any]:
     }
 
 
-def row(scene: str, flux: str, method: str, figures: dict[str, Any]) -> str:
-    """Return a row of the table."""
-    name = f"`{scene}`" if method == SHARP else f"`{scene}`, flux {flux}"
-    if "failed" in figures:
-        return f"| {name} | `{method}` | {figures['failed']} | | | | | |"
-    within = "" if figures["within"] is None else f"{figures['within']:.0f} %"
-    cost = f"{figures['seconds']:.0f} s, {figures['mib'] / 1024:.1f} GiB" if "seconds" in figures else ""
-    shown = method if method == SHARP else f"`{method}`"
-    return (
-        f"| {name} | {shown} | {figures['ate']:.3f} | {figures['rotation']:.3f} | {figures['rpe']:.3f} "
-        f"| {figures['located']:.0f} % | {within} | {cost} |"
-    )
+def row(scene: str, flux: str, of: dict[str, dict[str, Any]]) -> str:
+    """Return a row of the table, of the figures of each method."""
+    cells = [f"`{scene}`, {flux}"]
+    for method in METHODS:
+        figures = of.get(method)
+        if figures is None:
+            cells.append("")
+        elif "failed" in figures:
+            cells.append(figures["failed"])
+        else:
+            cells.append(f"{figures['ate']:.3f} %, {figures['turned']:.3f}°")
+    best = of.get(STRATIFIED, {})
+    cells += ["", ""] if "within" not in best else [f"{best['within']:.0f} %", f"{best['located']:.0f} %"]
+    return f"| {' | '.join(cells)} |"
 
 
 def main() -> None:
@@ -145,20 +148,24 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=SCENES, default=list(SCENES))
     parser.add_argument("--flux", nargs="*", choices=FLUXES, default=list(FLUXES))
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--frames", type=int, default=N_FRAMES, help="frames of the captures, of the same paths")
     parser.add_argument("--again", action="store_true", help="measure also what was measured before")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     lines = []
     for scene in arguments.only:
         for flux in arguments.flux:
+            figures = {}
             for method in arguments.methods:
-                if method == SHARP and flux != FLUXES[0]:
-                    continue
-                file = arguments.work / f"{scene}-{flux}-{method.replace(' ', '-')}.json"
+                # Sharp frames are the same whatever the flux.
+                name = f"{scene}-{arguments.frames}" if method == SHARP else f"{scene}-{flux}-{arguments.frames}"
+                file = arguments.work / f"{name}-{method.replace(' ', '-')}.json"
                 if arguments.again or not file.exists():
-                    file.write_text(json.dumps(measured(scene, flux, method, arguments.work)))
-                lines.append(row(scene, flux, method, json.loads(file.read_text())))
-                print(lines[-1], flush=True)
+                    file.write_text(json.dumps(measured(scene, flux, method, arguments.work, arguments.frames)))
+                figures[method] = json.loads(file.read_text())
+            lines.append(row(scene, flux, figures))
+            costs = [f"{name}: {of['seconds']:.0f} s, {of['mib']:.0f} MiB" for name, of in figures.items() if "seconds" in of]
+            print(lines[-1], *costs, sep="\n  ", flush=True)
     if arguments.page:
         text = arguments.page.read_text(encoding="utf-8")
         before, rest = text.split("<!-- poses: begin -->")
