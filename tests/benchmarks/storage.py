@@ -120,7 +120,7 @@ def all_places(cube: Path, address: str) -> dict[str, str | Path]:
     arrays = {"zarr": cube.with_suffix(".zarr"), "zarr, zstd": cube.with_name(f"{cube.stem}-zstd.zarr")}
     for name, array in arrays.items():
         start = time.perf_counter()
-        convert(capture_plan(cube, corrections=[]), array, compressed="zstd" in name)
+        convert(capture_plan(cube, corrections=[]), array, compress="zstd" in name)
         took = time.perf_counter() - start
         print(
             f"{name}: written in {took:.2f} s, {bytes_in(array) / bytes_in(cube):.3f} of the size of the .npy file", flush=True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
 
 import pytest
 
@@ -20,6 +21,14 @@ def test_keyboard_interrupt_is_interrupt_only_after_signal() -> None:
     assert not is_interrupt(SystemExit(0))
 
 
+@pytest.fixture
+def default_handler() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("default_handler")
 def test_without_handler_keyboard_interrupt_counts_in_main_thread_alone() -> None:
     seen = [is_interrupt(KeyboardInterrupt())]
     thread = threading.Thread(target=lambda: seen.append(is_interrupt(KeyboardInterrupt())))

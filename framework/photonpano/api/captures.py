@@ -50,7 +50,7 @@ def convert(
     progress: Progress | None = None,
     resumed: Callable[[int], object] | None = None,
     *,
-    compressed: bool = False,
+    compress: bool = False,
     catalog: Catalog | None = None,
 ) -> WrittenCapture:
     """Write a capture of binary frames to a packed .npy file, or to a zarr array.
@@ -63,7 +63,7 @@ def convert(
         output: the .npy file, or a folder with a name that ends as those that a source writes, such as .zarr.
         progress: receives the stage; quiet by default.
         resumed: called with the number of frames that OUTPUT.part holds, if there are any.
-        compressed: whether to compress the frames, in a format that can.
+        compress: whether to compress the frames, in a format that can.
         catalog: the sources that may write it; by default those of the installed plugins.
 
     Raises:
@@ -72,10 +72,10 @@ def convert(
     """
     output = Path(output)
     writer = _writer_of(output, discover() if catalog is None else catalog)
-    if writer is None and compressed:
+    if writer is None and compress:
         raise OutputError(f"cannot compress {output}: packed .npy files are not compressed; name it {output.stem}.zarr")
     with build_source(plan) as source:
-        return _write(source, plan, output, progress, resumed or (lambda _: None), writer, compressed)
+        return _write(source, plan, output, progress, resumed or (lambda _: None), writer, compress)
 
 
 def simulate(

@@ -41,7 +41,7 @@ def convert(
     before = part.stat().st_mtime_ns if part.exists() else None
     with capture_plan(path, source, keys, corrections) as plan:
         try:
-            written = convert_capture(plan, output, progress_for_stderr(), resumed, compressed=compress)
+            written = convert_capture(plan, output, progress_for_stderr(), resumed, compress=compress)
         finally:
             if part.exists() and part.stat().st_mtime_ns != before:
                 typer.echo(f"the frames written so far are in {part}; the same command continues from there", err=True)

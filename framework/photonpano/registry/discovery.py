@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 
 from photonpano.errors import PluginError, described
@@ -79,6 +80,8 @@ def _in_a_line(error: BaseException) -> str:
 
 def _origin(entry_point: EntryPoint) -> Origin:
     """Return the origin of a plugin; the metadata of a damaged installation may lack name or version."""
-    metadata = entry_point.dist.metadata if entry_point.dist else None
+    metadata = None
+    with suppress(OSError):  # where a library has brought importlib_metadata, that raises for missing metadata
+        metadata = entry_point.dist.metadata if entry_point.dist else None
     name, version = (metadata.get_all(key, ["unknown"])[0] if metadata else "unknown" for key in ("Name", "Version"))
     return Origin(name, version, f"{entry_point.name} = {entry_point.value}")

@@ -2,6 +2,7 @@ from .captures import KnownMotion as KnownMotion
 from .captures import MemorySource as MemorySource
 from .captures import photographed as photographed
 from .captures import recorded as recorded
+from .executors import ExecutorConformance as ExecutorConformance
 from .exporters import ExporterConformance as ExporterConformance
 from .interpolators import InterpolatorConformance as InterpolatorConformance
 from .locators import LocatorConformance as LocatorConformance

@@ -29,6 +29,7 @@ HEAVY = frozenset(
         "cupy",
         "cv2",
         "dask",
+        "distributed",
         "h5py",
         "imageio",
         "jax",

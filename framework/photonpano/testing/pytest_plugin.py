@@ -22,6 +22,7 @@ _KINDS = (
     "renderers",
     "exporters",
     "pose_estimators",
+    "executors",
 )
 for _name in ("conformance", "stages", *_KINDS):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")

@@ -9,6 +9,7 @@ import numpy as np
 
 from photonpano import discover
 from photonpano.testing import (
+    ExecutorConformance,
     ExporterConformance,
     InterpolatorConformance,
     MergerConformance,
@@ -167,3 +168,7 @@ class TestExr(ExporterConformance):
 
 class TestHdr(ExporterConformance):
     contribution = CATALOG.find("exporter", "hdr").contribution
+
+
+class TestThreads(ExecutorConformance):
+    contribution = CATALOG.find("executor", "threads").contribution
