@@ -229,5 +229,6 @@ class _OpenFile:
         self.descriptor = os.open(path, os.O_RDONLY)
 
     def __del__(self) -> None:
-        if hasattr(self, "descriptor"):
+        # At the end of the program, modules go before the last files do.
+        if hasattr(self, "descriptor") and os is not None:
             os.close(self.descriptor)
