@@ -5,6 +5,9 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 STEP := @printf '\n== %s\n'
 
+# The tests start Python hundreds of times: each must find its modules compiled, whatever the environment says.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help install test demo bench clean
 .DELETE_ON_ERROR:
 
