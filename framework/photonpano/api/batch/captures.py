@@ -116,15 +116,16 @@ def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callabl
     Raises:
         InputError: there are none.
     """
-    path = folder / given_path(Path(text))
+    given = given_path(Path(text))
+    path = folder / given
     if "\0" in text:
         raise InputError(f"{text!r} contains the character NUL, which no path can; correct the path")
     if path.is_dir():
         return _captures_in(path, endings, is_capture)
     if path.exists() or not glob.has_magic(text):
         return [path]
-    matches = sorted(Path(each) for each in glob.glob(str(path), recursive=True))  # noqa: PTH207 - may be absolute
-    captures = [each for each in matches if not _is_ours(each)]
+    matches = glob.glob(str(given), root_dir=folder, recursive=True)  # noqa: PTH207 - Path.glob finds hidden files as well
+    captures = [each for each in sorted(folder / match for match in matches) if not _is_ours(each)]
     if not captures:
         raise InputError(f"nothing matches {text}; check the pattern")
     return captures

@@ -67,6 +67,17 @@ def test_list_counts_from_its_folder_and_may_have_comments(find: Find) -> None:
     assert find(lists=("day/list.txt",)) == {"a": Path("day/a.npy"), "c": Path("day/../night/c.npy")}
 
 
+def test_patterns_of_a_list_count_from_a_folder_whose_name_is_a_pattern(find: Find) -> None:
+    Path("day").rename("day [1]")
+    Path("day [1]/list.txt").write_text("*.npy\n", encoding="utf-8")
+    assert list(find(lists=("day [1]/list.txt",))) == ["a", "b"]
+
+
+def test_hidden_files_match_no_pattern(find: Find) -> None:
+    Path("day/.c.npy").touch()
+    assert list(find("day/*.npy")) == ["a", "b"]
+
+
 def test_list_on_standard_input_counts_from_the_current_folder(find: Find, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO("day/a.npy\n"))
     assert find(lists=("-",)) == {"a": Path("day/a.npy")}
