@@ -38,15 +38,24 @@ def run_job(job: Job, catalog: Catalog | None = None) -> BatchRow:
     return replace(row, reason="\n".join([row.reason, *warnings]).strip())
 
 
+class _Warnings(logging.Handler):
+    """Collects what is logged as a warning."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.found: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.found.append(f"warning: {record.getMessage()}")
+
+
 @contextmanager
 def _warnings() -> Iterator[list[str]]:
     """Collect what is logged as a warning while the block runs."""
-    logger, found = logging.getLogger("photonpano"), list[str]()
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: found.append(f"warning: {record.getMessage()}")  # type: ignore[method-assign]
+    logger, handler = logging.getLogger("photonpano"), _Warnings()
     logger.addHandler(handler)
     try:
-        yield found
+        yield handler.found
     finally:
         logger.removeHandler(handler)
 
