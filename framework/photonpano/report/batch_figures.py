@@ -75,7 +75,8 @@ def _lines(
         points = found.setdefault(", ".join([row.name, *others]), [])
         if (value := getattr(row, error)) is not None:
             points.append((places[written(row.settings[key])], value))
-    return {name: tuple(map(list, zip(*sorted(points), strict=True))) for name, points in found.items() if points}  # type: ignore[misc]
+    ordered = {name: sorted(points) for name, points in found.items() if points}
+    return {name: ([x for x, _ in points], [y for _, y in points]) for name, points in ordered.items()}
 
 
 def _draw(axes: Axes, lines: Mapping[str, tuple[list[float], list[float]]]) -> None:

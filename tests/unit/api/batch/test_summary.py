@@ -4,6 +4,7 @@ import csv
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,8 +26,8 @@ DONE = {
 }
 
 
-def row(name: str, folder: Path, settings: dict[str, object] | None = None, **found: object) -> BatchRow:
-    return BatchRow(name, Path(f"captures/{name}.npy"), settings or {}, folder / name, **found)  # type: ignore[arg-type]
+def row(name: str, folder: Path, settings: dict[str, Any] | None = None, **found: Any) -> BatchRow:
+    return BatchRow(name, Path(f"captures/{name}.npy"), settings or {}, folder / name, **found)
 
 
 def summary(folder: Path, rows: list[BatchRow], keys: tuple[str, ...] = ()) -> tuple[list[dict[str, str]], str]:
