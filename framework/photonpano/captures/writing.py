@@ -76,7 +76,7 @@ def _write_truth(path: Path, truth: Mapping[str, NDArray[Any]]) -> tuple[Path, .
     if not truth:
         return ()
     with atomic_path(truth_path(path)) as temporary:
-        np.savez(temporary, **truth)  # type: ignore[arg-type]  # the stubs take the names for other parameters
+        np.savez(temporary, allow_pickle=False, **truth)
     return (truth_path(path),)
 
 

@@ -44,7 +44,7 @@ class Store:
             self._require_room(sum(array.nbytes for array in arrays.values()))
             # A record that a power failure damages is computed again; waiting for the disk would cost more.
             with atomic_path(path, flushed=False) as temporary:
-                np.savez(temporary, **arrays)  # type: ignore[arg-type]  # no array is named allow_pickle
+                np.savez(temporary, allow_pickle=False, **arrays)
         except (OutputError, OSError, TypeError) as error:
             if not self._warned:
                 logger.warning("%s; the run goes on, but if it is interrupted, this is computed again", error)
