@@ -129,5 +129,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     server = FileServer(parser.parse_args().folder.absolute())
-    print(server.address, flush=True)  # noqa: T201
+    print(server.address, flush=True)
     server.serve_forever()
