@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import LocationError
+from photonpano import LocationError, OutputError
+from photonpano import run as run_plan
 from photonpano.specs import parse_spec
 
 pytestmark = pytest.mark.usefixtures("without_report")
@@ -23,6 +24,16 @@ def run(outcome_of: Callable) -> Callable[..., Any]:
         return outcome_of(parse_spec({"version": 1, "source": source, "levels": 1}, overrides=overrides))
 
     return run
+
+
+@pytest.fixture
+def run_into(tmp_path: Path) -> Callable[..., Any]:
+    def run_into(capture: Path, *overrides: str) -> Any:
+        source = {"use": "packed-npy", "with": {"path": str(capture)}}
+        spec = {"version": 1, "source": source, "levels": 1}
+        return run_plan(parse_spec(spec, overrides=overrides, output=tmp_path / "runs" / "run"))
+
+    return run_into
 
 
 def refusal(run: Callable, capture: Path, *overrides: str) -> list[str]:
@@ -123,3 +134,28 @@ def test_motion_blurred_exposures_are_not_located_by_chance(run: Callable, simul
     fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 1})
     with pytest.raises(LocationError):
         run(fast, "resample.with.group_size=100")
+
+
+def test_failed_run_leaves_a_report_until_a_run_succeeds(run_into: Callable, with_a_wall: Callable) -> None:
+    capture = with_a_wall(50, 150)
+    with pytest.raises(LocationError) as caught:
+        run_into(capture, "resample.with.group_size=25")
+    report = caught.value.report
+    assert report is not None
+    assert report.name == "run.failed.html"
+    assert [file.name for file in report.parent.iterdir() if not file.name.startswith(".")] == [report.name]
+    run_into(capture, "resample.with.group_size=25", "graph.disconnected=largest")
+    assert not report.exists()
+
+
+@pytest.mark.parametrize("obstacle", ["render_failure", "atomic_path"])
+def test_failure_of_the_report_does_not_hide_that_of_the_run(
+    run_into: Callable, with_a_wall: Callable, monkeypatch: pytest.MonkeyPatch, obstacle: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(f"photonpano.pipeline.failed_run.{obstacle}", fail)
+    with pytest.raises(LocationError) as caught:
+        run_into(with_a_wall(50, 150), "resample.with.group_size=25")
+    assert caught.value.report is None

@@ -47,9 +47,8 @@ def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[
         yield
     except LocationError as error:
         found = obstacles(source, decisions)
-        if not found:
-            raise
-        raise LocationError("\n".join([str(error), *found])) from error
+        error.args = ("\n".join([str(error), *found]),)
+        raise
 
 
 def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:

@@ -72,6 +72,8 @@ def print_error(error: PhotonpanoError, debug: bool = False) -> int:
     """Print an error, each problem of a spec on its own line, and return the exit code."""
     if not isinstance(error, SpecError):
         typer.echo(f"error: {error}", err=True)
+        if error.report is not None:
+            typer.echo(f"report    {error.report}", err=True)
         if isinstance(error, PluginError) and error.__cause__ and not debug:
             typer.echo("for the traceback: photonpano --debug ...", err=True)
         return WRONG_SPEC if isinstance(error, WrongArgumentError) else FAILED

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
@@ -41,6 +41,30 @@ class Contrast:
     blank: str | None = None
 
 
+class UntiedError(LocationError):
+    """Too many exposures of a level are not tied to the others.
+
+    Attributes:
+        level: from 1.
+        groups: the groups of the level.
+        edges: the pairs that were tried.
+        parts: (N,) number of the connected component of each exposure, 0 for the largest.
+        merged: returns an exposure by its number; None where they cannot be merged again.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        level: int,
+        groups: Sequence[Group],
+        edges: Sequence[Edge],
+        parts: NDArray[np.integer],
+        merged: Callable[[int], VirtualExposure] | None,
+    ) -> None:
+        super().__init__(message)
+        self.level, self.groups, self.edges, self.parts, self.merged = level, groups, edges, parts, merged
+
+
 def contrast_of(exposure: VirtualExposure) -> Contrast:
     """Measure how much there is to see in an exposure."""
     longest = exposure.weight.max()
@@ -64,6 +88,7 @@ def require_tied(
     parts: NDArray[np.integer],
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
+    merged: Callable[[int], VirtualExposure] | None = None,
 ) -> None:
     """Refuse a level where too many exposures are not tied to the others.
 
@@ -77,9 +102,10 @@ def require_tied(
         parts: (N,) number of the connected component of each exposure, 0 for the largest.
         contrasts: how much there is to see in each exposure.
         disconnected: the option of the spec.
+        merged: returns an exposure by its number, for whoever looks at those that are lost.
 
     Raises:
-        LocationError: names the frames that are lost, those that are tied together, and why pairs failed.
+        UntiedError: names the frames that are lost, those that are tied together, and why pairs failed.
     """
     tied = parts == 0
     if len(groups) == 1:
@@ -106,7 +132,7 @@ def require_tied(
             *lines,
             "To go on with the largest part alone, set graph.disconnected to largest.",
         ]
-    raise LocationError("\n".join(lines))
+    raise UntiedError("\n".join(lines), level, groups, edges, parts, merged)
 
 
 @contextmanager

@@ -107,7 +107,7 @@ def locate(
         with exposures.clock("locate"), solving(level.number):
             edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
-            require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected)
+            require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             start = registrar.to_plane

@@ -11,6 +11,7 @@ from photonpano.errors import InputError
 from photonpano.motion.attribution import attributing
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.components import build_pose_estimator
+from photonpano.pipeline.failed_run import reporting_failure
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_checks import require_estimate
 from photonpano.pipeline.pose_files import write_pose_files
@@ -61,7 +62,7 @@ def run_poses(
             progress.note("a run with `pose` keeps no work: it begins anew")
         decisions = first_decisions(plan, source)
         start = time.perf_counter()
-        with naming_obstacles(source, decisions):
+        with reporting_failure(plan, begun, decisions, (), capture), naming_obstacles(source, decisions):
             estimate = _estimated(plan, source, decisions, progress)
         observers.posed(estimate, time.perf_counter() - start)
         warnings = [*poses_warnings(estimate), *write_pose_files(folder.staging, estimate, source.info, plan.output.exposures)]

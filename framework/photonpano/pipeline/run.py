@@ -8,12 +8,14 @@ from pathlib import Path
 
 from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Context, Progress, Quiet
+from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
 from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
+from photonpano.pipeline.failed_run import reporting_failure
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_run import run_poses
 from photonpano.pipeline.rendering import render_into
@@ -67,7 +69,8 @@ def run(
 
     Raises:
         InputError: the capture cannot be used, shows nothing, or does not suit the plan.
-        LocationError: the motion could not be estimated.
+        LocationError: the motion could not be estimated; `report` is a page with the exposures that did not match, beside the
+            run folder. So it is for the next two.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
         PluginError: a component failed in its own way, or broke its contract.
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
@@ -77,7 +80,13 @@ def run(
         poses, was_finished = run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keeps_work)
         return RunResult(plan.output.directory, poses, None, was_finished)
     observers = Observers(plan.observers, plan.output.directory)
-    context = Context(progress=progress or Quiet(), on_level=observers.level_finished)
+    finished: list[LevelResult] = []
+
+    def on_level(result: LevelResult) -> None:
+        finished.append(result)
+        observers.level_finished(result)
+
+    context = Context(progress=progress or Quiet(), on_level=on_level)
     with begun_run(plan, observers, context.progress, overwrite=overwrite) as begun, ExitStack() as stack:
         source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
         depends_on = run_fingerprint(plan, source)
@@ -88,6 +97,7 @@ def run(
         decisions = first_decisions(plan, source)
         how = Continuation(resume, from_level, keep_work)
         work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
+        stack.enter_context(reporting_failure(plan, begun, decisions, finished, depends_on["capture"]))
         executor = stack.enter_context(executor_of(plan, source))
         context = replace(context, threads=executor.under_way, checkpoints=work.checkpoints, executor=executor)
         with naming_obstacles(source, decisions):

@@ -161,15 +161,7 @@ def level_record(result: LevelResult) -> LevelRecord:
             for edge in located.edges
             if edge.locator not in ("", first.name)
         ],
-        "failures": [
-            FailureRecord(
-                **_pair(groups, edge),
-                reason=edge.motion.reason,
-                evidence={key: _number(value) for key, value in edge.motion.evidence.items()},
-            )
-            for edge in located.failures
-            if isinstance(edge.motion, NotLocated)
-        ],
+        "failures": failure_records(groups, located.edges),
         "revisits": {
             "pairs": len(located.closures),
             "located": sum(isinstance(edge.motion, Located) for edge in located.closures),
@@ -182,6 +174,24 @@ def level_record(result: LevelResult) -> LevelRecord:
         "evidence": _evidence_record(located.evidence),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
+
+
+def failure_records(groups: Sequence[Group], edges: Sequence[Edge]) -> list[FailureRecord]:
+    """Describe the pairs that were not located.
+
+    Args:
+        groups: of the level.
+        edges: the pairs that were tried.
+    """
+    return [
+        FailureRecord(
+            **_pair(groups, edge),
+            reason=edge.motion.reason,
+            evidence={key: _number(value) for key, value in edge.motion.evidence.items()},
+        )
+        for edge in edges
+        if isinstance(edge.motion, NotLocated)
+    ]
 
 
 def _evidence_record(evidence: Evidence | None) -> EvidenceRecord | None:

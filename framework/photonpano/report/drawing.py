@@ -31,13 +31,14 @@ _X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45
 """Distance of the labels of axes, and of colour bars, from these."""
 
 # matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
-INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
+INK, MUTED, LINE, PAPER, BAD = "#010101", "#010102", "#010103", "#010104", "#010105"
 SERIES = ("#010201", "#010202", "#010203", "#010204", "#010205")
 _VARIABLES = {
     INK: "var(--ink)",
     MUTED: "var(--muted)",
     LINE: "var(--line)",
     PAPER: "var(--paper)",
+    BAD: "var(--bad)",
     **{colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, start=1)},
 }
 

@@ -5,11 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypedDict
 
 from photonpano.record.schema import FailureRecord, LevelRecord
 
 MAX_EXAMPLES = 3
 """Number of pairs of a group that are listed."""
+
+
+class FailedLevel(TypedDict):
+    """The pairs of a level that were not located."""
+
+    level: int
+    failures: Sequence[FailureRecord]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +53,7 @@ class FailureGroup:
         return len(self.failures) - len(self.examples)
 
 
-def failure_groups(levels: Sequence[LevelRecord]) -> list[FailureGroup]:
+def failure_groups(levels: Sequence[LevelRecord | FailedLevel]) -> list[FailureGroup]:
     """Group the failures of each level by reason, the largest groups first."""
     groups = []
     for level in levels:

@@ -13,6 +13,7 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
 from photonpano.report.drawing import (
+    BAD,
     BAR_IN,
     INK,
     LINE,
@@ -32,13 +33,16 @@ from photonpano.report.drawing import (
     svg_of,
 )
 from photonpano.text import duration
-from photonpano.values import FloatArray, FluxImage, true_spans
+from photonpano.values import FloatArray, FluxImage, Group, true_spans
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
 MAX_INSTANTS = 1500
 """Number of instants at which a long trajectory is drawn, evenly spaced."""
+
+MAX_PARTS = 5
+"""Number of parts of a motion graph that have a row of their own."""
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
 
@@ -141,6 +145,35 @@ def coverage_map(coverage: FluxImage) -> str:
         image = axes.imshow(np.ma.masked_less_equal(small, 0), cmap="viridis", vmin=0, extent=extent_of(height, width))
         add_colour_bar(axes, image, "frames", "{x:,.0f}")
         return svg_of(figure, "coverage")
+
+
+def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
+    """Draw the exposures of a level over the frames: a row for each part that is tied together, and one for lone exposures.
+
+    Args:
+        groups: of the level.
+        parts: (N,) number of the connected component of each exposure, 0 for the largest.
+    """
+    sizes = np.bincount(parts)
+    tied = np.flatnonzero(sizes > 1)[:MAX_PARTS]
+    rows = [(f"part {row + 1}", parts == part, SERIES[0]) for row, part in enumerate(tied)]
+    lone, others = sizes[parts] == 1, (sizes[parts] > 1) & ~np.isin(parts, tied)
+    rows += [("other parts", others, SERIES[4])] if others.any() else []
+    rows += [("alone", lone, BAD)] if lone.any() else []
+    with plain_figure(WIDTH_IN, 0.7 + 0.4 * len(rows)) as figure:
+        [axes] = add_axes(figure, Margins(left=1.0, right=0.3))
+        for row, (_, members, colour) in enumerate(rows):
+            spans = [(group.span.start, len(group.span)) for group, member in zip(groups, members, strict=True) if member]
+            axes.broken_barh(spans, (row - 0.32, 0.64), facecolors=colour, edgecolor=PAPER, linewidth=0.6)
+        axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        axes.set_xlim(groups[0].span.start - 0.5, groups[-1].span.stop - 0.5)
+        axes.grid(visible=False, axis="y")
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", colors=INK)
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.set_xlabel("frame")
+        return svg_of(figure, "tied-parts")
 
 
 def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) -> str:

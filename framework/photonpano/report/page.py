@@ -15,6 +15,7 @@ from photonpano.report import figures, residual_figures
 from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.environment import environment_of, yaml_of
 from photonpano.report.failures import failure_groups
+from photonpano.report.files import listed_files
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Light, true_spans
 
@@ -25,18 +26,16 @@ MAX_SPANS = 12
 """Number of spans of frames that are listed."""
 
 
-def render_report(
-    record: RunRecord, explained: Explained | None, panorama: RenderedPanorama | None, light: Light | None = None
-) -> str:
+def render_report(record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None = None) -> str:
     """Return the report of a run as one HTML page that needs no other file, no network and no script.
 
     Args:
         record: the content of `run.json`.
-        explained: the motion of every frame, and what the panorama does not explain; None for a run that failed, whose page
-            has no figures of it.
-        panorama: the panorama; None for a run that failed.
+        explained: the motion of every frame, and what the panorama does not explain.
+        panorama: the panorama.
         light: that the run found; None if it is steady.
     """
+    files, more_files = listed_files(record.get("files", {}))
     page: str = (
         environment_of()
         .get_template("report.html")
@@ -45,7 +44,9 @@ def render_report(
             stages=figures.STAGE_NAMES,
             failures=failure_groups(record["levels"]),
             stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
-            **({"picture": None} if explained is None or panorama is None else _results(record, explained, panorama, light)),
+            files=files,
+            more_files=more_files,
+            **_results(record, explained, panorama, light),
         )
     )
     return page

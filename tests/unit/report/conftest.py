@@ -1,14 +1,16 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Panorama
+from photonpano import FrameSpan, Group, Panorama, VirtualExposure
 from photonpano.geometry import canvas_of, normalised, translation
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.photometry import BinaryResponse
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
@@ -222,3 +224,16 @@ def explained(motion: FrameMotion, panorama: RenderedPanorama, residuals: Residu
 @pytest.fixture
 def record(motion: FrameMotion, panorama: RenderedPanorama) -> dict[str, Any]:
     return make_record(len(motion.homographies), panorama)
+
+
+@pytest.fixture
+def exposure_of() -> Callable[[int], VirtualExposure]:
+    """Return exposures of noise by their number."""
+
+    def exposure_of(index: int) -> VirtualExposure:
+        flux = np.random.default_rng(index).uniform(0.1, 1, (24, 32)).astype(np.float32)
+        flux[0, 0] = np.nan
+        group = Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 50)
+        return VirtualExposure(flux, np.full_like(flux, 100), group, 1.0, BinaryResponse())
+
+    return exposure_of

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from photonpano.report import figures, render_report, residual_figures
+from photonpano import FrameSpan, Group, LocationError, NotLocated
+from photonpano.motion.diagnosis import UntiedError
+from photonpano.report import figures, render_failure, render_report, residual_figures
+from photonpano.values import Edge
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 
@@ -35,7 +38,10 @@ def check_self_contained(page: str) -> None:
     tree = ElementTree.fromstring(page)
     references = [value for element in tree.iter() for name, value in element.attrib.items() if name in ("src", "href")]
     references += re.findall(r"url\(([^)]*)\)", page)
-    assert all(re.match(r"#|data:image/(jpeg|png);base64,", reference) for reference in references), references
+    assert all(re.match(r"#|\./|data:image/(jpeg|png);base64,", reference) for reference in references), references
+    assert {reference for reference in references if reference.startswith("./")} <= {
+        element.attrib.get("href") for element in tree.iter("a")
+    }
     assert not re.search(r"@import|@font-face", page)
     assert not {element.tag for element in tree.iter()} & {"script", "link", "iframe", "object", "base"}
     names = [element.attrib["id"] for element in tree.iter() if "id" in element.attrib]
@@ -116,7 +122,7 @@ def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, explain
 
 def test_level_table_has_one_row_per_level(record, explained, panorama, no_figures):
     tree = ElementTree.fromstring(render_report(record, explained, panorama))
-    [table] = [table for table in tree.iter("table") if table.get("class") == "figures"]
+    [table] = [table for table in tree.iter("table") if "levels" in table.get("class", "")]
     rows = [["".join(cell.itertext()) for cell in row] for row in table.find("tbody")]
     dash = "\N{EN DASH}"
     assert rows == [
@@ -193,22 +199,91 @@ def test_page_reduces_large_panorama(record, explained, panorama, no_figures):
     assert "Reduced for this page" not in render_report(record, explained, panorama)
 
 
-def test_page_of_failed_run_has_no_panorama(record):
-    record.update(status="failed", panorama=None, verdict=None, levels=record["levels"][:2], warnings=["the graph fell apart"])
-    page = render_report(record, None, None)
+@pytest.fixture
+def failed(record):
+    return record | {"status": "failed", "panorama": None, "verdict": None, "motion": None, "levels": [], "warnings": []}
+
+
+def untied(merged=None, reason="too dark"):
+    """Make the error of six exposures: the first three are tied together, so are the next two, and one is alone."""
+    groups = [Group(FrameSpan(100 * k, 100 * k + 100), 100 * k + 50) for k in range(6)]
+    edges = [Edge(3, 2, NotLocated(reason)), Edge(5, 4, NotLocated(f"{reason} as well"))]
+    message = (
+        "level 2: 2 of 8 pairs could not be located\n  frames 300 to 399 onto frames 200 to 299: too dark\nTry larger groups."
+    )
+    return UntiedError(message, 2, groups, edges, np.array([0, 0, 0, 1, 1, 2]), merged)
+
+
+def test_page_of_failed_run_shows_exposures_that_did_not_match(failed, record, exposure_of):
+    page = render_failure(failed | {"levels": record["levels"][:1]}, untied(exposure_of))
     check_self_contained(page)
     text = text_of(page)
-    assert "photonpano 0.1.0 failed corridor-pan" in text
-    assert "located, last level 78 of 79 groups" in text
+    for sentence in (
+        "photonpano 0.1.0 failed corridor-pan",
+        "The run failed: level 2: 2 of 8 pairs could not be located. Try larger groups. The run folder is as it was",
+        "Exposures of one row are tied together",
+        "Frames 300 to 399 against 200 to 299: too dark",
+        "Frames 500 to 599 against 400 to 499: too dark as well",
+    ):
+        assert sentence in text
     assert "Motion" not in text
-    assert page.count("<svg") == 1
+    assert page.count("data:image/jpeg") == 4
+    [figure] = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    assert [name for name in ("part 1", "part 2", "part 3", "other parts", "alone") if f">{name}<" in figure] == [
+        "part 1",
+        "part 2",
+        "alone",
+    ]
 
 
-def test_page_of_run_that_failed_before_level_1(record):
-    record.update(status="failed", panorama=None, verdict=None, levels=[], warnings=[])
-    page = render_report(record, None, None)
+def test_page_of_failed_run_escapes_its_reasons(failed):
+    failed["warnings"] = [HOSTILE]
+    page = render_failure(failed, untied(reason=HOSTILE))
     check_self_contained(page)
+    assert "<script>" not in page
+
+
+def test_page_of_run_that_failed_otherwise_has_its_message_alone(failed):
+    page = render_failure(failed, LocationError("frames reach the horizon\n  and more"))
+    check_self_contained(page)
+    assert "The run failed: frames reach the horizon. and more The run folder" in text_of(page)
     assert "<svg" not in page
+
+
+def test_page_says_verdict_in_words(record, explained, panorama, no_figures):
+    record["motion"] = {"std_px": 0.1234, "worst_std_px": 1.5, "worst_frame": 9874}
+    expected = (
+        "The motion is expected to err by 0.12 px at the corners of a frame, and by 1.5 px at worst (frame 9,874). "
+        "250 frames of 10,000 were not located."
+    )
+    assert f"This panorama is doubtful: 1 thing speaks against it. {expected}" in text_of(
+        render_report(record, explained, panorama)
+    )
+    record["verdict"] = {"status": "trusted", "reasons": [], "residual_ratio": 1.04}
+    words = (
+        "This panorama can be relied on: motion and panorama explain the photons, and short spans of frames scatter 1.04 times"
+    )
+    assert f"{words} as much as noise does. {expected}" in text_of(render_report(record, explained, panorama))
+
+
+def test_page_links_files_of_the_run(record, explained, panorama, no_figures):
+    names = ["strange #1?.txt", "panorama.tiff", "report.html", *(f"images/{k:02d}.png" for k in range(40))]
+    record["files"] = {name: {"bytes": 2048, "sha256": "0" * 64} for name in names}
+    page = render_report(record, explained, panorama)
+    check_self_contained(page)
+    tree = ElementTree.fromstring(page)
+    links = [element.attrib["href"] for element in tree.iter("a")]
+    assert links[:3] == ["./panorama.tiff", "./run.json", "./images/00.png"]
+    assert len(links) == 30
+    assert "And 13 files more; run.json lists all." in text_of(page)
+    record["files"] = {"strange #1?.txt": {"bytes": 5, "sha256": "0" * 64}}
+    assert 'href="./strange%20%231%3F.txt"' in render_report(record, explained, panorama)
+
+
+def test_level_table_names_its_numbers_on_a_phone(record, explained, panorama, no_figures):
+    tree = ElementTree.fromstring(render_report(record, explained, panorama))
+    [table] = [table for table in tree.iter("table") if "levels" in table.get("class", "")]
+    assert all(cell.get("data-name") for row in table.find("tbody") for cell in row)
 
 
 def test_import_of_report_is_light():

@@ -1,0 +1,106 @@
+"""Render the report of a run that failed: the exposures that did not match, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonpano.errors import PhotonpanoError
+from photonpano.motion.diagnosis import UntiedError
+from photonpano.photometry import picture_of
+from photonpano.record.run_json import failure_records
+from photonpano.record.schema import FailureRecord, RunRecord
+from photonpano.report import figures
+from photonpano.report.drawing import jpeg_uri, shrunk
+from photonpano.report.environment import environment_of
+from photonpano.report.failures import FailureGroup, failure_groups
+from photonpano.report.page import head_of
+from photonpano.values import VirtualExposure
+
+MAX_PAIRS = 8
+"""Number of pairs whose exposures are shown."""
+EXPOSURE_PIXELS = 480
+"""Longer side of an exposure on the page."""
+_WHITE_QUANTILE = 0.995
+
+
+@dataclass(frozen=True, slots=True)
+class ShownPair:
+    """A pair that was not located, to look at.
+
+    Attributes:
+        failure: its frames and its reason.
+        moving: its exposure, as a data URI.
+        fixed: the other one.
+    """
+
+    failure: FailureRecord
+    moving: str
+    fixed: str
+
+
+def render_failure(record: RunRecord, error: PhotonpanoError) -> str:
+    """Return the report of a run that failed as one HTML page that needs no other file and no network.
+
+    Args:
+        record: as `run.json` would be, with the status "failed" and the levels that were finished.
+        error: that ended the run. Of an `UntiedError` the page shows the pairs that were not located.
+    """
+    lost = error if isinstance(error, UntiedError) else None
+    groups = [] if lost is None else _groups(lost)
+    page: str = (
+        environment_of()
+        .get_template("failure.html")
+        .render(
+            **head_of(record),
+            lines=_lines(error),
+            level=None if lost is None else lost.level,
+            lost_groups=groups,
+            n_pairs=0 if lost is None else len(lost.edges),
+            n_failed=sum(len(group.failures) for group in groups),
+            parts=None if lost is None else figures.tied_parts(lost.groups, lost.parts),
+            pairs=[] if lost is None else _shown(lost, groups),
+            stages=figures.STAGE_NAMES,
+            failures=failure_groups(record["levels"]),
+        )
+    )
+    return page
+
+
+def _lines(error: PhotonpanoError) -> list[str]:
+    """Return the sentences of the error; the pairs that it lists are shown with their exposures."""
+    lines = str(error).splitlines()
+    return [line for line in lines if not line.startswith("  ")] if isinstance(error, UntiedError) else lines
+
+
+def _groups(lost: UntiedError) -> list[FailureGroup]:
+    return failure_groups([{"level": lost.level, "failures": failure_records(lost.groups, lost.edges)}])
+
+
+def _shown(lost: UntiedError, groups: Sequence[FailureGroup]) -> list[ShownPair]:
+    """Return some pairs of each reason with their exposures; none where these cannot be merged again."""
+    if lost.merged is None:
+        return []
+    number = {(group.span.start, group.span.stop): index for index, group in enumerate(lost.groups)}
+    each = max(1, MAX_PAIRS // max(1, len(groups)))
+    chosen = [failure for group in groups for failure in _spread(group.failures, each)][:MAX_PAIRS]
+    found = []
+    for failure in chosen:
+        pair = [lost.merged(number[span[0], span[1]]) for span in (failure["moving"], failure["fixed"])]
+        moving, fixed = _pictures(pair)
+        found.append(ShownPair(failure, moving, fixed))
+    return found
+
+
+def _spread(failures: Sequence[FailureRecord], most: int) -> list[FailureRecord]:
+    """Return failures from the first to the last, evenly spaced."""
+    return [failures[index] for index in np.unique(np.linspace(0, len(failures) - 1, min(most, len(failures))).astype(int))]
+
+
+def _pictures(pair: Sequence[VirtualExposure]) -> list[str]:
+    """Return exposures as data URIs, of one brightness."""
+    seen = np.concatenate([exposure.flux[np.isfinite(exposure.flux)] for exposure in pair])
+    white = (float(np.quantile(seen, _WHITE_QUANTILE)) if seen.size else 0.0) or 1.0
+    return [jpeg_uri(shrunk(picture_of(exposure.flux, white), EXPOSURE_PIXELS)) for exposure in pair]
