@@ -25,6 +25,7 @@ CENTRE_OF_FIRST_PIXEL = 0.5
 """Position of the first pixel's centre in COLMAP; ours is 0."""
 MAX_TRIALS = 10_000
 """RANSAC finds a homography with 20 % inliers in half as many trials; unrelated images would take far more."""
+_SIFT = pycolmap.FeatureExtractorType.SIFT
 _SEEDS = 2**31
 """Seeds of the library are below this."""
 
@@ -36,16 +37,19 @@ class Features:
     Attributes:
         points: (N, 2) float64, pixel centres are integers.
         sizes: (N,) float64, scales of the keypoints in px; position errors are proportional to them.
-        keypoints: the points and scales in the library's type, with our pixel centres; matching does not depend on the origin.
-        descriptors: (N, 128) uint8, in the library's type.
+        descriptors: (N, 128) uint8.
         shape: (height, width) of the exposure.
     """
 
     points: FloatArray
     sizes: FloatArray
-    keypoints: pycolmap.FeatureKeypoints
-    descriptors: pycolmap.FeatureDescriptors
+    descriptors: NDArray[np.uint8]
     shape: tuple[int, int]
+
+    def for_matcher(self) -> tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors]:
+        """Return points and descriptors in types of the library, which cannot be pickled; matching uses positions alone."""
+        keypoints = [pycolmap.FeatureKeypoint(x=x, y=y) for x, y in self.points.tolist()]
+        return pycolmap.FeatureKeypoints(keypoints), pycolmap.FeatureDescriptors(_SIFT, self.descriptors)
 
 
 class TwoViewLocator(PointLocator):
@@ -80,15 +84,10 @@ class TwoViewLocator(PointLocator):
         # The library checks the limit after each scale, so there may be more.
         largest = np.argsort(-positions[:, 2], kind="stable")
         kept = largest[mask[y, x][largest] > 0][: config.max_keypoints]
-        keypoints = [found[int(index)] for index in kept]
-        for keypoint in keypoints:
-            keypoint.x -= CENTRE_OF_FIRST_PIXEL
-            keypoint.y -= CENTRE_OF_FIRST_PIXEL
         return Features(
             points=positions[kept, :2],
             sizes=positions[kept, 2],
-            keypoints=pycolmap.FeatureKeypoints(keypoints),
-            descriptors=pycolmap.FeatureDescriptors(descriptors.type, descriptors.data[kept]),
+            descriptors=np.asarray(descriptors.data, np.uint8)[kept],
             shape=(image.shape[0], image.shape[1]),
         )
 
@@ -115,7 +114,7 @@ class TwoViewLocator(PointLocator):
 
     def _matched_everywhere(self, moving: Features, fixed: Features) -> NDArray[np.intp]:
         """Return the indices of matches: (K, 2)."""
-        pairs = self._matcher().match(moving.keypoints, moving.descriptors, fixed.keypoints, fixed.descriptors)
+        pairs = self._matcher().match(*moving.for_matcher(), *fixed.for_matcher())
         return np.asarray(pairs, np.intp).reshape(-1, 2)
 
     def _matched_nearby(self, moving: Features, fixed: Features, initial: Homography) -> NDArray[np.intp]:
@@ -126,7 +125,7 @@ class TwoViewLocator(PointLocator):
         # The required camera has no effect on a homography.
         height, width = moving.shape
         camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.0, width, height)
-        first, second = ((each.keypoints, each.descriptors, camera) for each in (moving, fixed))
+        first, second = ((*each.for_matcher(), camera) for each in (moving, fixed))
         self._matcher().match_guided(self._config.search_px, *first, *second, geometry)
         return np.asarray(geometry.inlier_matches, np.intp).reshape(-1, 2)
 

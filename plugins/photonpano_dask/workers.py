@@ -10,6 +10,7 @@ import dask
 from distributed import Client, Future, LocalCluster, wait
 
 from photonpano import ExecutorContext, InputError
+from photonpano.execution import differences
 from photonpano_dask.configs import DaskConfig
 
 _AHEAD = 2
@@ -43,23 +44,21 @@ def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
                 ) from error
     workers = DaskWorkers(client, cluster)
     try:
-        _require_alike(client, context.needs, config.address)
+        _require_alike(client, context, config.address)
     except BaseException:
         workers.close()
         raise
     return workers
 
 
-def _require_alike(client: Client, needs: Callable[[], Mapping[str, str]], address: str | None) -> None:
-    here = needs()
-    there: Mapping[str, Mapping[str, str]] = client.run(needs)
+def _require_alike(client: Client, context: ExecutorContext, address: str | None) -> None:
+    there: Mapping[str, Mapping[str, str]] = client.run(context.elsewhere)
     if not there:
         raise InputError(f"the dask scheduler at {address} has no workers; start some with `dask worker {address}`")
     for worker, found in there.items():
-        different = [f"{name} {found[name]} (here {here[name]})" for name in here if found[name] != here[name]]
-        if different:
+        if different := differences(context.here, found):
             raise InputError(
-                f"the dask worker {worker} differs from this process: {', '.join(different)}; it needs the same versions, and "
+                f"the dask worker {worker} differs from this process: {different}; it needs the same versions, and "
                 "must find the same capture at its path, since results must not depend on the worker"
             )
 

@@ -2,6 +2,6 @@
 
 from photonpano.execution.here import Here
 from photonpano.execution.protocol import Executor
-from photonpano.execution.remote import CaptureElsewhere, Pending, Remote, Workers
+from photonpano.execution.remote import CaptureElsewhere, Pending, Remote, Workers, differences
 
-__all__ = ["CaptureElsewhere", "Executor", "Here", "Pending", "Remote", "Workers"]
+__all__ = ["CaptureElsewhere", "Executor", "Here", "Pending", "Remote", "Workers", "differences"]

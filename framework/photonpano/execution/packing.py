@@ -6,6 +6,8 @@ import io
 import pickle
 from typing import Any
 
+from photonpano.errors import PluginError
+
 _CAPTURE = "capture"
 
 
@@ -17,13 +19,15 @@ def packed(value: object, capture: object) -> bytes:
         capture: the source that stands for the capture.
 
     Raises:
-        TypeError: something that the value holds cannot be pickled.
+        PluginError: something that the value holds cannot be pickled.
     """
     buffer = io.BytesIO()
     try:
         _Packer(buffer, capture).dump(value)
-    except (pickle.PicklingError, AttributeError) as error:
-        raise TypeError(str(error)) from error
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise PluginError(
+            f"a component cannot be sent to other processes: {error}; run it in threads: leave out run.executor"
+        ) from error
     return buffer.getvalue()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import itemgetter
@@ -85,8 +85,8 @@ class Remote:
 
     def share(self, value: ValueT) -> ValueT:
         """Return what stands for a value in tasks: it travels to each worker once."""
-        standin: Any = _StandIn(self._workers.submit(_Shared, packed(value, self._capture), self._opener))
-        return standin  # type: ignore[no-any-return]
+        stand_in: ValueT = self._stand_in(self._workers.submit(_Shared, packed(value, self._capture), self._opener))
+        return stand_in
 
     def call(self, work: Callable[..., ResultT], *given: Any) -> ResultT:
         """Work on a task, and return its result."""
@@ -96,12 +96,14 @@ class Remote:
     def keep(self, work: Callable[..., tuple[ValueT, ResultT]], *given: Any) -> tuple[ValueT, ResultT]:
         """Work on a task with two results; the first stays where it was made."""
         both = self._submitted(work, *given)
-        kept: Any = _StandIn(self._workers.submit(_first, both))
-        return kept, self._awaited(self._workers.submit(_second, both))
+        return self._stand_in(self._workers.submit(_first, both)), self._awaited(self._workers.submit(_second, both))
 
     def close(self) -> None:
         """End the processes that were started."""
         self._workers.close()
+
+    def _stand_in(self, pending: Pending) -> Any:
+        return _StandIn(pending)
 
     def _awaited(self, pending: Pending) -> Any:
         """Wait for a result. Once the program is interrupted, its threads do not wait any longer."""
@@ -160,6 +162,11 @@ class _Shared(_Sent):
 def opened(opener: Callable[[], object]) -> object:
     """Open a capture in the process of a worker, once as long as tasks of one run come."""
     return opener()
+
+
+def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """Say in what another process differs from this one, such as "numpy 2.0 (here 2.1)"; nothing if it does not."""
+    return ", ".join(f"{name} {there[name]} (here {here[name]})" for name in here if there[name] != here[name])
 
 
 def _work(*given: Any) -> Any:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 from uuid import uuid4
 
 from photonpano.contributions import ExecutorContext
-from photonpano.errors import PhotonpanoError
-from photonpano.execution import CaptureElsewhere, Executor, Here
-from photonpano.execution.remote import opened
+from photonpano.errors import InputError, PhotonpanoError
+from photonpano.execution import CaptureElsewhere, Executor, Here, differences
 from photonpano.motion.attributed_source import AttributedSource
 from photonpano.pipeline.components import build_source, built
 from photonpano.protocols import Source
@@ -23,7 +22,7 @@ from photonpano.record.environment import library_versions, plugin_records
 from photonpano.source_wrapper import SourceWrapper
 from photonpano.specs.loading import parse_spec
 from photonpano.specs.plan import Plan
-from photonpano.threads import thread_count
+from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 
@@ -38,12 +37,15 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
     if plan.executor is None:
         yield Here(thread_count(plan.run.threads))
         return
-    document = {key: plan.document[key] for key in ("version", "source")} | {"run": {"seed": plan.run.seed}}
-    # Workers may live longer than a run, and files change: each run has the capture opened anew.
-    opener = CaptureOpener(json.dumps(document, sort_keys=True), uuid4().hex)
+    read = as_read(source)
     names = ("photonpano", *library_versions(plan), *(each["plugin"] for each in plugin_records(plan)))
-    needs = Needs(tuple(dict.fromkeys(names)), opener)
-    context = ExecutorContext(thread_count(plan.run.threads), CaptureElsewhere(as_read(source), opener), needs)
+    here = met_by(dict.fromkeys(names), read)
+    # Not the document, which hides the passwords of URLs.
+    keys = plan.source.config.model_dump(exclude_unset=True, by_alias=True)
+    opener = CaptureOpener(uuid4().hex, plan.run.seed, plan.source.contribution.name, keys, here)
+    context = ExecutorContext(
+        thread_count(plan.run.threads), CaptureElsewhere(read, opener), here=here, elsewhere=partial(met_elsewhere, opener)
+    )
     executor: Executor = built(plan.executor, context)
     try:
         yield executor
@@ -60,48 +62,60 @@ def as_read(source: Source) -> Source:
 
 @dataclass(frozen=True, slots=True)
 class CaptureOpener:
-    """Opens a capture in another process.
+    """Opens a capture in another process, for the tasks of one run.
 
     Attributes:
-        document: the sections of a resolved spec that name it, as JSON.
-        run: distinguishes the run.
+        run: a word of this run alone, by which openers are told apart: workers may live longer than a run, and files change.
+        seed: of the run.
+        source: the name of the source.
+        keys: its keys under `with`.
+        needed: what the run needs, as `met_by` returns it.
     """
 
-    document: str
     run: str
+    seed: int = field(compare=False)
+    source: str = field(compare=False)
+    keys: Mapping[str, Any] = field(compare=False)
+    needed: Mapping[str, str] = field(compare=False)
 
     def __call__(self) -> Source:
-        """Open the capture."""
-        import cv2
+        """Open the capture. From then on, the libraries of the process work in one thread: workers are many processes.
 
-        # A worker is one of many processes, each with a core.
-        cv2.setNumThreads(1)
-        plan = parse_spec(json.loads(self.document) | {"corrections": []}, output="unused")
-        return as_read(build_source(replace(plan, corrections=())))
+        Raises:
+            InputError: this process joined the cluster late, and does not have what the run needs.
+        """
+        source = self.unchecked()
+        if different := differences(self.needed, met_by(self.needed, source)):
+            raise InputError(f"a worker that joined during the run differs from the process that runs it: {different}")
+        return source
 
-
-@dataclass(frozen=True, slots=True)
-class Needs:
-    """Tells what a process has of what a run needs: versions of distributions, and the capture.
-
-    Attributes:
-        names: of the distributions; "python" stands for itself.
-        opener: opens the capture.
-    """
-
-    names: tuple[str, ...]
-    opener: CaptureOpener
-
-    def __call__(self) -> dict[str, str]:
-        """Return versions by name, and a hash of some frames of the capture, or why it cannot be opened."""
-        try:
-            capture = _hash_of(opened(self.opener))
-        except PhotonpanoError as error:
-            capture = str(error)
-        return {name: _version(name) for name in self.names} | {"capture": capture}
+    def unchecked(self) -> Source:
+        """Open the capture, whatever this process has."""
+        _WHILE_THE_PROCESS_LIVES.enter_context(one_thread_inside())
+        spec = {"version": 1, "source": {"use": self.source, "with": self.keys}, "corrections": [], "run": {"seed": self.seed}}
+        return as_read(build_source(parse_spec(spec, output="unused")))
 
 
-def _hash_of(source: Any) -> str:
+_WHILE_THE_PROCESS_LIVES = ExitStack()
+
+
+def met_elsewhere(opener: CaptureOpener) -> dict[str, str]:
+    """Return what another process has of what a run needs; of a capture that it cannot open, why."""
+    try:
+        source = opener.unchecked()
+    except PhotonpanoError as error:
+        return met_by(opener.needed, None) | {"capture": str(error)}
+    return met_by(opener.needed, source)
+
+
+def met_by(needed: Iterable[str], source: Source | None) -> dict[str, str]:
+    """Return what this process has of what a run needs: versions of distributions by name, and a hash of the capture."""
+    return {name: _version(name) for name in needed if name != "capture"} | {
+        "capture": "" if source is None else _hash_of(source)
+    }
+
+
+def _hash_of(source: Source) -> str:
     """Return a hash of what describes a capture, and of its first, middle and last frame."""
     digest, last = hashlib.sha256(repr(source.info).encode()), source.info.n_frames - 1
     for frame in (0, last // 2, last):

@@ -10,6 +10,7 @@ import pluggy
 from photonpano import hookspecs
 from photonpano.contributions import API_VERSION, Contribution
 from photonpano.errors import PluginError, described
+from photonpano.hookspecs import components, observation
 from photonpano.interrupts import is_interrupt
 from photonpano.registry.kinds import KINDS, Kind
 from photonpano.text import listed
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from photonpano.contributions import Contribution
 
 PREFIX = f"{hookspecs.PROJECT}_"
-HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
+HOOKS = tuple(name for module in (components, observation) for name in vars(module) if name.startswith(PREFIX))
 """All hooks, in the order in which they are specified."""
 OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
 """The hooks that offer nothing: a run calls them, so that a plugin can watch it."""

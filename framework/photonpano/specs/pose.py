@@ -23,6 +23,9 @@ def without_panorama(root: dict[str, Any], spec: WrittenSpec) -> dict[str, Any]:
         message = "does not apply with `pose`: there is no panorama to write; `photonpano export` writes poses"
         spec.wrong_key("output.formats", message)
     own = {key: value for key, value in root.items() if key not in PANORAMA_ONLY}
+    run = own.get("run")
+    if isinstance(run, dict) and run.get("executor") is not None:
+        spec.wrong_key("run.executor", "does not apply with `pose`: poses are found in threads of one process")
     output = own.get("output")
     if isinstance(output, dict):
         own["output"] = {key: value for key, value in output.items() if key != "formats"}

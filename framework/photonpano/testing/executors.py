@@ -63,7 +63,7 @@ class ExecutorConformance(Conformance):
         """The executor, built for the capture of this module."""
         checks = cls()
         checks.require_libraries()
-        context = ExecutorContext(2, CaptureElsewhere(capture(), capture), needs=dict)
+        context = ExecutorContext(2, CaptureElsewhere(capture(), capture), here={}, elsewhere=dict)
         executor = checks.contribution.build(checks.settings(), context)
         yield executor
         executor.close()

@@ -17,7 +17,7 @@ from photonpano.motion.checks import require_valid
 from photonpano.protocols import LocatesTurns
 from photonpano.testing.captures import photographed, read_only
 from photonpano.testing.conformance import must_not_raise, passing
-from photonpano.testing.sameness import fingerprint, global_seed, in_threads
+from photonpano.testing.sameness import copied, fingerprint, global_seed, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, accepts_read_only
 from photonpano.values import FloatArray, Homography, Located, NotLocated, StreamInfo, VirtualExposure
@@ -293,6 +293,16 @@ class LocatorConformance(StageConformance):
             others[f"in thread {number} of several at once"] = found
         wrong = [how for how, found in others.items() if found != expected]
         assert not wrong, f"the same pair must give the same bytes; {' and '.join(wrong)}, it gives others"
+
+    def test_locator_works_in_other_processes(self) -> None:
+        """An executor may send it, and what it makes of an exposure, to other processes and machines."""
+        locator = self.built_for_exposures()
+        described = [locator.describe(each) for each in pair("shift", self.shape)]
+        initial = nearby("shift")
+        copy = copied(locator, "a locator")
+        expected = fingerprint(locator.register(*described, initial))
+        found = fingerprint(copy.register(*copied(described, "the result of describe()"), initial))
+        assert found == expected, "the same pair must give the same bytes; a pickled copy of the locator gives others"
 
     def _require_motions(self) -> None:
         if not self.motions:

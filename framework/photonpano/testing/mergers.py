@@ -17,7 +17,7 @@ from photonpano.motion.checks import require_exposure
 from photonpano.protocols import Merger, Source, Trajectory
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
 from photonpano.testing.conformance import passing
-from photonpano.testing.sameness import fingerprint, in_threads
+from photonpano.testing.sameness import copied, fingerprint, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import StageConformance, accepts_read_only
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, FrameSpan, Group, Homography, VirtualExposure
@@ -263,6 +263,14 @@ class MergerConformance(StageConformance):
                     others["in several threads at once"] = found
             wrong = [how for how, found in others.items() if found != expected]
             assert not wrong, f"the same frames must give the same bytes; {' and '.join(wrong)}, the exposure differs"
+
+    def test_merger_works_in_other_processes(self) -> None:
+        """An executor may send it to other processes and machines."""
+        source = MemorySource(moving_frames(), dead_pixels())
+        merger = self.built(source.info)
+        copy = copied(merger, "a merger")
+        expected, found = (fingerprint(each.merge(source, GROUP, MOTION, 1.0)) for each in (merger, copy))
+        assert found == expected, "the same frames must give the same bytes; a pickled copy of the merger gives others"
 
     def _require_compensation(self) -> None:
         if not self.compensates:

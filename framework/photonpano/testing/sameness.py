@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import pickle
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -56,3 +57,15 @@ def in_threads(work: Callable[[int], T]) -> list[T]:
 
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(start, range(THREADS)))
+
+
+def copied(value: T, what: str) -> T:
+    """Return a copy as another process would get it; fail with a message if it cannot travel there."""
+    try:
+        copy: T = pickle.loads(pickle.dumps(value))
+    except Exception as error:
+        raise AssertionError(
+            f"{what} must survive pickling, so that other processes can use it; keep functions and classes at the top of a "
+            f"module, and drop locks and open files in __getstate__ ({type(error).__name__}: {error})"
+        ) from error
+    return copy

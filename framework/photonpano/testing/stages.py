@@ -25,16 +25,10 @@ class StageConformance(Conformance):
     def built(self, stream: StreamInfo = STREAM, threads: int = 1) -> Any:
         """Build the component for a capture; its summary is available only afterwards."""
         self.require_libraries()
-        is_built = False
-
-        def capture() -> CaptureSummary:
-            if not is_built:
-                raise CaptureUnreadError("no frame has been read while the component is being built")
-            return SUMMARY
-
+        capture = _Summary()
         context = StageContext(stream, BinaryResponse(), seed=0, threads=threads, capture=capture, decide=_decided)
         component = self.contribution.build(self.settings(), context)
-        is_built = True
+        capture.available = True
         return component
 
     def test_build_reads_no_frames(self) -> None:
@@ -50,6 +44,17 @@ class StageConformance(Conformance):
         problems = self.contribution.check(self.settings(), STREAM)
         assert not isinstance(problems, str), f"check() must return a sequence of sentences, got the text {problems!r}"
         assert not list(problems), f"check() must accept the config under test for {STREAM}; it returned: {'; '.join(problems)}"
+
+
+class _Summary:
+    """The summary of the capture, once the component is built."""
+
+    available = False
+
+    def __call__(self) -> CaptureSummary:
+        if not self.available:
+            raise CaptureUnreadError("no frame has been read while the component is being built")
+        return SUMMARY
 
 
 def _decided(what: str, value: DecisionValue, reason: str) -> None:

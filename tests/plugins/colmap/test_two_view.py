@@ -93,7 +93,7 @@ def test_keypoints_have_integer_pixel_centres() -> None:
     found = locator().describe(noise_free(0.1 + 0.5 * blobs))
     nearest = np.linalg.norm(found.points[:, None] - true, axis=2).argmin(axis=0)
     np.testing.assert_allclose(found.points[nearest], true, atol=0.1)
-    handed_on = np.array([(each.x, each.y) for each in found.keypoints])
+    handed_on = np.array([(each.x, each.y) for each in found.for_matcher()[0]])
     np.testing.assert_allclose(handed_on, found.points, atol=1e-4)
 
 
@@ -197,6 +197,6 @@ def test_pair_without_texture_is_rejected(photograph: Callable, still: Features,
 def test_describe_keeps_the_largest_keypoints(seen_from: Callable, still: Features) -> None:
     best = locator(max_keypoints=50).describe(seen_from(STILL, 2))
     assert len(still.points) > 300
-    assert len(best.points) == len(best.keypoints) == len(best.descriptors.data) == 50
+    assert len(best.points) == len(best.descriptors) == 50
     assert best.sizes.min() > np.quantile(still.sizes, 0.9)
     assert np.all(np.diff(best.sizes) <= 0)

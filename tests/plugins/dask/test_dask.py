@@ -24,7 +24,7 @@ from photonpano_dask import workers
 from photonpano_dask.configs import DaskConfig
 
 FILES = "trajectory.npz", "panorama.tiff"
-CONTEXT = ExecutorContext(2, CaptureElsewhere(None, lambda: None), lambda: {"photonpano": "0.1.0", "numpy": "2.4.6"})
+CONTEXT = ExecutorContext(2, CaptureElsewhere(None, lambda: None), {"photonpano": "0.1.0", "numpy": "2.4.6"}, dict)
 
 
 class Killing(Quiet):
@@ -100,7 +100,7 @@ def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch
 def test_workers_that_cannot_do_the_run_are_named(found: dict[str, Any], message: str) -> None:
     client: Any = SimpleNamespace(run=lambda _: found)
     with pytest.raises(InputError) as caught:
-        workers._require_alike(client, CONTEXT.needs, "tcp://a:1")
+        workers._require_alike(client, CONTEXT, "tcp://a:1")
     assert str(caught.value) == message
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 import photonpano.pipeline.run as run_module
-from photonpano import FrameSpan, Light, parse_spec, run
+from photonpano import FrameSpan, InputError, Light, PluginError, parse_spec, run
 from photonpano.captures.part import part_of
 from photonpano.corrections import ColourFilter, HotPixels, corrected_source, divided_by
 from photonpano.corrections.vignette import Vignette
@@ -21,7 +20,7 @@ from photonpano.execution.packing import packed, unpacked
 from photonpano.geometry import Camera
 from photonpano.lighting import in_light
 from photonpano.motion.attributed_source import AttributedSource, attributed
-from photonpano.pipeline.executors import CaptureOpener, Needs, as_read
+from photonpano.pipeline.executors import CaptureOpener, as_read, met_elsewhere
 from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
 from photonpano.source_wrapper import seen_through
 from photonpano.testing import MemorySource
@@ -71,7 +70,7 @@ def test_frames_do_not_travel() -> None:
 
 
 def test_what_cannot_travel_is_named() -> None:
-    with pytest.raises(TypeError, match="lambda"):
+    with pytest.raises(PluginError, match=r"cannot be sent to other processes: .*lambda.*; run it in threads"):
         packed(lambda: 0, None)
 
 
@@ -123,18 +122,30 @@ def test_run_on_copies_has_the_same_bytes(tmp_path: Path, monkeypatch: pytest.Mo
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_needs_tell_another_capture_from_this_one(tmp_path: Path) -> None:
+def opener_of(path: Path, needed: Mapping[str, str]) -> CaptureOpener:
+    return CaptureOpener("run", 0, "packed-npy", {"path": path}, needed)
+
+
+@pytest.fixture
+def captures(tmp_path: Path) -> Path:
     rng = np.random.default_rng(0)
-
-    def needs(name: str) -> dict[str, str]:
-        document = {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(tmp_path / name)}}}
-        return Needs(("python", "photonpano", "no-such-thing"), CaptureOpener(json.dumps(document), "run"))()
-
     for name in ("one.npy", "other.npy"):
         np.save(tmp_path / name, rng.integers(0, 256, (9, 16, 4), dtype=np.uint8))
-    here, there, nowhere = (needs(name) for name in ("one.npy", "other.npy", "none.npy"))
+    return tmp_path
+
+
+def test_processes_are_told_apart_by_versions_and_capture(captures: Path) -> None:
+    needed = dict.fromkeys(("python", "photonpano", "no-such-thing"), "")
+    here, there, nowhere = (met_elsewhere(opener_of(captures / f"{name}.npy", needed)) for name in ("one", "other", "none"))
     assert here["no-such-thing"] == "missing"
     assert here["python"] == there["python"]
     assert here["capture"] != there["capture"]
-    assert here == needs("one.npy")
+    assert here == met_elsewhere(opener_of(captures / "one.npy", needed))
     assert "there is no file" in nowhere["capture"]
+
+
+def test_worker_that_joins_late_with_another_capture_is_refused(captures: Path) -> None:
+    needed = met_elsewhere(opener_of(captures / "one.npy", {"photonpano": ""}))
+    assert opener_of(captures / "one.npy", needed)().info.n_frames == 9
+    with pytest.raises(InputError, match=r"joined during the run differs .*: capture \w+ \(here \w+\)"):
+        opener_of(captures / "other.npy", needed)()

@@ -309,8 +309,9 @@ def test_observers_see_the_stage_pose(plan_of: Callable[..., Plan], without_repo
 
 def test_other_sections_are_refused(plan_of: Callable[..., Plan], without_report: None) -> None:
     with pytest.raises(photonpano.SpecError) as caught:
-        plan_of(levels=2, output={"formats": ["hdr"]}, camera={"distortion": {"k1": "find"}})
-    assert [problem.where for problem in caught.value.problems] == ["levels", "output.formats", "camera.distortion.k1"]
+        plan_of(levels=2, output={"formats": ["hdr"]}, camera={"distortion": {"k1": "find"}}, run={"executor": "threads"})
+    where = [problem.where for problem in caught.value.problems]
+    assert where == ["levels", "output.formats", "run.executor", "camera.distortion.k1"]
 
 
 def test_document_is_a_spec_itself(plan_of: Callable[..., Plan], without_report: None) -> None:

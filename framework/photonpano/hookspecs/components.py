@@ -1,21 +1,8 @@
-"""The extension points: one hook a kind, no arguments, each returns contributions; and hooks that watch runs.
-
-A plugin is a module with these hooks, named in the entry-point group `photonpano` of its distribution:
-
-    [project.entry-points.photonpano]
-    my-plugin = "my_plugin.hooks"
-
-The hook module imports no heavy library; the component does so when it is built. `examples/third_party_plugin` is such a
-distribution, and `docs/tutorial/first-plugin.md` writes it step by step.
-"""
+"""The hooks that offer components, one for each kind: they take no arguments, and return contributions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any
-
-import pluggy
+from collections.abc import Iterable
 
 from photonpano.contributions import (
     ExecutorContribution,
@@ -29,16 +16,11 @@ from photonpano.contributions import (
     ResamplerContribution,
     SourceContribution,
 )
-
-PROJECT = "photonpano"
-"""The pluggy project name, and the entry-point group."""
-
-hookspec = pluggy.HookspecMarker(PROJECT)
-hookimpl = pluggy.HookimplMarker(PROJECT)
+from photonpano.hookspecs.markers import hookspec
 
 
 @hookspec
-def photonpano_sources() -> Iterable[SourceContribution]:  # type: ignore[empty-body]
+def photonpano_sources() -> Iterable[SourceContribution]:
     """Offer sources: they open a capture and give the summed counts, or the frames, of a span.
 
     Example:
@@ -61,10 +43,11 @@ def photonpano_sources() -> Iterable[SourceContribution]:  # type: ignore[empty-
             yield SourceContribution(name="my-camera", summary="Files of my camera", config=MyCameraConfig, build=build)
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[empty-body]
+def photonpano_resamplers() -> Iterable[ResamplerContribution]:
     """Offer resamplers: they choose the groups of frames of each level.
 
     Example:
@@ -96,10 +79,11 @@ def photonpano_resamplers() -> Iterable[ResamplerContribution]:  # type: ignore[
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-body]
+def photonpano_mergers() -> Iterable[MergerContribution]:
     """Offer mergers: they merge the frames of a group into a virtual exposure.
 
     Example:
@@ -132,10 +116,11 @@ def photonpano_mergers() -> Iterable[MergerContribution]:  # type: ignore[empty-
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_locators() -> Iterable[LocatorContribution]:  # type: ignore[empty-body]
+def photonpano_locators() -> Iterable[LocatorContribution]:
     """Offer locators: they find the motion between two virtual exposures.
 
     Example:
@@ -165,10 +150,11 @@ def photonpano_locators() -> Iterable[LocatorContribution]:  # type: ignore[empt
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: ignore[empty-body]
+def photonpano_interpolators() -> Iterable[InterpolatorContribution]:
     """Offer interpolators: they turn located instants into a trajectory.
 
     Example:
@@ -206,10 +192,11 @@ def photonpano_interpolators() -> Iterable[InterpolatorContribution]:  # type: i
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_refiners() -> Iterable[RefinerContribution]:  # type: ignore[empty-body]
+def photonpano_refiners() -> Iterable[RefinerContribution]:
     """Offer refiners: they correct the motion after the last level, from residuals of short spans of frames.
 
     Example:
@@ -257,10 +244,11 @@ def photonpano_refiners() -> Iterable[RefinerContribution]:  # type: ignore[empt
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_renderers() -> Iterable[RendererContribution]:  # type: ignore[empty-body]
+def photonpano_renderers() -> Iterable[RendererContribution]:
     """Offer renderers: they render flux and weight on a canvas.
 
     Example:
@@ -308,10 +296,11 @@ def photonpano_renderers() -> Iterable[RendererContribution]:  # type: ignore[em
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_exporters() -> Iterable[ExporterContribution]:  # type: ignore[empty-body]
+def photonpano_exporters() -> Iterable[ExporterContribution]:
     """Offer exporters: they write the panorama as a file of another format.
 
     Example:
@@ -347,10 +336,11 @@ def photonpano_exporters() -> Iterable[ExporterContribution]:  # type: ignore[em
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_pose_estimators() -> Iterable[PoseEstimatorContribution]:  # type: ignore[empty-body]
+def photonpano_pose_estimators() -> Iterable[PoseEstimatorContribution]:
     """Offer pose estimators: they find the pose of each frame of a camera that travels through a scene. Experimental.
 
     Example:
@@ -377,10 +367,11 @@ def photonpano_pose_estimators() -> Iterable[PoseEstimatorContribution]:  # type
             )
         ```
     """
+    return ()
 
 
 @hookspec
-def photonpano_executors() -> Iterable[ExecutorContribution]:  # type: ignore[empty-body]
+def photonpano_executors() -> Iterable[ExecutorContribution]:
     """Offer executors: they work on the tasks of a run, such as those of a level. Experimental.
 
     One for other processes is a `photonpano.execution.Remote` around something that passes tasks on: see `Workers`.
@@ -420,84 +411,4 @@ def photonpano_executors() -> Iterable[ExecutorContribution]:  # type: ignore[em
             )
         ```
     """
-
-
-@hookspec
-def photonpano_run_started(directory: Path, spec: Mapping[str, Any]) -> None:
-    """Watch a run begin, before its capture is opened.
-
-    Observation hooks look and do not touch: what they are given is frozen, what they return is ignored, and what they raise is
-    logged with the name of their plugin, while the run goes on. They are called in the thread that runs, one after the other. A
-    plugin takes those of the arguments that it needs, by name.
-
-    Args:
-        directory: the run folder. It may not be there yet, and belongs to the run: write elsewhere.
-        spec: the resolved spec, defaults filled in.
-
-    Example:
-        ```python
-        import sys
-
-        from photonpano import hookimpl
-
-
-        @hookimpl
-        def photonpano_run_started(directory, spec):
-            print(f"{directory}: begins with {spec['source']['use']}, seed {spec['run']['seed']}", file=sys.stderr)
-        ```
-    """
-
-
-@hookspec
-def photonpano_stage_finished(
-    directory: Path, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]
-) -> None:
-    """Watch a stage end. Merging and locating alternate, so the hook is called for all four stages when the level is done.
-
-    A run with `pose` has the stage "pose" only: levels belong to the pose estimator.
-
-    Args:
-        directory: the run folder, by which runs can be distinguished.
-        level: from 1; None for the panorama and for poses.
-        stage: "resample", "merge", "locate" or "interpolate"; at the end of the run "render"; with `pose` only "pose".
-        seconds: how long it took.
-        summary: its results. resample: `groups`; merge: `exposures`; locate: `pairs`, `failed` pairs and `located`
-            exposures; interpolate: `change_px` (None at level 1) and `std_px` (None if not known), as in `run.json`; render:
-            `height` and `width` of the panorama; pose: numbers of `located` frames, of `exposures` and of `points`.
-
-    Example:
-        ```python
-        import sys
-
-        from photonpano import hookimpl
-
-
-        @hookimpl
-        def photonpano_stage_finished(level, stage, seconds):
-            where = "" if level is None else f"level {level}: "
-            print(f"{where}{stage} took {seconds:.1f} s", file=sys.stderr)
-        ```
-    """
-
-
-@hookspec
-def photonpano_run_finished(directory: Path, record: Mapping[str, Any] | None, error: str | None) -> None:
-    """Watch a run end, well or not: called once for each run that started.
-
-    Args:
-        directory: the run folder; complete if the run ended well, else as it was before.
-        record: the content of `run.json`; None if the run failed.
-        error: the class of what ended the run, and its message; None if it ended well.
-
-    Example:
-        ```python
-        import sys
-
-        from photonpano import hookimpl
-
-
-        @hookimpl
-        def photonpano_run_finished(directory, record, error):
-            print(f"{directory}: {error or 'done'}", file=sys.stderr)
-        ```
-    """
+    return ()

@@ -1,0 +1,51 @@
+"""What plugins are made of: the records that offer components, their configs, and what components are told."""
+
+from photonpano.contributions.configs import Config, SpecLocation, SpecPath
+from photonpano.contributions.contexts import ExecutorContext, SourceContext, StageContext
+from photonpano.contributions.records import (
+    API_VERSION,
+    Contribution,
+    ExecutorContribution,
+    ExporterContribution,
+    InterpolatorContribution,
+    LocatorContribution,
+    MergerContribution,
+    PartOfCapture,
+    PoseEstimatorContribution,
+    Recognised,
+    RefinerContribution,
+    RendererContribution,
+    Requirement,
+    ResamplerContribution,
+    SourceContribution,
+    StageContribution,
+    WriteFrames,
+    install_command,
+)
+
+__all__ = [
+    "API_VERSION",
+    "Config",
+    "Contribution",
+    "ExecutorContext",
+    "ExecutorContribution",
+    "ExporterContribution",
+    "InterpolatorContribution",
+    "LocatorContribution",
+    "MergerContribution",
+    "PartOfCapture",
+    "PoseEstimatorContribution",
+    "Recognised",
+    "RefinerContribution",
+    "RendererContribution",
+    "Requirement",
+    "ResamplerContribution",
+    "SourceContext",
+    "SourceContribution",
+    "SpecLocation",
+    "SpecPath",
+    "StageContext",
+    "StageContribution",
+    "WriteFrames",
+    "install_command",
+]
