@@ -2,7 +2,9 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-INSTALLED := $(VENV)/installed
+# Files that mark what $(VENV) holds: what runs photonpano, or all that the tests need as well.
+RUNS := $(VENV)/runs
+COMPLETE := $(VENV)/complete
 STEP := @printf '\n== %s\n'
 
 # The tests start Python hundreds of times: each must find its modules compiled, whatever the environment says.
@@ -15,19 +17,20 @@ help:
 	@echo 'make demo     simulate a small capture, make its panorama, and score it'
 	@echo 'make test     run all checks and tests'
 	@echo 'make bench    run the benchmarks, which takes long'
-	@echo 'make install  make the virtual environment $(VENV)'
+	@echo 'make install  make the virtual environment $(VENV), with all that tests and benchmarks need'
 	@echo 'make clean    remove the virtual environment, the demo and caches'
 
-install: $(INSTALLED)
+install: $(COMPLETE)
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(COMPLETE): EXTRAS := [dev]
+$(RUNS) $(COMPLETE): pyproject.toml constraints.txt
 	$(STEP) 'installing into $(VENV)'
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: photonpano needs Python 3.11 or newer; try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
-	@touch $@
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.$(EXTRAS)'
+	@touch $(RUNS) $@
 
-test: $(INSTALLED)
+test: $(COMPLETE)
 	$(STEP) 'ruff check'
 	@$(BIN)/ruff check .
 	$(STEP) 'ruff format'
@@ -39,7 +42,7 @@ test: $(INSTALLED)
 	$(STEP) 'pytest'
 	@$(BIN)/pytest -n auto --dist worksteal
 
-demo: $(INSTALLED)
+demo: $(RUNS)
 	@mkdir -p demo
 	$(STEP) 'simulating a capture'
 	@$(BIN)/photonpano simulate examples/pipelines/demo-capture.yaml --output demo/capture.npy
@@ -49,7 +52,7 @@ demo: $(INSTALLED)
 	@$(BIN)/photonpano evaluate demo/run --truth demo/capture.truth.npz
 	$(STEP) 'done; look at $(CURDIR)/demo/run/panorama.png and report.html beside it'
 
-bench: $(INSTALLED)
+bench: $(COMPLETE)
 	$(STEP) 'benchmarks'
 	@$(BIN)/pytest tests/benchmarks -s --timeout 0
 
