@@ -21,6 +21,7 @@ from pydantic import BaseModel
 import photonpano
 from photonpano import discover, hookspecs
 from photonpano.cli.app import app
+from photonpano.cli.verbosity import PARAMETERS
 from photonpano.corrections import CORRECTIONS
 from photonpano.registry import KINDS
 from photonpano.registry.description import config_rows
@@ -107,6 +108,8 @@ def command(names: Sequence[str]) -> str:
     for name in names:
         node = node.commands[name]
     shown = [parameter for parameter in node.params if "--help" not in parameter.opts]
+    if not names:  # every command takes these as well
+        shown += PARAMETERS
     rows = []
     for parameter in shown:
         flags = [*parameter.opts, *parameter.secondary_opts]

@@ -10,10 +10,11 @@ from photonpano.cli.batch import batch
 from photonpano.cli.check import check
 from photonpano.cli.check_run import check_run
 from photonpano.cli.clean import clean
+from photonpano.cli.command import Command
 from photonpano.cli.convert import convert
 from photonpano.cli.dark import dark
 from photonpano.cli.ending import end_on_signals, leave
-from photonpano.cli.errors import FAILED, SIGNALLED, print_error, reported
+from photonpano.cli.errors import FAILED, SIGNALLED, print_error
 from photonpano.cli.evaluate import evaluate
 from photonpano.cli.explain import explain
 from photonpano.cli.export import export
@@ -25,6 +26,7 @@ from photonpano.cli.run import run
 from photonpano.cli.schema import schema
 from photonpano.cli.simulate import simulate
 from photonpano.cli.streams import prepare_streams
+from photonpano.cli.verbosity import with_verbosity
 from photonpano.cli.verify import verify
 from photonpano.cli.video import video
 from photonpano.cli.warm_up import warm_up
@@ -33,18 +35,16 @@ from photonpano.interrupts import interrupted_by
 
 
 class _Commands(TyperGroup):
-    """The commands, with their errors reported."""
+    """The commands."""
 
-    def invoke(self, ctx: Any) -> Any:
-        """Run a command; its errors become a message and an exit code."""
-        with reported(debug=ctx.params["debug"]):
-            return super().invoke(ctx)
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters."""
+        return with_verbosity(super().get_params(ctx))
 
 
 app = typer.Typer(
     name="photonpano",
     cls=_Commands,
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -55,7 +55,7 @@ _COMMANDS = (
     *(convert, export, simulate, dark, evaluate, clean, schema, warm_up),
 )
 for command in _COMMANDS:
-    app.command()(command)
+    app.command(cls=Command)(command)
 app.add_typer(plugins, name="plugins")
 
 

@@ -7,7 +7,6 @@ import typer
 
 from photonpano.cli.options import Overwrite, SpecPath
 from photonpano.cli.verdict import Strict
-from photonpano.context import Quiet
 
 if TYPE_CHECKING:
     from photonpano.record.batch_row import BatchRow
@@ -87,22 +86,13 @@ def batch(
         prepared = prepare_batch(spec, captures or (), output, lists=lists or (), changes=changes or (), swept=sweep or ())
     except InputError as error:
         raise WrongArgumentError(str(error)) from error
-    progress = progress_for_stderr()
-    result = run_batch(prepared, jobs, _Lines() if isinstance(progress, Quiet) else progress, overwrite=overwrite)
+    result = run_batch(prepared, jobs, progress_for_stderr(notes=True), overwrite=overwrite)
     typer.echo(columns([_HEAD, *map(_cells, result.rows)]))
     typer.echo(f"\nsummary   {result.directory / PAGE}")
     if result.failed:
         raise PhotonpanoError(f"{len(result.failed)} of {counted(len(result.rows), 'run')} failed; the others are done")
     if strict and (doubtful := [row for row in result.rows if row.verdict != "trusted"]):
         raise DoubtfulError(f"{counted(len(doubtful), 'run is', 'runs are')} doubtful, and --strict accepts only trusted ones")
-
-
-class _Lines(Quiet):
-    """Progress without a terminal: a line for each run."""
-
-    def note(self, message: str) -> None:
-        """Print a line on stderr."""
-        typer.echo(message, err=True)
 
 
 _HEAD = ("capture", "verdict", "expected error", "true error", "frames", "time", "memory", "reason")

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import typer
 
+from photonpano.cli.verbosity import SHOWN, log_shown
 from photonpano.errors import PhotonpanoError, PluginError, SpecError
 from photonpano.interrupts import interrupted_by
 
@@ -48,7 +49,12 @@ def reported(*, debug: bool = False) -> Iterator[None]:
         raise typer.Exit(print_error(PluginError(what), debug)) from error
     except KeyboardInterrupt as error:
         typer.echo(INTERRUPTED, err=True)
+        log_shown(logging.ERROR, INTERRUPTED.strip())
         raise typer.Exit(SIGNALLED + interrupted_by()) from error
+    except Exception as error:
+        if not isinstance(error, typer.Exit | typer.BadParameter):
+            log_shown(logging.ERROR, "a defect of photonpano or of a plugin", error)
+        raise
     finally:
         logger.removeHandler(handler)
 
@@ -62,6 +68,8 @@ class _Warnings(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a warning."""
+        if record.name == SHOWN:
+            return
         if self._debug and record.exc_info:
             traceback.print_exception(record.exc_info[1])
         # Not with typer.echo, which bypasses the progress bars.
@@ -70,6 +78,7 @@ class _Warnings(logging.Handler):
 
 def print_error(error: PhotonpanoError, debug: bool = False) -> int:
     """Print an error, each problem of a spec on its own line, and return the exit code."""
+    log_shown(logging.ERROR, str(error), error if isinstance(error, PluginError) else None)
     if not isinstance(error, SpecError):
         typer.echo(f"error: {error}", err=True)
         if error.report is not None:
@@ -87,3 +96,4 @@ def print_error(error: PhotonpanoError, debug: bool = False) -> int:
 def warn(message: str) -> None:
     """Print a warning."""
     typer.echo(f"warning: {message}", err=True)
+    log_shown(logging.WARNING, message)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from photonpano.errors import Problem
     from photonpano.registry import Catalog
@@ -28,11 +28,30 @@ Overrides = Annotated[
 CapturePath = Annotated[
     str, typer.Argument(metavar="PATH", help="A capture (a file, a folder, or a URL), or a spec (.yaml).", show_default=False)
 ]
+
+
+def component_names(*kinds: str) -> Callable[[str], list[str]]:
+    """Return what completes the name of a component.
+
+    Args:
+        kinds: of the components; by default all.
+    """
+
+    def complete(incomplete: str) -> list[str]:
+        from photonpano.registry import discover
+
+        rows = discover().rows
+        return sorted({each.name for each in rows if each.name.startswith(incomplete) and (not kinds or each.kind in kinds)})
+
+    return complete
+
+
 SourceName = Annotated[
     str | None,
     typer.Option(
         "--source",
         metavar="NAME",
+        autocompletion=component_names("source"),
         help="The source that reads the capture; by default the one that recognises it.",
         show_default=False,
     ),

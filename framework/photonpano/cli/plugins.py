@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from photonpano.cli.options import Json
+from photonpano.cli.command import Command
+from photonpano.cli.options import Json, component_names
 
 if TYPE_CHECKING:
     from photonpano.registry import Catalog, Entry, Origin
@@ -35,7 +36,7 @@ class KindName(StrEnum):
 _KIND_NAMES = ", ".join(KindName)
 
 
-@plugins.command("list")
+@plugins.command("list", cls=Command)
 def list_plugins(
     kind: Annotated[
         KindName | None, typer.Option(metavar="KIND", help=f"Only components of this kind: {_KIND_NAMES}.", show_default=False)
@@ -68,9 +69,14 @@ def list_plugins(
         typer.echo(f"{len(catalog.broken)} {are} broken, see: photonpano plugins list --broken", err=True)
 
 
-@plugins.command("show")
+@plugins.command("show", cls=Command)
 def show_plugin(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the component in specs.", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="The name of the component in specs.", show_default=False, autocompletion=component_names()
+        ),
+    ],
     kind: Annotated[
         KindName | None,
         typer.Option(

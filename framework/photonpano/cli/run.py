@@ -47,6 +47,7 @@ def run(
     """
     from photonpano.cli.errors import WrongArgumentError, warn
     from photonpano.cli.progress import progress_for_stderr
+    from photonpano.cli.verbosity import log_decisions
     from photonpano.cli.verdict import DoubtfulError, print_verdict, require_trust
     from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
     from photonpano.pipeline.run import run as run_plan
@@ -60,6 +61,7 @@ def run(
         plan, progress_for_stderr(), overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work
     )
     record, directory = result.record, result.directory.resolve()
+    log_decisions(record)
     if result.was_finished:
         typer.echo("finished  this run was finished before; nothing was left to do")
     if result.verdict is not None:

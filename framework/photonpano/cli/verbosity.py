@@ -1,0 +1,174 @@
+"""How much commands say beside their results: -v, -q and --log, before the name of a command or after it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from photonpano import __version__
+from photonpano.text import byte_size, duration
+
+if TYPE_CHECKING:
+    from photonpano.record.schema import RunRecord
+
+logger = logging.getLogger("photonpano")
+SHOWN = f"{__name__}.shown"
+"""The logger of what is on the screen already, such as progress: for the log file alone."""
+_VERBOSE, _QUIET, _LOG = "verbose", "quiet", "log"
+_chosen: set[str] = set()
+
+
+def is_quiet() -> bool:
+    """Return whether progress is not wanted."""
+    return _QUIET in _chosen
+
+
+def is_verbose() -> bool:
+    """Return whether details are wanted."""
+    return _VERBOSE in _chosen
+
+
+def is_logged() -> bool:
+    """Return whether anything below a warning is written anywhere."""
+    return logger.isEnabledFor(logging.INFO)
+
+
+def log_shown(level: int, message: str, error: BaseException | None = None) -> None:
+    """Write what was printed to the log file, with the traceback of an error."""
+    if is_logged():
+        logging.getLogger(SHOWN).log(level, "%s", message, exc_info=error)
+
+
+def log_decisions(record: RunRecord) -> None:
+    """Log each decision of a run with its reason, and what the run took."""
+    if not is_logged():
+        return
+    for each in record["decisions"]:
+        logger.info("%s %s: %s", each["what"], each["value"], each["reason"])
+    memory = record["peak_memory_bytes"]
+    logger.info("took %s%s", duration(record["seconds"]), f" and at most {byte_size(memory)} of memory" if memory else "")
+
+
+def with_verbosity(parameters: list[Any]) -> list[Any]:
+    """Return the parameters of a command, with those of this module before `--help`."""
+    return [*parameters[:-1], *PARAMETERS, *parameters[-1:]]
+
+
+@contextmanager
+def verbosity_of(ctx: Any) -> Iterator[None]:
+    """Say as much as the options want, until the command ends.
+
+    Raises:
+        typer.BadParameter: both -v and -q are given, or the log cannot be written.
+    """
+    wanted: dict[str, Any] = ctx.meta.get(__name__, {})
+    if {_VERBOSE, _QUIET} <= wanted.keys():
+        raise typer.BadParameter("give one of them", param_hint="'-v' and '-q'")
+    handlers: list[logging.Handler] = [_Details(logging.INFO)] if _VERBOSE in wanted else []
+    if path := wanted.get(_LOG):
+        try:
+            handlers.append(_LogFile(path))
+        except OSError as error:
+            raise typer.BadParameter(f"cannot write {path}: {error.strerror}", param_hint="'--log'") from error
+    level = logger.level
+    if handlers:
+        logger.setLevel(min(each.level for each in handlers))
+    for each in handlers:
+        logger.addHandler(each)
+    _chosen.update(wanted)
+    try:
+        log_shown(logging.INFO, f"photonpano {__version__}, process {os.getpid()}, in {Path.cwd()}")
+        yield
+    finally:
+        _chosen.difference_update(wanted)
+        logger.setLevel(level)
+        for each in handlers:
+            logger.removeHandler(each)
+            each.close()
+
+
+def _keep(ctx: typer.Context, parameter: typer.CallbackParam, value: bool | Path | None) -> None:
+    """Keep the value of an option for `verbosity_of`; a group and its commands share `meta`."""
+    if value:
+        ctx.meta.setdefault(__name__, {})[parameter.name] = value
+
+
+class _Details(logging.Handler):
+    """Prints what is less than a warning on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a line."""
+        if record.levelno < logging.WARNING and record.name != SHOWN:
+            sys.stderr.write(f"{record.getMessage()}\n")
+
+
+class _LogFile(logging.FileHandler):
+    """Appends lines to a file, each with its time. A disk that is full ends the file, not the command."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
+        self.setLevel(logging.DEBUG)
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+        self._failed = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, unless one could not be written before."""
+        if not self._failed:
+            super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Say once that the log has ended."""
+        del record
+        self._failed = True
+        reason = traceback.format_exception_only(sys.exc_info()[1])[-1].strip()
+        sys.stderr.write(f"warning: the log {self.baseFilename} ends here: {reason}\n")
+
+    def close(self) -> None:
+        """Close the file; what a full disk did not take is lost."""
+        try:
+            super().close()
+        except OSError:
+            self._failed = True
+
+
+def _options(
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose",
+            "-v",
+            callback=_keep,
+            expose_value=False,
+            help="Say more on standard error: each decision with its reason and, without a terminal, each stage with its time.",
+        ),
+    ] = False,
+    quiet: Annotated[
+        bool,
+        typer.Option("--quiet", "-q", callback=_keep, expose_value=False, help="Say only results, warnings and errors."),
+    ] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log",
+            metavar="FILE",
+            callback=_keep,
+            expose_value=False,
+            help="Append stages, decisions, warnings and errors to a file, each with its time.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Carry the options."""
+
+
+_carrier = typer.Typer(add_completion=False)
+_carrier.command()(_options)
+PARAMETERS: list[Any] = typer.main.get_command(_carrier).params
