@@ -24,8 +24,8 @@ def batch(
         list[str] | None,
         typer.Argument(
             metavar="[CAPTURE]...",
-            help="Files, folders, and patterns in quotes, such as 'captures/*.npy'. A folder that is no capture stands for "
-            "those in it.",
+            help="Files, folders, URLs, and patterns in quotes, such as 'captures/*.npy'. A folder that is no capture stands "
+            "for those in it.",
             show_default=False,
         ),
     ] = None,
@@ -90,7 +90,8 @@ def batch(
     typer.echo(columns([_HEAD, *map(_cells, result.rows)]))
     typer.echo(f"\nsummary   {result.directory / PAGE}")
     if result.failed:
-        raise PhotonpanoError(f"{len(result.failed)} of {counted(len(result.rows), 'run')} failed; the others are done")
+        others = "; the others are done" if len(result.failed) < len(result.rows) else ""
+        raise PhotonpanoError(f"{len(result.failed)} of {counted(len(result.rows), 'run')} failed{others}")
     if strict and (doubtful := [row for row in result.rows if row.verdict != "trusted"]):
         raise DoubtfulError(f"{counted(len(doubtful), 'run is', 'runs are')} doubtful, and --strict accepts only trusted ones")
 

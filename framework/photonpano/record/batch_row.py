@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from photonpano.paths import Location
+
 Status = Literal["waiting", "running", "done", "failed", "interrupted"]
 
 
@@ -17,7 +19,7 @@ class BatchRow:
 
     Attributes:
         name: of the capture, which is the name of its folder.
-        capture: the file or folder.
+        capture: the file or folder, or its URL.
         settings: the swept keys of the spec with their values; empty without a sweep.
         directory: the run folder.
         status: "waiting", "running", "done", "failed", or "interrupted" for a run that the end of the batch has stopped.
@@ -38,7 +40,7 @@ class BatchRow:
     """
 
     name: str
-    capture: Path
+    capture: Location
     settings: Mapping[str, Any]
     directory: Path
     status: Status = "waiting"

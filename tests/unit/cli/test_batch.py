@@ -62,6 +62,11 @@ def test_failed_run_exits_with_1(place: Path, invoke: Callable[..., Any]) -> Non
     ]
 
 
+def test_nothing_else_is_done_where_all_fail(place: Path, invoke: Callable[..., Any]) -> None:
+    done = invoke("batch", "scan.yaml", "bad.npy", "-o", "out")
+    assert done.stderr.endswith("error: 1 of 1 run failed\n")
+
+
 def test_doubtful_run_fails_with_strict_alone(place: Path, invoke: Callable[..., Any]) -> None:
     done = invoke("batch", "scan.yaml", "odd.npy", "-o", "out", "--strict")
     assert done.exit_code == 1

@@ -25,6 +25,7 @@ from photonpano.api.batch.workers import rows_of
 from photonpano.context import Progress, Quiet
 from photonpano.errors import InputError, OutputError, Problem, SpecError
 from photonpano.locks import locked
+from photonpano.paths import Location
 from photonpano.record.batch_row import BatchRow
 from photonpano.registry import discover
 from photonpano.specs.loading import read_spec
@@ -91,7 +92,7 @@ def batch(
     Args:
         spec: a spec file, or a spec as plain data whose relative paths count from the current folder. Each capture takes the
             place of its `source.with.path`.
-        captures: files, folders, and patterns such as `captures/*.npy`.
+        captures: files, folders, URLs, and patterns such as `captures/*.npy`.
         output: the folder of the batch. The run folder of `night.npy` is `night` in it.
         changes: values to change in all runs, such as `run.seed=1`. A list sweeps a key that takes no list.
         sweep: values of keys, such as `{"resample.with.group_size": [50, 100]}`; every combination is run on every capture.
@@ -138,15 +139,15 @@ def prepare_batch(
         file = Path(spec)
         text = SpecText(read_spec(file), file.parent.absolute(), file)
 
-    def problems_of(capture: Path, *overrides: str) -> tuple[Problem, ...]:
+    def problems_of(capture: Location, *overrides: str) -> tuple[Problem, ...]:
         try:
             text.plan([*overrides, capture_override(capture)], directory, catalog)
         except SpecError as error:
             return error.problems
         return ()
 
-    def is_capture(path: Path) -> bool:
-        return not any(is_of_capture(each.where) for each in problems_of(path))
+    def is_capture(place: Location) -> bool:
+        return not any(is_of_capture(each.where) for each in problems_of(place))
 
     found = find_captures(captures, lists, catalog, is_capture)
     sample = next((each for each in found.values() if is_capture(each)), next(iter(found.values())))

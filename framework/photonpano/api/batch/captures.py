@@ -1,4 +1,4 @@
-"""Find the captures of a batch: files, folders, patterns, and lists of them."""
+"""Find the captures of a batch: files, folders, URLs, patterns, and lists of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from photonpano.contributions import SourceContribution
 from photonpano.errors import InputError
-from photonpano.paths import given_path, refusal
+from photonpano.paths import Location, Url, given_path, location, refusal
 from photonpano.record.contents import RECORD
 from photonpano.registry import Catalog
 
@@ -21,14 +21,14 @@ _LONGEST_LIST = 2**24
 
 def find_captures(
     given: Iterable[str | Path], lists: Iterable[str | Path], catalog: Catalog, is_capture: Callable[[Path], bool]
-) -> dict[str, Path]:
+) -> dict[str, Location]:
     """Find captures, and name them.
 
     A file that is missing counts as a capture: its run fails and says so, and the others go on.
 
     Args:
-        given: files, folders and patterns such as `captures/*.npy`, relative to the current folder. A folder that is no
-            capture stands for the captures in it.
+        given: files, folders and patterns such as `captures/*.npy`, relative to the current folder, and URLs. A folder that
+            is no capture stands for the captures in it.
         lists: text files with one of these a line, relative to the folder of the list; empty lines, and those that begin with
             `#`, are left out. `-` is standard input, whose paths count from the current folder.
         catalog: the sources, whose files end as captures do.
@@ -41,7 +41,7 @@ def find_captures(
         InputError: nothing is found in a place, a list cannot be read, two captures have one name, or there are none at all;
             the message has all problems, a line each.
     """
-    found: dict[Path, Path] = {}
+    found: dict[Location, Location] = {}
     problems: list[str] = []
     sources = [each.contribution for each in catalog.rows if isinstance(each.contribution, SourceContribution)]
     endings = {suffix for source in sources for suffix in source.suffixes}
@@ -49,23 +49,23 @@ def find_captures(
     for text, folder, where in _texts(given, lists, problems):
         nothing_given = False
         try:
-            for path in _captures_at(text, folder, endings, is_capture):
-                found.setdefault(path.resolve(), path)
+            for place in _captures_at(text, folder, endings, is_capture):
+                found.setdefault(place if isinstance(place, Url) else place.resolve(), place)
         except (InputError, ValueError, OSError) as error:
             problems.append(f"{where}{error}")
     if nothing_given and not problems:
         problems.append("no capture is given: name files, folders, or patterns in quotes such as 'captures/*.npy'")
-    named: dict[str, Path] = {}
-    for path in found.values():
-        name = _name(path)
-        if any("\ud800" <= each <= "\udfff" for each in str(path.absolute())):
-            problems.append(f"{str(path)!a} is no text of UTF-8, which results cannot record; rename it")
+    named: dict[str, Location] = {}
+    for place in found.values():
+        name = _name(place)
+        if any("\ud800" <= each <= "\udfff" for each in str(place if isinstance(place, Url) else place.absolute())):
+            problems.append(f"{str(place)!a} is no text of UTF-8, which results cannot record; rename it")
         if name in named:
             problems.append(
-                f"two captures are called {name}, and would get one run folder: {named[name]} and {path}; rename one of them, "
+                f"two captures are called {name}, and would get one run folder: {named[name]} and {place}; rename one of them, "
                 "or run them in two batches"
             )
-        named.setdefault(name, path)
+        named.setdefault(name, place)
     if problems:
         raise InputError("\n".join(problems))
     return named
@@ -110,12 +110,16 @@ def _lines(path: Path) -> tuple[Sequence[str], Path]:
         raise InputError(f"{path}: the list of captures cannot be read: {error.strerror}") from error
 
 
-def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> list[Path]:
-    """Return the captures that a text stands for: a path, or a pattern.
+def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> Sequence[Location]:
+    """Return the captures that a text stands for: a path, a URL, or a pattern.
 
     Raises:
         InputError: there are none.
     """
+    if isinstance(url := location(text), Url):
+        if "*" in str(url):
+            raise InputError(f"{url} is a pattern, and only files of this computer are matched; name each URL, as in a list")
+        return [url]
     given = given_path(Path(text))
     path = folder / given
     if "\0" in text:
@@ -152,8 +156,12 @@ def _is_ours(path: Path) -> bool:
     return path.name.endswith(_TRUTH) or (path / RECORD).is_file()
 
 
-def _name(path: Path) -> str:
+def _name(place: Location) -> str:
     """Return the name of a capture: that of its folder, or of its file without the ending."""
-    absolute = path.absolute()
-    plain = Path(absolute.stem) if absolute.suffix in _COMPRESSED else absolute
-    return absolute.name if path.is_dir() else plain.stem
+    if isinstance(place, Url):
+        whole = Path(place.name or place.host)
+    else:
+        whole = place.absolute()
+        if place.is_dir():
+            return whole.name
+    return Path(whole.stem).stem if whole.suffix in _COMPRESSED else whole.stem

@@ -14,6 +14,7 @@ from photonpano.api.batch.job import Job, is_of_capture
 from photonpano.captures.writing import truth_path
 from photonpano.errors import InputError, PhotonpanoError, SpecError, described
 from photonpano.evaluation import evaluate, evaluate_poses
+from photonpano.paths import Url
 from photonpano.pipeline.run import RunResult, run
 from photonpano.record.batch_row import BatchRow
 from photonpano.registry import Catalog
@@ -67,7 +68,7 @@ def _attempted(job: Job, catalog: Catalog | None) -> BatchRow:
         if plan.run.threads == "auto":  # the record keeps `auto`: results do not depend on it
             plan = replace(plan, run=plan.run.model_copy(update={"threads": job.threads}))
         result = run(plan, overwrite=job.overwrite, resume=True)
-        return _scored(_finished(job.row, result), truth_path(job.row.capture), result)
+        return _scored(_finished(job.row, result), result)
     except SpecError as error:
         own = [each for each in error.problems if is_of_capture(each.where)]
         reason = "\n".join(each.message for each in own) if len(own) == len(error.problems) else str(error)
@@ -100,9 +101,9 @@ def _finished(row: BatchRow, result: RunResult) -> BatchRow:
     )
 
 
-def _scored(row: BatchRow, truth: Path, result: RunResult) -> BatchRow:
-    """Add the score of a run whose truth is known."""
-    if not truth.exists():
+def _scored(row: BatchRow, result: RunResult) -> BatchRow:
+    """Add the score of a run whose truth lies beside the capture."""
+    if isinstance(row.capture, Url) or not (truth := truth_path(row.capture)).exists():
         return row
     try:
         if result.record["poses"]:

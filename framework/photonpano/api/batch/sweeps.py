@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from photonpano.errors import Problem, SpecError
+from photonpano.paths import Location, Url, as_written
 from photonpano.record.batch_row import written
 from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
@@ -56,9 +57,9 @@ class SpecText:
         )
 
 
-def capture_override(capture: Path) -> str:
+def capture_override(capture: Location) -> str:
     """Return the override that puts a capture in the place of that of the spec."""
-    return override(CAPTURE_KEY, str(capture.absolute()))
+    return override(CAPTURE_KEY, as_written(capture if isinstance(capture, Url) else capture.absolute()))
 
 
 def override(key: str, value: Any) -> str:

@@ -49,6 +49,8 @@ def find(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Find:
         (["night/c.npy", "day/../night/c.npy", "night/*"], {"c": "night/c.npy"}),
         (["absent.npy"], {"absent": "absent.npy"}),
         (["day/b.npy", "old/b.c.npy.gz"], {"b": "day/b.npy", "b.c": "old/b.c.npy.gz"}),
+        (["s3://day/b.npy", "s3://day/b.npy", "s3://night"], {"b": "s3://day/b.npy", "night": "s3://night"}),
+        (["https://me:secret@host/c.npy.gz?key=secret"], {"c": "https://host/c.npy.gz"}),
     ],
     ids=lambda value: " ".join(value),
 )
@@ -91,12 +93,14 @@ def test_all_problems_come_at_once(find: Find) -> None:
     Path("night/a.npy").touch()
     with pytest.raises(InputError) as caught:
         find(
-            "*.mat", "empty", "night", "a\0b", "caf\udce9", lists=("bad.txt", "none.txt", "data.txt", "latin.txt", "absent.txt")
+            *("*.mat", "empty", "night", "a\0b", "caf\udce9", "s3://day/*.npy"),
+            lists=("bad.txt", "none.txt", "data.txt", "latin.txt", "absent.txt"),
         )
     assert str(caught.value).splitlines() == [
         "nothing matches *.mat; check the pattern",
         "empty is no capture that the spec can read, and there is none in it; name the files",
         "'a\\x00b' contains the character NUL, which no path can; correct the path",
+        "s3://day/*.npy is a pattern, and only files of this computer are matched; name each URL, as in a list",
         "bad.txt:2: nothing matches day/*.h5; check the pattern",
         "none.txt: the list names no capture; write one a line",
         "data.txt: not a list of captures, which is text; name captures as arguments",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import BatchRow, LocationError
+from photonpano import BatchRow, Location, LocationError, Url
 from photonpano.api.batch import running
 from photonpano.api.batch.job import Job
 from photonpano.api.batch.running import run_job
@@ -22,9 +22,15 @@ from photonpano.pipeline.run import RunResult
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 25}}, "levels": 1, "refine": []}
 
 
+@pytest.fixture(scope="module")
+def scan(simulated: Callable[..., Path]) -> Path:
+    """A capture of 200 frames of 64x96 px, with its truth."""
+    return simulated(n_frames=200, frame_shape=[64, 96])
+
+
 @pytest.fixture
-def job_of(tmp_path: Path) -> Callable[[Path], Job]:
-    def job_of(capture: Path) -> Job:
+def job_of(tmp_path: Path) -> Callable[[Location], Job]:
+    def job_of(capture: Location) -> Job:
         row = BatchRow("cube", capture, {}, tmp_path / "out" / "cube")
         return Job(row, SpecText(SPEC, tmp_path), (capture_override(capture),), 1)
 
@@ -46,11 +52,8 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     return found
 
 
-def test_run_is_scored_and_not_repeated(
-    job_of: Callable[[Path], Job], simulated: Callable[..., Path], without_report: None
-) -> None:
-    capture = simulated(n_frames=200, frame_shape=[64, 96])
-    job = pickle.loads(pickle.dumps(job_of(capture)))
+def test_run_is_scored_and_not_repeated(job_of: Callable[[Location], Job], scan: Path, without_report: None) -> None:
+    job = pickle.loads(pickle.dumps(job_of(scan)))
     row = run_job(job)
     assert (row.status, row.was_finished, row.n_frames, row.has_report) == ("done", False, 200, True), row.reason
     assert row.verdict in ("trusted", "doubtful")
@@ -60,6 +63,18 @@ def test_run_is_scored_and_not_repeated(
     assert row.thumbnail.startswith("data:image/jpeg;base64,")
     again = run_job(job)
     assert (again.was_finished, again.true_error_px, again.seconds) == (True, row.true_error_px, row.seconds)
+
+
+def test_capture_at_a_url_is_run_without_a_score(
+    job_of: Callable[[Location], Job], scan: Path, file_server: Callable[..., Any], without_report: None
+) -> None:
+    with file_server(scan.parent) as server:
+        job = job_of(Url(f"{server.address}/{scan.name}?key=secret"))
+        row = run_job(job)
+        assert (row.status, row.n_frames, row.true_error_px) == ("done", 200, None), row.reason
+        assert run_job(job).was_finished
+    assert str(row.capture) == f"{server.address}/{scan.name}"
+    assert "secret" not in (row.directory / "run.json").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -74,7 +89,7 @@ def test_run_is_scored_and_not_repeated(
     ids=["absent", "empty", "text", "cut short", "black"],
 )
 def test_capture_that_cannot_be_used_says_why(
-    job_of: Callable[[Path], Job], tmp_path: Path, content: bytes | str | None, reason: str
+    job_of: Callable[[Location], Job], tmp_path: Path, content: bytes | str | None, reason: str
 ) -> None:
     path = tmp_path / "cube.npy"
     if isinstance(content, str):
@@ -89,7 +104,7 @@ def test_capture_that_cannot_be_used_says_why(
 
 
 def test_error_and_warnings_of_a_run_are_its_reason(
-    job_of: Callable[[Path], Job], found: Callable[[Any], None], small_capture: Path, monkeypatch: pytest.MonkeyPatch
+    job_of: Callable[[Location], Job], found: Callable[[Any], None], small_capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found(LocationError("none of the pairs could be located"))
     logger = logging.getLogger("photonpano.pipeline")
@@ -99,7 +114,7 @@ def test_error_and_warnings_of_a_run_are_its_reason(
 
 
 def test_run_without_a_usable_truth_is_done(
-    job_of: Callable[[Path], Job], small_capture: Path, small_run: RunResult, found: Callable[[Any], None], tmp_path: Path
+    job_of: Callable[[Location], Job], small_capture: Path, small_run: RunResult, found: Callable[[Any], None], tmp_path: Path
 ) -> None:
     found(small_run)
     capture = tmp_path / "cube.npy"
@@ -112,7 +127,7 @@ def test_run_without_a_usable_truth_is_done(
 
 
 def test_poses_have_doubts_and_errors_of_positions(
-    job_of: Callable[[Path], Job],
+    job_of: Callable[[Location], Job],
     small_capture: Path,
     small_run: RunResult,
     found: Callable[[Any], None],
