@@ -15,6 +15,8 @@ from .api.poses import ExportedPoses as ExportedPoses
 from .api.poses import export as export
 from .api.rendering import RenderResult as RenderResult
 from .api.rendering import render as render
+from .api.results import load_panorama as load_panorama
+from .api.results import load_trajectory as load_trajectory
 from .api.run_check import RunCheck as RunCheck
 from .api.run_check import check_run as check_run
 from .api.runs import evaluate as evaluate
@@ -25,6 +27,7 @@ from .api.verification import verify as verify
 from .api.video import Video as Video
 from .api.video import video as video
 from .context import Progress as Progress
+from .context import Quiet as Quiet
 from .contributions import Config as Config
 from .contributions import ExecutorContext as ExecutorContext
 from .contributions import ExecutorContribution as ExecutorContribution
@@ -53,6 +56,7 @@ from .errors import PluginError as PluginError
 from .errors import SpecError as SpecError
 from .evaluation import Evaluation as Evaluation
 from .evaluation import PoseScore as PoseScore
+from .evaluation import RunTrajectory as RunTrajectory
 from .evaluation import evaluate_poses as evaluate_poses
 from .execution import Executor as Executor
 from .hookspecs import hookimpl as hookimpl

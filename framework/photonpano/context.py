@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from photonpano.execution import Executor, Here
+from photonpano.notebooks import NotebookBars, in_notebook
 from photonpano.threads import in_order
 
 ItemT = TypeVar("ItemT")
@@ -38,6 +39,11 @@ class Quiet:
 
     def note(self, message: str) -> None:
         """Ignore a line."""
+
+
+def usual(progress: Progress | None) -> Progress:
+    """Return the progress that is given or, for None, the usual one: bars in a notebook, and nothing elsewhere."""
+    return progress or (NotebookBars() if in_notebook() else Quiet())
 
 
 class Log(Protocol):

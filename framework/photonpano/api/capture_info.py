@@ -11,11 +11,13 @@ from photonpano.captures.order import order_warning
 from photonpano.captures.summary import require_photons, saturated_share, summarise
 from photonpano.corrections import CorrectedSource, FilteredSource, HotPixels, without_still_pixels
 from photonpano.errors import InputError
+from photonpano.notebooks import facts
 from photonpano.paths import Url
 from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.protocols import Source
 from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
+from photonpano.text import duration
 from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import CaptureSummary, StreamInfo
 
@@ -83,6 +85,24 @@ class CaptureInfo:
     def stream(self) -> StreamInfo:
         """Frames, size and rate as one value."""
         return StreamInfo(self.n_frames, self.height, self.width, self.frame_rate_hz, self.kind, self.bit_depth)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return what was found, in words: pairs of a name and what it is."""
+        speed, size = self.speed_px, self.group_size
+        return [
+            ("source", self.source + (f" ({self.reason})" if self.reason else "")),
+            ("capture", str(self.stream)),
+            ("duration", "unknown without frame_rate_hz" if self.seconds is None else duration(self.seconds)),
+            ("flux", f"{self.flux:.3g} photons per pixel per frame"),
+            ("hot pixels", f"about {percent(self.hot_share)}" if self.hot_share else "none"),
+            ("still", self.still_how),
+            ("speed", self.speed_how if speed is None else f"{speed:.2g} px per frame ({self.speed_how})"),
+            ("group size", "unknown" if size is None else f"{size}: {self.group_size_reason}"),
+        ]
+
+    def _repr_html_(self) -> str:
+        """Show what was found, and the warnings, in a notebook."""
+        return facts([*self.rows(), *(("warning", each) for each in self.warnings)])
 
 
 def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:

@@ -12,9 +12,10 @@ from photonpano.atomic import atomic_folder
 from photonpano.captures.picture_files import counted, write_pngs
 from photonpano.captures.sharp import require_sharp_views, sharp_pictures
 from photonpano.captures.writing import write_folder, write_packed
-from photonpano.context import Progress, Quiet
+from photonpano.context import Progress, usual
 from photonpano.contributions import SourceContribution
 from photonpano.errors import OutputError
+from photonpano.notebooks import facts
 from photonpano.pipeline.components import build_source
 from photonpano.protocols import Source
 from photonpano.registry import Catalog, discover
@@ -43,6 +44,12 @@ class WrittenCapture:
     source: Mapping[str, Any]
     sharp: Path | None = None
 
+    def _repr_html_(self) -> str:
+        """Show what was written in a notebook."""
+        files = {"capture": self.path, "truth": self.truth, "frames without noise": self.sharp}
+        rows = [(name, str(path)) for name, path in files.items() if path]
+        return facts([*rows, ("frames", str(self.info)), ("source", str(dict(self.source)))])
+
 
 def convert(
     plan: Plan,
@@ -61,7 +68,7 @@ def convert(
     Args:
         plan: of the capture, from `capture_plan` or `load_spec`; its corrections are applied.
         output: the .npy file, or a folder with a name that ends as those that a source writes, such as .zarr.
-        progress: receives the stage; quiet by default.
+        progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
         resumed: called with the number of frames that OUTPUT.part holds, if there are any.
         compress: whether to compress the frames, in a format that can.
         catalog: the sources that may write it; by default those of the installed plugins.
@@ -86,7 +93,7 @@ def simulate(
     Args:
         plan: of the capture; its source may be any that gives binary frames.
         output: the .npy file, or the folder.
-        progress: receives the stage; quiet by default.
+        progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
         sharp_every: frames from one picture without noise to the next. They are written to the folder CAPTURE.sharp, such as
             cube.sharp/frame_000050.png for cube.npy: 8 bits, sRGB, the same white in all. None writes none.
 
@@ -102,7 +109,7 @@ def simulate(
         sharp, views = output.with_suffix(".sharp"), require_sharp_views(source)
         frames = range(0, source.info.n_frames, sharp_every)
         with atomic_folder(sharp) as folder:
-            with one_thread_inside(), (progress or Quiet()).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
+            with one_thread_inside(), usual(progress).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
                 pictures = sharp_pictures(views, frames, thread_count(plan.run.threads))
                 write_pngs(folder, counted(pictures, advance), [f"frame_{frame:06}" for frame in frames])
             return replace(_write(source, plan, output, progress, None, writer), sharp=sharp)
@@ -127,7 +134,7 @@ def _write(
     compressed: bool = False,
 ) -> WrittenCapture:
     info, n_masked, threads = source.info, int((~source.valid).sum()), thread_count(plan.run.threads)
-    with (progress or Quiet()).stage(f"writing {output.name}", info.n_frames, "frames") as advance:
+    with usual(progress).stage(f"writing {output.name}", info.n_frames, "frames") as advance:
         if writer is not None and (write := writer.write) is not None:
             folder, *truth = write_folder(source, output, partial(write, compressed=compressed), advance, threads)
             section = {"use": writer.name, "with": {"path": str(folder)}}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from photonpano.atomic import atomic_path
-from photonpano.context import Progress, Quiet
+from photonpano.context import Progress, usual
 from photonpano.corrections import hot_in_the_dark, measure_dark, write_dark
 from photonpano.corrections.hot_pixels import THRESHOLD
 from photonpano.errors import InputError, OutputError
@@ -55,7 +55,7 @@ def dark(plan: Plan, output: Path | str, threshold: float = THRESHOLD, progress:
         plan: of the capture; corrections that move pixels are applied.
         output: an .npz file for the dark counts, or a .npy file for the mask of the hot pixels.
         threshold: how far hot pixels stand out, in standard deviations.
-        progress: receives the stage; quiet by default.
+        progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
 
     Raises:
         InputError: all pixels are masked.
@@ -68,7 +68,7 @@ def dark(plan: Plan, output: Path | str, threshold: float = THRESHOLD, progress:
         info, valid = source.info, source.valid
         if not valid.any():
             raise InputError("dark counts cannot be measured: all pixels of the capture are masked")
-        with (progress or Quiet()).stage("dark counts", info.n_frames, "frames") as advance:
+        with usual(progress).stage("dark counts", info.n_frames, "frames") as advance:
             measured = measure_dark(source, advance)
     hot, limit = hot_in_the_dark(measured, threshold, valid)
     with atomic_path(output) as temporary:

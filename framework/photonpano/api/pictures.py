@@ -7,7 +7,7 @@ from pathlib import Path
 
 from photonpano.captures.picture_files import counted, require_writable, write_pictures
 from photonpano.captures.preview import Style, pictures, preview_spans, white_flux
-from photonpano.context import Progress, Quiet
+from photonpano.context import Progress, usual
 from photonpano.pipeline.components import build_source
 from photonpano.specs import Plan
 from photonpano.threads import one_thread_inside, thread_count
@@ -58,7 +58,7 @@ def preview(
         srgb: whether levels follow the sRGB curve, or are proportional to the flux.
         label: whether frames and time are written below each picture.
         fps: pictures a second of a film.
-        progress: receives the stage; quiet by default.
+        progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
 
     Raises:
         OutputError: the pictures cannot be written, or a library that writes them is missing.
@@ -71,6 +71,6 @@ def preview(
         style = Style(white_flux(source, spans, quantile, threads) if white is None else white, srgb, label)
         digits = len(str(source.info.n_frames))
         names = [f"frame_{span.start:0{digits}}" for span in spans]
-        with (progress or Quiet()).stage(f"writing {output.name}", len(spans), "pictures") as advance:
+        with usual(progress).stage(f"writing {output.name}", len(spans), "pictures") as advance:
             write_pictures(output, counted(pictures(source, spans, style, threads), advance), names, fps)
         return Preview(output, len(spans), len(spans[0]), style.white_flux, source.info)

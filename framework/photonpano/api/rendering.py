@@ -5,12 +5,12 @@ from __future__ import annotations
 import datetime
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.captures.fingerprint import capture_files, fingerprint
-from photonpano.context import Context, Progress, Quiet
+from photonpano.context import Context, Progress, usual
 from photonpano.errors import InputError
 from photonpano.pipeline.rendering import Rendering, render_into
 from photonpano.pipeline.run_folder import run_folder as writing_run_folder
@@ -18,6 +18,7 @@ from photonpano.record.environment import library_versions, peak_memory_bytes, p
 from photonpano.record.run_json import decision_records, panorama_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
+from photonpano.report.notebook import run_html
 from photonpano.threads import one_thread_inside, thread_count
 
 _SECTIONS = ("render", "output", "run", "source")
@@ -34,7 +35,11 @@ class RenderResult:
     """
 
     directory: Path
-    record: RunRecord
+    record: RunRecord = field(repr=False)
+
+    def _repr_html_(self) -> str:
+        """Show picture and files in a notebook."""
+        return run_html(self.directory, self.record)
 
 
 def render(
@@ -56,7 +61,7 @@ def render(
         changes: values of the recorded spec to change, such as `render.scale=2`, `output.formats=[exr]`, or
             `source.with.path=...` for a capture that was moved.
         overwrite: whether `output` may hold files that no run has written, which stay, or a run of another capture.
-        progress: receives the stages; quiet by default.
+        progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
 
     Raises:
@@ -82,7 +87,7 @@ def render(
         one_thread_inside(),
     ):
         require_same_plane(opened)
-        context = Context(thread_count(opened.plan.run.threads), progress or Quiet())
+        context = Context(thread_count(opened.plan.run.threads), usual(progress))
         rendering = render_into(written, opened.plan, opened.source, opened.vignette, opened.motion, context)
         record = written.commit(_record(opened, rendering, time.perf_counter() - start))
     return RenderResult(opened.plan.output.directory, record)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonpano.api.opened_run import opened_run
-from photonpano.context import Context, Progress, Quiet
+from photonpano.context import Context, Progress, usual
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
 from photonpano.residuals.refinement import Look, refine
@@ -36,7 +36,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
 
     Args:
         run_folder: written by `run`.
-        progress: receives the stages; quiet by default.
+        progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
 
     Raises:
@@ -44,7 +44,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
     """
     with opened_run(Path(run_folder), catalog) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
-        context = Context(thread_count(plan.run.threads), progress or Quiet())
+        context = Context(thread_count(plan.run.threads), usual(progress))
         rendering = plan.render.tolerance_px, int(plan.run.memory), context
         explained = refine(opened.source, Look(opened.source, opened.motion, *rendering), (), *rendering)
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])

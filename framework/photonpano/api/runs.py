@@ -8,7 +8,7 @@ from pathlib import Path
 
 from photonpano.api.captures import simulate
 from photonpano.api.opened_run import opened_run
-from photonpano.context import Context, Progress, Quiet
+from photonpano.context import Context, Progress, usual
 from photonpano.evaluation import Evaluation
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.geometry import Canvas
@@ -36,7 +36,7 @@ def evaluate(
         run_folder: written by `run`.
         truth: the `.truth.npz` that was simulated with the capture.
         oracle: also render the capture along the true motion, and score that; opens the capture again.
-        progress: receives the stages of that; quiet by default.
+        progress: receives the stages of that; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
 
     Raises:
@@ -48,7 +48,7 @@ def evaluate(
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             source, plan = opened.source, opened.plan
-            context = Context(thread_count(plan.run.threads), progress or Quiet())
+            context = Context(thread_count(plan.run.threads), usual(progress))
             renderer = build_renderer(plan, source, [])
             images = render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
             return composed(images, source)

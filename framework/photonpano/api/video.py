@@ -13,7 +13,7 @@ import numpy as np
 from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.rendering import require_harmless, require_same_plane
 from photonpano.captures.picture_files import counted, require_writable, write_pictures
-from photonpano.context import Progress, Quiet
+from photonpano.context import Progress, usual
 from photonpano.errors import ExtentError, InputError, ProjectionError
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
@@ -82,7 +82,7 @@ def video(
             begins where the exposure of the one before ends.
         trail: whether to draw the outline of the frame, over the panorama.
         changes: values of the recorded spec to change, such as `render.scale=0.5` or `render.extent=reference`.
-        progress: receives the stages; quiet by default.
+        progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
 
     Raises:
@@ -95,7 +95,7 @@ def video(
     for change in changes:
         require_harmless(change)
     _require_arguments(view, fps, speed, trail)
-    output, progress = Path(output), progress or Quiet()
+    output, progress = Path(output), usual(progress)
     with opened_run(Path(run_folder), catalog, changes) as opened, one_thread_inside():
         require_same_plane(opened)
         n_frames, step = _timing(opened, exposure, fps, speed)

@@ -1,14 +1,8 @@
 """photonpano info."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
 import typer
 
 from photonpano.cli.options import CapturePath, Corrections, Json, Keys, SourceName
-
-if TYPE_CHECKING:
-    from photonpano.api.capture_info import CaptureInfo
 
 
 def info(
@@ -40,23 +34,8 @@ def info(
     if as_json:
         typer.echo(json.dumps(asdict(found), indent=2))
         return
-    typer.echo(columns(list(_rows(found))))
+    typer.echo(columns(found.rows()))
     for warning in found.warnings:
         warn(warning)
     spec = "\n".join(f"{section}: {flow(value)}" for section, value in found.spec.items())
     typer.echo(f"\nA spec to start from:\n\n{spec}")
-
-
-def _rows(found: "CaptureInfo") -> Iterator[list[str]]:
-    from photonpano.api.capture_info import percent
-    from photonpano.text import duration
-
-    speed, size = found.speed_px, found.group_size
-    yield ["source", found.source + (f" ({found.reason})" if found.reason else "")]
-    yield ["capture", str(found.stream)]
-    yield ["duration", "unknown without frame_rate_hz" if found.seconds is None else duration(found.seconds)]
-    yield ["flux", f"{found.flux:.3g} photons per pixel per frame"]
-    yield ["hot pixels", f"about {percent(found.hot_share)}" if found.hot_share else "none"]
-    yield ["still", found.still_how]
-    yield ["speed", found.speed_how if speed is None else f"{speed:.2g} px per frame ({found.speed_how})"]
-    yield ["group size", "unknown" if size is None else f"{size}: {found.group_size_reason}"]

@@ -2,7 +2,7 @@
 
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
-from photonpano.evaluation.inputs import RunTrajectory, Truth, load_run_trajectory, load_truth
+from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.pose_inputs import RunPoses, has_poses, load_run_poses, load_true_poses
 from photonpano.evaluation.poses import PoseScore, align_positions, evaluate_poses, pose_errors
 from photonpano.evaluation.rotations import RotationScore, Turn, rotation_errors
@@ -28,6 +28,7 @@ __all__ = [
     "exposure_bound_px",
     "has_poses",
     "image_score",
+    "load_panorama",
     "load_run_poses",
     "load_run_trajectory",
     "load_true_poses",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
+from photonpano.evaluation.path import drawn_path
 from photonpano.evaluation.rotations import Turn
 from photonpano.geometry import PROJECTIONS, Camera, Canvas, corners, nearest_rotations, normalised, translation
+from photonpano.notebooks import facts
 from photonpano.reading import read_arrays, reading
+from photonpano.text import pixels
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
 _TRUTH = "a truth as `photonpano simulate` writes it"
@@ -77,6 +80,22 @@ class RunTrajectory:
         if self.camera is None:
             return None
         return Turn(nearest_rotations(self.camera.rotations(self.homographies)), self.camera)
+
+    def _repr_html_(self) -> str:
+        """Show the path in a notebook."""
+        return drawn_path(self.homographies[self.located], self.frame_shape) + facts(self._rows())
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        located = self.located
+        yield "frames", f"{located.sum():,} of {len(located):,} located"
+        if np.isfinite(self.std_px[located]).any():
+            std = self.std_px[located]
+            yield (
+                "expected error",
+                f"{pixels(float(np.nanmean(std)))} px, and {pixels(float(np.nanmax(std)))} px in the worst frame",
+            )
+        if self.camera is not None:
+            yield "camera", f"turns; focal length {self.camera.focal_px:,.0f} px"
 
 
 def load_truth(path: Path) -> Truth:

@@ -6,7 +6,7 @@ import time
 
 from photonpano.captures.fingerprint import fingerprint
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.context import Progress, Quiet
+from photonpano.context import Progress, usual
 from photonpano.errors import InputError
 from photonpano.motion.attribution import attributing
 from photonpano.pipeline.checkpoints.finished import finished_run
@@ -33,7 +33,7 @@ def run_poses(
 
     Args:
         plan: from `load_spec` or `parse_spec`.
-        progress: receives stages and messages; quiet by default.
+        progress: receives stages and messages; by default, bars in a notebook and nothing elsewhere.
         overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
         resume: take the results of a finished run of the same spec, capture and versions; an interrupted one begins anew,
             since such a run keeps nothing to go on with.
@@ -50,7 +50,7 @@ def run_poses(
     """
     if keeps_work:
         raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
-    progress = progress or Quiet()
+    progress = usual(progress)
     observers = Observers(plan.observers, plan.output.directory)
     with begun_run(plan, observers, progress, overwrite=overwrite) as begun:
         source, folder = begun.source, begun.folder

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.context import Context, Progress, Quiet
+from photonpano.context import Context, Progress, usual
 from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
@@ -24,6 +24,7 @@ from photonpano.protocols import light_of
 from photonpano.record.run_json import record_of, verdict_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_report
+from photonpano.report.notebook import run_html
 from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
@@ -41,9 +42,13 @@ class RunResult:
     """
 
     directory: Path
-    record: RunRecord
+    record: RunRecord = field(repr=False)
     verdict: Verdict | None
     was_finished: bool = False
+
+    def _repr_html_(self) -> str:
+        """Show picture, verdict and files in a notebook."""
+        return run_html(self.directory, self.record)
 
 
 def run(
@@ -59,7 +64,7 @@ def run(
 
     Args:
         plan: from `load_spec` or `parse_spec`.
-        progress: receives stages and messages; quiet by default.
+        progress: receives stages and messages; by default, bars in a notebook and nothing elsewhere.
         overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
         resume: go on with a run of the same spec, capture and versions that was interrupted. If it was finished, its results
             are returned.
@@ -86,7 +91,7 @@ def run(
         finished.append(result)
         observers.level_finished(result)
 
-    context = Context(progress=progress or Quiet(), on_level=on_level)
+    context = Context(progress=usual(progress), on_level=on_level)
     with begun_run(plan, observers, context.progress, overwrite=overwrite) as begun, ExitStack() as stack:
         source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
         depends_on = run_fingerprint(plan, source)

@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.notebooks import facts, picture
+from photonpano.text import share
 from photonpano.values.arrays import FluxImage, Homography
 from photonpano.values.frames import Group
 
@@ -75,3 +77,16 @@ class Panorama:
     flux: FluxImage
     weight: FluxImage
     canvas: Homography
+
+    def _repr_html_(self) -> str:
+        """Show the flux in a notebook."""
+        height, width = self.flux.shape[:2]
+        seen = np.isfinite(self.flux)
+        rows = [("panorama", f"{height} x {width} pixels" + (", in colour" if self.flux.ndim == 3 else ""))]
+        rows.append(("seen", share(float(seen.mean()))))
+        if seen.any():
+            rows += [
+                ("flux, median", f"{np.median(self.flux[seen]):.3g} photons per pixel per frame"),
+                ("weight, median", f"{np.median(self.weight[seen]):,.0f} frames"),
+            ]
+        return picture(self.flux, "the panorama") + facts(rows)

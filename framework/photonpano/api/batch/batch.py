@@ -22,7 +22,7 @@ from photonpano.api.batch.sweeps import (
     read_changes,
 )
 from photonpano.api.batch.workers import rows_of
-from photonpano.context import Progress, Quiet
+from photonpano.context import Progress, usual
 from photonpano.errors import InputError, OutputError, Problem, SpecError
 from photonpano.locks import locked
 from photonpano.paths import Location
@@ -98,7 +98,7 @@ def batch(
         sweep: values of keys, such as `{"resample.with.group_size": [50, 100]}`; every combination is run on every capture.
         jobs: how many runs go on at once; they share the cores.
         overwrite: as in `run`, for each run folder.
-        progress: receives a note for each run that ends; quiet by default.
+        progress: receives a note for each run that ends; by default, bars in a notebook and nothing elsewhere.
 
     Raises:
         SpecError: the spec, a change or a swept key is wrong; carries all problems. Nothing was run.
@@ -170,7 +170,7 @@ def run_batch(batch: Batch, jobs: int = 1, progress: Progress | None = None, *, 
     """Run a batch that was prepared: see `batch`."""
     if jobs < 1:
         raise InputError(f"jobs: expected at least 1, got {jobs}")
-    directory, rows, n_ended, progress = batch.directory, list(batch.rows), 0, progress or Quiet()
+    directory, rows, n_ended, progress = batch.directory, list(batch.rows), 0, usual(progress)
     n_workers = min(jobs, len(rows))
     threads = max(1, thread_count("auto") // n_workers)
     todo = [Job(row, batch.spec, _overrides(batch, row), threads, overwrite) for row in rows]

@@ -12,6 +12,7 @@ import cv2
 
 from photonpano.api.batch.job import Job, is_of_capture
 from photonpano.captures.writing import truth_path
+from photonpano.context import Quiet
 from photonpano.errors import InputError, PhotonpanoError, SpecError, described
 from photonpano.evaluation import evaluate, evaluate_poses
 from photonpano.paths import Url
@@ -67,7 +68,7 @@ def _attempted(job: Job, catalog: Catalog | None) -> BatchRow:
         plan = job.spec.plan(job.overrides, job.row.directory, catalog)
         if plan.run.threads == "auto":  # the record keeps `auto`: results do not depend on it
             plan = replace(plan, run=plan.run.model_copy(update={"threads": job.threads}))
-        result = run(plan, overwrite=job.overwrite, resume=True)
+        result = run(plan, Quiet(), overwrite=job.overwrite, resume=True)
         return _scored(_finished(job.row, result), result)
     except SpecError as error:
         own = [each for each in error.problems if is_of_capture(each.where)]

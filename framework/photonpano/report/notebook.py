@@ -1,0 +1,65 @@
+"""Show a finished run in a notebook: its picture, its verdict, and where its files are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+
+from photonpano.notebooks import facts, picture_of_png
+from photonpano.record.run_json import verdict_of
+from photonpano.record.schema import RunRecord
+from photonpano.report.drawing import shrunk
+from photonpano.text import counted, duration, pixels, share
+
+_MAX_PIXELS = 900
+"""Longer side of the picture."""
+
+
+def run_html(folder: Path, record: RunRecord) -> str:
+    """Return what a notebook shows of a run.
+
+    Args:
+        folder: the run folder; a picture that is no longer there is left out.
+        record: the content of its run.json.
+    """
+    place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+    report = ""
+    if "report.html" in record["files"]:
+        href = escape((place / "report.html").as_posix())
+        report = f'<p><a href="{href}" target="_blank">report.html</a></p>'
+    return _picture(folder / "panorama.png") + facts(_rows(record, place)) + report
+
+
+def _picture(path: Path) -> str:
+    """Return the picture of a run, made smaller; nothing if it cannot be read."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.exists() else None
+    if image is None:
+        return ""
+    _, png = cv2.imencode(".png", shrunk(image, _MAX_PIXELS))
+    return picture_of_png(png.tobytes(), "the panorama")
+
+
+def _rows(record: RunRecord, place: Path) -> Iterator[tuple[str, str]]:
+    source, panorama, verdict = record["source"], record["panorama"], record["verdict"]
+    motion, poses = record["motion"], record["poses"]
+    frames = counted(source["n_frames"], "frame")
+    if verdict is not None:
+        judged = verdict_of(verdict)
+        yield "verdict", judged.status
+        for reason in judged.reasons:
+            yield "doubtful", str(reason)
+    for warning in record["warnings"]:
+        yield "warning", warning
+    yield "capture", f"{frames} of {source['height']} x {source['width']} pixels"
+    if panorama is not None:
+        seen = share(panorama["coverage_share"])
+        yield "panorama", f"{panorama['height']} x {panorama['width']} pixels, of which {seen} were seen"
+    if motion is not None:
+        yield "expected error", f"{pixels(motion['std_px'])} px, and {pixels(motion['worst_std_px'])} px in the worst frame"
+    if poses is not None:
+        yield "poses", f"of {poses['located']:,} of {frames}"
+    yield "time", duration(record["seconds"])
+    yield "run folder", str(place)

@@ -1,0 +1,158 @@
+"""Values and progress as HTML."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from photonpano import InputError, Quiet, RunTrajectory, capture_plan, info, load_panorama, load_trajectory
+from photonpano.context import usual
+from photonpano.notebooks import NotebookBars, facts, in_notebook, picture
+
+
+def pixels_of(html: str) -> np.ndarray:
+    data = re.search(r'src="data:image/png;base64,([^"]+)"', html)
+    assert data is not None
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data[1]))))
+
+
+def test_facts_are_escaped() -> None:
+    assert '<td style="text-align:left">a &lt;b&gt; &amp; c</td>' in facts([("name", "a <b> & c")])
+
+
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3)], ids=["grey", "colour"])
+def test_picture_is_square_root_of_flux_and_black_where_unknown(shape: tuple[int, ...]) -> None:
+    flux = np.full(shape, 4.0, np.float32)
+    flux[:, :10], flux[:, 10:15] = np.nan, 1.0
+    shown = pixels_of(picture(flux, "flux"))
+    assert (shown[:, :10].max(), shown[0, 12].max(), shown[0, 20].max()) == (0, 128, 255)
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0])
+def test_picture_without_light_is_black(value: float) -> None:
+    assert pixels_of(picture(np.full((4, 5), value, np.float32), "nothing")).max() == 0
+
+
+def test_large_picture_is_made_smaller() -> None:
+    assert pixels_of(picture(np.ones((100, 3000), np.float32), "wide")).shape == (30, 900)
+
+
+@pytest.fixture
+def cell(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What a cell of a notebook shows, one item for each time it is drawn."""
+    shown: list[str] = []
+
+    class Handle:
+        def update(self, value: Any) -> None:
+            shown.append(value._repr_html_())
+
+    def display(value: Any, *, display_id: bool) -> Handle:
+        assert display_id
+        shown.append(value._repr_html_())
+        return Handle()
+
+    modules = {
+        "ipykernel": {},
+        "IPython": {},
+        "IPython.core": {},
+        "IPython.core.getipython": {"get_ipython": lambda: types.SimpleNamespace(kernel=object())},
+        "IPython.display": {"display": display},
+    }
+    for name, content in modules.items():
+        module = types.ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    return shown
+
+
+def test_progress_is_bars_in_notebook_and_nothing_elsewhere(cell: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    given = Quiet()
+    assert in_notebook()
+    assert isinstance(usual(None), NotebookBars)
+    assert usual(given) is given
+    monkeypatch.delitem(sys.modules, "ipykernel")
+    assert isinstance(usual(None), Quiet)
+    assert cell == []
+
+
+def test_bars_are_one_output_that_ends_with_what_was_done(cell: list[str]) -> None:
+    bars = NotebookBars()
+    with bars.stage("level 1: <locate>", 1000, "exposures") as advance:
+        for _ in range(1000):
+            advance(1)
+    bars.note("level 1: 3 < 4")
+    assert len(cell) < 10  # not once a unit
+    assert 'value="0" max="1000"' in cell[0]
+    assert 'value="1000" max="1000"' in cell[-1]
+    assert "level 1: &lt;locate&gt;" in cell[-1]
+    assert "level 1: 3 &lt; 4" in cell[-1]
+
+
+def test_bar_of_failed_stage_keeps_what_was_done(cell: list[str]) -> None:
+    bars = NotebookBars()
+
+    def fail() -> None:
+        with bars.stage("level 1", 8, "exposures") as advance:
+            advance(3)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert 'value="3" max="8"' in cell[-1]
+
+
+def test_run_shows_picture_verdict_and_folder(small_run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_run.directory.parent)
+    html = small_run._repr_html_()
+    assert pixels_of(html).shape[:2] == (small_run.record["panorama"]["height"], small_run.record["panorama"]["width"])
+    assert small_run.record["verdict"]["status"] in html
+    assert f">{small_run.directory.name}<" in html
+    assert len(repr(small_run)) < 1000
+
+
+def test_run_whose_files_are_gone_shows_the_rest(small_run: Any, tmp_path: Path) -> None:
+    import dataclasses
+
+    html = dataclasses.replace(small_run, directory=tmp_path / "gone")._repr_html_()
+    assert "<img" not in html
+    assert "verdict" in html
+
+
+def test_panorama_and_trajectory_of_run_show_themselves(small_run: Any) -> None:
+    panorama = load_panorama(small_run.directory)
+    assert pixels_of(panorama._repr_html_()).shape == panorama.flux.shape
+    trajectory = load_trajectory(small_run.directory)
+    html = trajectory._repr_html_()
+    assert f"{trajectory.located.sum()} of {len(trajectory.located)} located" in html
+    assert len(re.findall(r"[-\d.]+,[-\d.]+", html[html.index("<polyline") :])) == min(500, trajectory.located.sum())
+
+
+def test_path_beyond_plane_is_not_drawn() -> None:
+    turned = np.stack([np.eye(3), [[1, 0, 0], [0, 1, 0], [-1 / 10, 0, 1]]])
+    trajectory = RunTrajectory(turned, np.eye(3), (20, 30), np.ones(2, bool), np.full(2, np.nan))
+    html = trajectory._repr_html_()
+    assert "2 of 2 located" in html
+    nothing = RunTrajectory(turned, np.eye(3), (20, 30), np.zeros(2, bool), np.full(2, np.nan))
+    assert "<svg" not in nothing._repr_html_()
+
+
+@pytest.mark.parametrize("load", [load_panorama, load_trajectory])
+def test_folder_that_is_no_run_is_refused(load: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no run has finished in it|is not a folder|is no run folder"):
+        load(tmp_path)
+
+
+def test_capture_shows_itself(small_capture: Path) -> None:
+    found = info(capture_plan(small_capture, {"frame_rate_hz": 96_800}))
+    html = found._repr_html_()
+    assert all(name in html for name, _ in found.rows())
+    assert "photons per pixel per frame" in html
