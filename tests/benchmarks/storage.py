@@ -19,7 +19,9 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,14 +61,26 @@ def read_short_spans(source: Source) -> None:
         source.counts(span)
 
 
-def seconds(path: str | Path, read: Callable[[Source], None], times: int = 3) -> float:
+class Took(NamedTuple):
+    """Seconds that passed, and seconds of processor time of this process, the server's left out."""
+
+    elapsed: float
+    processor: float
+
+
+def took(work: Callable[[], object]) -> Took:
+    """Do some work, and return how long it took."""
+    elapsed, processor = time.perf_counter(), time.process_time()
+    work()
+    return Took(time.perf_counter() - elapsed, time.process_time() - processor)
+
+
+def reading(path: str | Path, read: Callable[[Source], None], times: int = 3) -> Took:
     """Return the shortest time of reading a capture, which is opened anew each time."""
     found = []
     for _ in range(times):
         with build_source(capture_plan(path, corrections=[])) as source:
-            start = time.perf_counter()
-            read(source)
-            found.append(time.perf_counter() - start)
+            found.append(took(partial(read, source)))
     return min(found)
 
 
@@ -86,13 +100,13 @@ def bytes_in(path: Path) -> int:
     return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
-def compare(places: dict[str, str | Path], measure: Callable[[str | Path], float]) -> None:
-    """Print the time of each place, and its ratio to the first."""
+def compare(places: dict[str, str | Path], measure: Callable[[str | Path], Took]) -> None:
+    """Print the time of each place, its ratio to the first, and the processor time."""
     first = None
     for name, place in places.items():
-        took = measure(place)
-        first = took if first is None else first
-        print(f"  {name:28} {took:8.2f} s  x {took / first:.2f}", flush=True)
+        elapsed, processor = measure(place)
+        first = elapsed if first is None else first
+        print(f"  {name:28} {elapsed:8.2f} s  x {elapsed / first:.2f}  {processor:8.2f} s of the processor", flush=True)
 
 
 def main() -> None:
@@ -108,9 +122,10 @@ def main() -> None:
         cube = folder / "cube.npy"
         write_frames(cube, arguments.frames)
         places = all_places(cube, address)
-        for title, read in (("groups", read_groups), ("short spans", read_short_spans)):
-            print(f"{title} of {arguments.frames:,} frames, {THREADS} threads")
-            compare(places, lambda place, read=read: seconds(place, read))
+        print(f"{arguments.frames:,} frames in groups of {GROUP}, {THREADS} threads")
+        compare(places, partial(reading, read=read_groups))
+        print(f"{min(SHORT_FRAMES, arguments.frames):,} frames in spans of {SHORT}, one after the other")
+        compare(places, partial(reading, read=read_short_spans))
         if arguments.runs:
             whole_runs(folder, address)
 
@@ -119,12 +134,9 @@ def all_places(cube: Path, address: str) -> dict[str, str | Path]:
     """Write a capture to zarr arrays, print their sizes, and return where all of them can be read."""
     arrays = {"zarr": cube.with_suffix(".zarr"), "zarr, zstd": cube.with_name(f"{cube.stem}-zstd.zarr")}
     for name, array in arrays.items():
-        start = time.perf_counter()
-        convert(capture_plan(cube, corrections=[]), array, compress="zstd" in name)
-        took = time.perf_counter() - start
-        print(
-            f"{name}: written in {took:.2f} s, {bytes_in(array) / bytes_in(cube):.3f} of the size of the .npy file", flush=True
-        )
+        written = took(partial(convert, capture_plan(cube, corrections=[]), array, compress="zstd" in name))
+        share = bytes_in(array) / bytes_in(cube)
+        print(f"{name}: written in {written.elapsed:.2f} s, {share:.3f} of the size of the .npy file", flush=True)
     names = {"npy": cube, **arrays}
     remote = {f"{name} over HTTP": f"{address}/bucket/{path.name}" for name, path in names.items()}
     remote |= {f"{name} in S3": f"s3://bucket/{path.name}" for name, path in names.items()}
@@ -138,16 +150,13 @@ def whole_runs(folder: Path, address: str) -> None:
     simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": street}}), capture)
     print("whole runs of 10,000 frames")
 
-    def timed(place: str | Path) -> float:
+    def whole_run(place: str | Path) -> Took:
         with tempfile.TemporaryDirectory() as output:
             spec = {"version": 1, "source": {"use": "auto", "with": {"path": str(place)}}}
-            plan = parse_spec(spec, output=Path(output, "run"))
-            start = time.perf_counter()
-            run(plan)
-            return time.perf_counter() - start
+            return took(partial(run, parse_spec(spec, output=Path(output, "run"))))
 
-    timed(capture)  # compiles the loops over pixels
-    compare(all_places(capture, address), timed)
+    whole_run(capture)  # compiles the loops over pixels
+    compare(all_places(capture, address), whole_run)
 
 
 if __name__ == "__main__":
