@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-LONGEST_S = 60.0
+LONGEST_S = 30.0
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run", "--disable-extensions")
 
 
@@ -70,7 +70,7 @@ class Page:
 
     def wait_for(self, expression: str) -> None:
         """Wait until an expression is true."""
-        self._until(lambda: bool(self.run(expression)))
+        self._until(lambda: bool(self.run(f"Boolean({expression})")))
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         """Dispatch mousePressed, mouseMoved, mouseReleased or mouseWheel at a place of the window."""

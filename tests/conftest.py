@@ -19,14 +19,29 @@ from photonpano.pipeline.run import RunResult
 from photonpano.testing import KnownMotion, MemorySource
 
 
+def sibling(name: str) -> Any:
+    """Import a module of this folder."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def browser_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Lend a page of a headless Chromium."""
+    browser = sibling("browser")
+    if browser.chromium() is None:
+        pytest.skip("Chromium is not installed (Debian: apt-get install chromium)")
+    with browser.browser(tmp_path_factory.mktemp("browser")) as page:
+        yield page
+
+
 @pytest.fixture(scope="session")
 def file_server() -> Callable[..., Any]:
     """Return the class of servers that serve a folder over HTTP, and as an object store."""
     pytest.importorskip("aiohttp", reason="URLs need photonpano[http]")
-    spec = importlib.util.spec_from_file_location("file_server", Path(__file__).with_name("file_server.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.FileServer
+    return sibling("file_server").FileServer
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ def preview_spans(info: StreamInfo, group_size: int, step: int) -> list[FrameSpa
 def white_flux(source: Source, spans: Sequence[FrameSpan], quantile: float, threads: int = 1) -> float:
     """Return a quantile of the flux of the pixels, over 16 of the exposures; 1 if all are dark."""
     chosen = sorted({round(place) for place in np.linspace(0, len(spans) - 1, _WHITE_EXPOSURES)})
-    exposures = in_order(lambda place: _exposure(source, spans[place]), chosen, threads)
+    exposures = in_order(lambda place: still_exposure(source, spans[place]), chosen, threads)
     return float(np.nanquantile(np.stack(list(exposures)), quantile)) or 1.0
 
 
@@ -54,7 +54,7 @@ def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: 
     """Yield the picture of each exposure, in order: (H, W) or (H, W, 3) uint8, and a strip below it for the label."""
 
     def picture(span: FrameSpan) -> NDArray[np.uint8]:
-        image = tone_mapped(_exposure(source, span), style.white_flux, srgb=style.srgb)
+        image = tone_mapped(still_exposure(source, span), style.white_flux, srgb=style.srgb)
         if not style.label:
             return image
         label = _label(span, source.info)
@@ -63,8 +63,11 @@ def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: 
     return in_order(picture, spans, threads)
 
 
-def _exposure(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the flux of the sum of some frames: (H, W), NaN where a pixel is masked; (H, W, 3) behind a filter array."""
+def still_exposure(source: Source, span: FrameSpan) -> FluxImage:
+    """Return the flux of the sum of some frames, without any motion: (H, W), or (H, W, 3) behind a filter array.
+
+    Pixels that are masked are NaN.
+    """
     still = Chunk(span, np.eye(3))
 
     def merged(each: Source) -> Panorama:

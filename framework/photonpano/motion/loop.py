@@ -13,7 +13,7 @@ from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.merge import merge
+from photonpano.motion.merge import VirtualExposures, merge
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, fit_turns
@@ -35,6 +35,7 @@ class LevelResult:
         trajectory: the motion of every frame; the reference frame's homography is the identity.
         uncertainty: the expected error of the trajectory.
         seconds: time spent in each stage.
+        exposures: its virtual exposures, which can be merged again.
     """
 
     level: Level
@@ -43,6 +44,7 @@ class LevelResult:
     trajectory: Trajectory
     uncertainty: Uncertainty
     seconds: dict[str, float]
+    exposures: VirtualExposures
 
     @property
     def change_px(self) -> float | None:
@@ -98,7 +100,7 @@ def estimate_motion(
         located = locate(exposures, graph, context, model)
         trajectory = interpolate(level, located, timeline, reference, clock)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
-        results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds))
+        results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))
         context.on_level(results[-1])
         previous = trajectory

@@ -23,7 +23,7 @@ from photonpano.pipeline.run_steps import begun_run, first_decisions, with_repor
 from photonpano.protocols import light_of
 from photonpano.record.run_json import record_of, verdict_of
 from photonpano.record.schema import RunRecord
-from photonpano.report import render_report
+from photonpano.report import OpenCapture, render_report
 from photonpano.report.notebook import run_html
 from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
@@ -123,6 +123,7 @@ def run(
         )
         work.finish()
         light = light_of(source)
-        record = with_report(folder, record, lambda record: render_report(record, explained, panorama, light))
+        capture = OpenCapture(source, found.results)
+        record = with_report(folder, record, lambda record: render_report(record, explained, panorama, light, capture))
         begun.finished(record)
     return RunResult(plan.output.directory, record, verdict)

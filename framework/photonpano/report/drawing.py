@@ -255,10 +255,18 @@ def shrunk(image: NDArray[Any], max_pixels: int) -> NDArray[Any]:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def jpeg_uri(image: NDArray[np.uint8]) -> str:
+def png_uri(image: NDArray[np.uint8]) -> str:
+    """Return an (H, W, 4) image of red, green, blue and opacity as a data URI."""
+    import cv2
+
+    _, encoded = cv2.imencode(".png", image[..., [2, 1, 0, 3]])
+    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def jpeg_uri(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> str:
     """Return an (H, W) grey or (H, W, 3) red-green-blue image as a data URI."""
     import cv2
 
     in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
-    _, encoded = cv2.imencode(".jpg", in_opencv_order, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    _, encoded = cv2.imencode(".jpg", in_opencv_order, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()

@@ -51,7 +51,7 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
     """Draw the position and the speed of the frame centre, and the expected corner error, over time."""
     from matplotlib.ticker import LogLocator
 
-    instants = _instants(len(motion.homographies))
+    instants = instants_of(len(motion.homographies))
     path, unit = _path(motion, instants)
     with plain_figure(WIDTH_IN, 6.0) as figure:
         position, speed, error = add_axes(figure, Margins(right=0.3, top=0.55), rows=(3, 2, 2), share_x=True)
@@ -86,14 +86,14 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
 
 def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
     """Draw the path of the frame centre over the panorama, with the outlines of the first, the reference and the last frame."""
-    instants = _instants(len(motion.homographies))
-    path = _places(panorama, motion.homographies[instants], _centre(motion.frame_shape))[:, 0]
+    instants = instants_of(len(motion.homographies))
+    path = places_on(panorama, motion.homographies[instants], centre_of(motion.frame_shape))[:, 0]
     height, width = panorama.picture.shape[:2]
     with map_figure(height, width) as (figure, axes):
         picture = shrunk(panorama.picture, MAP_PIXELS)
         axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent_of(height, width), alpha=0.55)
         for index, style in ((motion.reference, "-"), (0, ":"), (-1, ":")):
-            outline = _places(panorama, motion.homographies[index, None], outline_of(motion.frame_shape))[0]
+            outline = places_on(panorama, motion.homographies[index, None], outline_of(motion.frame_shape))[0]
             axes.plot(*_cut_at_seam(np.vstack([outline, outline[:1]]), width).T, color=INK, linewidth=0.9, linestyle=style)
         drawn = _cut_at_seam(path, width)
         axes.plot(*drawn.T, color=PAPER, linewidth=3.5)
@@ -106,7 +106,7 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
 
 def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray, str]:
     """Return the path of the frame centre from that of the reference frame, (N, 2), and its unit: degrees of a turn."""
-    centre = _centre(motion.frame_shape)
+    centre = centre_of(motion.frame_shape)
     if motion.camera is None or motion.rotations is None:
         return apply(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
     ahead = motion.camera.directions(centre[0])
@@ -116,7 +116,7 @@ def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray,
     return path - 360 * np.round(path[reference] / 360), "degrees"
 
 
-def _places(panorama: RenderedPanorama, homographies: FloatArray, pixels: FloatArray) -> FloatArray:
+def places_on(panorama: RenderedPanorama, homographies: FloatArray, pixels: FloatArray) -> FloatArray:
     """Return where pixels of frames lie on the picture of a panorama: (N, P, 2)."""
     rays = np.append(pixels, np.ones((len(pixels), 1)), axis=1) @ np.swapaxes(
         panorama.canvas.plane_to_rays @ homographies, -1, -2
@@ -201,11 +201,13 @@ def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) 
         return svg_of(figure, "stage-times")
 
 
-def _instants(n_frames: int) -> NDArray[np.int64]:
-    return np.unique(np.linspace(0, n_frames - 1, min(n_frames, MAX_INSTANTS)).round().astype(np.int64))
+def instants_of(n_frames: int, most: int = MAX_INSTANTS) -> NDArray[np.int64]:
+    """Return frames from the first to the last, evenly spaced."""
+    return np.unique(np.linspace(0, n_frames - 1, min(n_frames, most)).round().astype(np.int64))
 
 
-def _centre(frame_shape: tuple[int, int]) -> FloatArray:
+def centre_of(frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the centre of a frame: (1, 2)."""
     return np.asarray(corners(frame_shape).mean(axis=0, keepdims=True))
 
 

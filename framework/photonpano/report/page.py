@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -10,12 +12,15 @@ import numpy as np
 
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.protocols import Source
 from photonpano.record.schema import RunRecord
 from photonpano.report import figures, residual_figures
 from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.environment import environment_of, yaml_of
 from photonpano.report.failures import failure_groups
 from photonpano.report.files import listed_files
+from photonpano.report.viewer import viewer_data
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Light, true_spans
 
@@ -26,14 +31,36 @@ MAX_SPANS = 12
 """Number of spans of frames that are listed."""
 
 
-def render_report(record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None = None) -> str:
-    """Return the report of a run as one HTML page that needs no other file, no network and no script.
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenCapture:
+    """A capture that the viewer of a report looks at.
+
+    Attributes:
+        source: the capture, as the panorama was rendered from it.
+        levels: of its motion.
+    """
+
+    source: Source
+    levels: Sequence[LevelResult]
+
+
+def render_report(
+    record: RunRecord,
+    explained: Explained,
+    panorama: RenderedPanorama,
+    light: Light | None = None,
+    capture: OpenCapture | None = None,
+) -> str:
+    """Return the report of a run as one HTML page that needs no other file and no network.
+
+    A script in it shows the panorama in a viewer; where scripts are off, all figures are there.
 
     Args:
         record: the content of `run.json`.
         explained: the motion of every frame, and what the panorama does not explain.
         panorama: the panorama.
         light: that the run found; None if it is steady.
+        capture: for the viewer; None for a page without one.
     """
     files, more_files = listed_files(record.get("files", {}))
     page: str = (
@@ -46,6 +73,7 @@ def render_report(record: RunRecord, explained: Explained, panorama: RenderedPan
             stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
             files=files,
             more_files=more_files,
+            viewer=None if capture is None else viewer_data(record, explained, panorama, capture.source, capture.levels),
             **_results(record, explained, panorama, light),
         )
     )

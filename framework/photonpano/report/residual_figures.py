@@ -63,20 +63,37 @@ def misfit_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas)
         measured: the canvas of the panorama of the residuals, on which the misfit is drawn if the projections differ.
         canvas: of the panorama.
     """
-    same = measured.projection == canvas.projection and measured.horizon is canvas.horizon
+    same = same_projection(measured, canvas)
     shape, onto = (canvas.shape, canvas.transform) if same else (measured.shape, measured.transform)
-    to_panorama = onto @ inverse(measured.transform)
-    misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
-    rows, columns = misfit.shape
-    (left, top), (right, bottom) = apply(to_panorama, [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]])
+    misfit, (left, top, right, bottom) = misfit_cells(residuals, measured, onto)
     with map_figure(*shape, side_in=BAR_IN) as (figure, axes):
         axes.set_facecolor(LINE)
-        extent = float(left), float(right), float(bottom), float(top)
+        extent = left, right, bottom, top
         image = axes.imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
         axes.set_xlim(-0.5, shape[1] - 0.5)
         axes.set_ylim(shape[0] - 0.5, -0.5)
         _add_colour_bar(axes, image, "misfit")
         return svg_of(figure, "misfit-panorama")
+
+
+def same_projection(one: Canvas, other: Canvas) -> bool:
+    """Return whether two canvases differ by their scale and place only."""
+    return one.projection == other.projection and one.horizon is other.horizon
+
+
+def misfit_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[Any, tuple[float, float, float, float]]:
+    """Return the misfit over the panorama, masked where it was seen too briefly, and its box.
+
+    Args:
+        residuals: of the run.
+        measured: the canvas of the panorama of the residuals.
+        onto: (3, 3) transform of the canvas in whose pixels the box is: left, top, right, bottom.
+    """
+    misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
+    rows, columns = misfit.shape
+    edges = [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]]
+    (left, top), (right, bottom) = apply(onto @ inverse(measured.transform), edges)
+    return misfit, (float(left), float(top), float(right), float(bottom))
 
 
 def over_sensor(residuals: Residuals) -> str:

@@ -1,0 +1,253 @@
+"""Gather what the viewer of a report shows: linear data, maps over the panorama, the path, and pictures of one instant."""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Sequence
+from typing import Any, cast
+
+import cv2
+import numpy as np
+
+from photonpano.captures.preview import still_exposure
+from photonpano.geometry import Canvas, inverse, outline_of, rescaling
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.photometry import WhiteBalance, balanced, flux_std, tone_mapped
+from photonpano.protocols import ColouredSource, Source
+from photonpano.record.schema import RunRecord
+from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
+from photonpano.report.figures import centre_of, instants_of, places_on
+from photonpano.report.residual_figures import misfit_cells, same_projection
+from photonpano.residuals.refinement import Explained
+from photonpano.values import FloatArray, FluxImage, FrameSpan
+
+LINEAR_VALUES = 1_200_000
+"""Most values of linear data on a page, which keeps it below some megabytes; a larger panorama is reduced."""
+CODES = 4095
+"""Codes of 12 bits, logarithmic in the flux."""
+DECADES = 5.0
+"""Range of the codes, in powers of ten below the highest flux: a step is 0.28 %."""
+MAP_PIXELS = 500
+"""Longer side of a map."""
+GLIMPSES, COLOURED_GLIMPSES = 40, 12
+"""Instants of which the page shows what the camera saw; fewer in colour, where a sum takes a hundred times as long."""
+GLIMPSE_PIXELS = 240
+VIEW_PIXELS = 1000
+"""Longer side of the pictures of one instant."""
+_INSTANTS = 600
+"""Frames whose outline is on the page."""
+_COLOURS = 6
+"""Colours of a legend, between which a browser blends."""
+
+
+def viewer_data(
+    record: RunRecord, explained: Explained, panorama: RenderedPanorama, source: Source, levels: Sequence[LevelResult]
+) -> dict[str, Any]:
+    """Return what the viewer needs, as plain data for JSON. Frames are read, and exposures merged again.
+
+    Args:
+        record: the content of `run.json`.
+        explained: the motion of every frame, and what the panorama does not explain.
+        panorama: the panorama.
+        source: the capture, still open.
+        levels: whose exposures of one instant are shown.
+    """
+    motion, white = explained.motion, panorama.white_flux
+    render = record["spec"].get("render") or {}
+    instant = shared_instant(motion, levels)
+    spans = [len(span) for span in explained.residuals.spans]
+    return {
+        "size": [panorama.canvas.width, panorama.canvas.height],
+        "linear": linear_data(balanced(panorama.thumbnail.flux, cast(WhiteBalance, _balance(render))), white),
+        "picture": None if (render.get("tone") or "srgb") == "srgb" else jpeg_uri(shrunk(panorama.picture, VIEW_PIXELS)),
+        "maps": [*panorama_maps(panorama, source), *_misfit_map(explained, panorama.canvas)],
+        "path": path_data(motion, panorama),
+        "rate": record["source"]["frame_rate_hz"],
+        "glimpses": glimpses(source, int(np.median(spans)), white),
+        "instant": instant,
+        "views": views_of_instant(instant, motion, panorama, source, levels),
+    }
+
+
+def _balance(render: Any) -> Any:
+    found = render.get("white_balance", "none")
+    return found if isinstance(found, str) else tuple(found)
+
+
+def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:
+    """Encode flux for a browser: `low * (high / low) ** ((code - 1) / (codes - 1))`, and the code 0 where nothing was seen.
+
+    Codes take two bytes; all high bytes come before all low ones, and `zlib` packs them. So a browser needs no decoder of
+    pictures, which may change colours.
+
+    Args:
+        flux: (H, W) or (H, W, 3); NaN where nothing was seen.
+        white: flux that is white at first.
+    """
+    channels = 1 if flux.ndim == 2 else flux.shape[2]
+    seen = np.isfinite(flux)
+    longest = max(flux.shape[:2]) * min(1.0, float(np.sqrt(LINEAR_VALUES / flux.size)))
+    if longest < max(flux.shape[:2]):
+        share = shrunk(seen.astype(np.float32), int(longest))
+        flux = np.where(share > 0, shrunk(np.where(seen, flux, 0), int(longest)) / np.maximum(share, 1e-6), np.nan)
+        seen = np.isfinite(flux)
+    high = (float(flux[seen].max()) if seen.any() else 0.0) or 1.0
+    low = high / 10**DECADES
+    with np.errstate(invalid="ignore", divide="ignore"):
+        place = np.log(np.maximum(flux, low) / low) / np.log(high / low)
+    codes = np.where(seen, 1 + np.rint((CODES - 1) * np.nan_to_num(place)), 0).astype(np.uint16).ravel()
+    packed = zlib.compress((codes >> 8).astype(np.uint8).tobytes() + (codes & 255).astype(np.uint8).tobytes(), 9)
+    return {
+        "width": flux.shape[1],
+        "height": flux.shape[0],
+        "channels": channels,
+        "low": low,
+        "high": high,
+        "codes": CODES,
+        "white": white,
+        "data": base64.b64encode(packed).decode(),
+    }
+
+
+def panorama_maps(panorama: RenderedPanorama, source: Source) -> list[dict[str, Any]]:
+    """Return the coverage, and the relative standard deviation of the flux by photon noise, as maps over the panorama."""
+    flux, weight = panorama.thumbnail.flux, panorama.thumbnail.weight
+    height, width = panorama.canvas.shape
+    box = [0, 0, width, height]
+    if panorama.noise is not None and panorama.reduction == 1:
+        std = panorama.noise.std(flux, weight)
+    else:
+        std = flux_std(flux, weight, source.response)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = 100 * std / flux
+    if flux.ndim == 3:
+        weight, relative = weight.sum(axis=-1), relative.mean(axis=-1)
+    seen = weight > 0
+    percent = np.where(seen & np.isfinite(relative), relative, np.nan)
+    return [
+        _map("Coverage", np.where(seen, weight, np.nan), "frames", box, "viridis", low=0.0),
+        _map("Uncertainty", percent, "% of the flux, by photon noise", box, "magma"),
+    ]
+
+
+def _misfit_map(explained: Explained, canvas: Canvas) -> list[dict[str, Any]]:
+    if not same_projection(explained.canvas, canvas):
+        return []
+    misfit, (left, top, right, bottom) = misfit_cells(explained.residuals, explained.canvas, canvas.transform)
+    box = [round(float(side) + 0.5, 2) for side in (left, top, right, bottom)]
+    return [_map("Misfit", misfit.filled(np.nan), "(1 is photon noise)", box, "inferno")]
+
+
+def _map(
+    name: str, values: FloatArray | FluxImage, unit: str, box: Sequence[float], colours: str, low: float | None = None
+) -> dict[str, Any]:
+    """Return a map as a picture in colours, transparent where it is NaN, with its legend."""
+    from matplotlib import colormaps
+    from matplotlib.colors import rgb2hex
+
+    known = values[np.isfinite(values)]
+    first, last = (float(each) for each in np.quantile(known, (0.01, 0.99))) if known.size else (0.0, 1.0)
+    first = first if low is None else low
+    share = shrunk(np.isfinite(values).astype(np.float32), MAP_PIXELS)
+    small = shrunk(np.nan_to_num(values).astype(np.float32), MAP_PIXELS) / np.maximum(share, np.float32(1e-6))
+    table = colormaps[colours]
+    shades = np.rint(255 * table(np.clip((small - first) / max(last - first, 1e-12), 0, 1))).astype(np.uint8)
+    shades[..., 3] = np.where(share > 0, 255, 0)
+    legend = [rgb2hex(table(each)) for each in np.linspace(0, 1, _COLOURS)]
+    return {"name": name, "uri": png_uri(shades), "low": first, "high": last, "unit": unit, "box": list(box), "colours": legend}
+
+
+def path_data(motion: FrameMotion, panorama: RenderedPanorama) -> dict[str, Any]:
+    """Return where frames lie on the panorama, in its pixels, at instants all over the capture."""
+    instants = instants_of(len(motion.homographies), _INSTANTS)
+    border = outline_of(motion.frame_shape) if not panorama.canvas.planar else _corners(motion.frame_shape)
+    outlines = places_on(panorama, motion.homographies[instants], np.vstack([border, border[:1]]))
+    centres = places_on(panorama, motion.homographies[instants], centre_of(motion.frame_shape))[:, 0]
+    factor = panorama.reduction
+    std = [round(float(each), 4) if np.isfinite(each) else None for each in motion.std_px[instants]]
+    return {
+        "frames": instants.tolist(),
+        "centres": _rounded(centres * factor),
+        "outlines": _rounded(outlines * factor),
+        "std": std,
+        "start": int(np.abs(instants - motion.reference).argmin()),
+    }
+
+
+def _corners(frame_shape: tuple[int, int]) -> FloatArray:
+    height, width = frame_shape
+    return np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]])
+
+
+def _rounded(points: FloatArray) -> Any:
+    return np.round(np.nan_to_num(points), 1).tolist()
+
+
+def glimpses(source: Source, n_frames: int, white: float) -> list[dict[str, Any]]:
+    """Return short sums of frames, all over the capture."""
+    total = source.info.n_frames
+    n_frames = min(n_frames, total)
+    most = COLOURED_GLIMPSES if isinstance(source, ColouredSource) else GLIMPSES
+    found = []
+    for start in np.unique(np.linspace(0, total - n_frames, min(most, total)).astype(int)):
+        span = FrameSpan(int(start), int(start) + n_frames)
+        picture = shrunk(tone_mapped(still_exposure(source, span), white), GLIMPSE_PIXELS)
+        frame = (span.start + span.stop - 1) // 2
+        found.append({"frame": frame, "first": span.start, "last": span.stop - 1, "uri": jpeg_uri(picture, quality=75)})
+    return found
+
+
+def shared_instant(motion: FrameMotion, levels: Sequence[LevelResult]) -> int:
+    """Return a located frame near an exposure of every level; of several such frames the one nearest to the reference frame."""
+    located = [result.located.instants for result in levels]
+    candidates = np.rint(located[-1]).astype(int)
+    gap = sum(np.abs(instants[None] - candidates[:, None]).min(axis=1) for instants in located)
+    order = np.lexsort((np.abs(candidates - motion.reference), np.rint(gap)))
+    return int(np.clip(candidates[order[0]], 0, len(motion.homographies) - 1))
+
+
+def views_of_instant(
+    frame: int, motion: FrameMotion, panorama: RenderedPanorama, source: Source, levels: Sequence[LevelResult]
+) -> list[dict[str, Any]]:
+    """Return pictures of what a frame shows: itself, the plain average, the exposure of each level, and the panorama."""
+    height, width = motion.frame_shape
+    scale = float(np.clip(panorama.canvas.transform[0, 0] if panorama.canvas.planar else 1.0, 1, max(1, VIEW_PIXELS / width)))
+    shape = round(height * scale), round(width * scale)
+    to_frame = rescaling(1 / scale)
+    x, y = np.meshgrid(np.arange(shape[1], dtype=np.float64), np.arange(shape[0], dtype=np.float64))
+    pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    here = motion.homographies[frame] @ to_frame @ pixels  # on the reference plane
+
+    def view(name: str, note: str, image: FluxImage, places: FloatArray, sharp: bool = False) -> dict[str, Any]:
+        across, down = (each.reshape(shape).astype(np.float32) for each in places)
+        how = cv2.INTER_NEAREST if sharp else cv2.INTER_LINEAR
+        warped = cv2.remap(image, across, down, how, borderMode=cv2.BORDER_CONSTANT, borderValue=[float("nan")] * 4)
+        return {"name": name, "note": note, "uri": jpeg_uri(tone_mapped(np.asarray(warped, np.float32), panorama.white_flux))}
+
+    def on(transform: FloatArray, rays: FloatArray) -> FloatArray:
+        moved = transform @ rays
+        return np.asarray(moved[:2] / moved[2])
+
+    itself = on(to_frame, pixels)
+    whole = source.info.span
+    alone = still_exposure(source, FrameSpan(frame, frame + 1))
+    alone *= panorama.white_flux / (float(np.nanmax(alone, initial=0)) or 1.0)  # a lit pixel of a binary frame is white
+    found = [
+        view("One frame", f"frame {frame:,}", alone, itself, sharp=True),
+        view("Plain average", f"all {len(whole):,} frames, without motion", still_exposure(source, whole), itself),
+    ]
+    for result in levels:
+        index = int(np.flatnonzero(result.located.solution.located)[np.abs(result.located.instants - frame).argmin()])
+        exposure = result.exposures.merged(index)
+        instant = np.array([exposure.group.reference], np.float64)
+        to_exposure = rescaling(exposure.scale) @ inverse(motion.trajectory.at(instant))[0]
+        note = f"frames {exposure.group.span.start:,} to {exposure.group.span.stop - 1:,}, along the motion known before"
+        found.append(view(f"Level {result.level.number}", note, exposure.flux, on(to_exposure, here)))
+    places = panorama.canvas.pixels((panorama.canvas.plane_to_rays @ here).T).T
+    reduced = (places + 0.5) / panorama.reduction - 0.5
+    seen = round(float(np.nanmax(panorama.thumbnail.weight)))
+    found.append(view("Panorama", f"up to {seen:,} frames a pixel", panorama.thumbnail.flux, reduced))
+    return found

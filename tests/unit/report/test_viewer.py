@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import base64
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import photonpano.report
+from photonpano.report import viewer
+
+SCRIPT = Path(photonpano.report.__file__).parent / "templates" / "viewer.js"
+
+
+def decoded(linear: dict) -> np.ndarray:
+    """Decode linear data as the script does."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(linear["data"])), np.uint8).reshape(2, -1).astype(int)
+    codes = 256 * planes[0] + planes[1]
+    flux = linear["low"] * (linear["high"] / linear["low"]) ** ((codes - 1) / (linear["codes"] - 1))
+    shape = (linear["height"], linear["width"], linear["channels"])
+    return np.where(codes > 0, flux, np.nan).reshape(shape)
+
+
+@pytest.mark.parametrize("shape", [(30, 50), (30, 50, 3)])
+def test_linear_data_keeps_flux_to_a_sixth_of_a_percent(shape):
+    flux = np.exp(np.random.default_rng(0).uniform(-6, 3, shape)).astype(np.float32)
+    flux[3, 4], flux[5, 6] = np.nan, 0
+    found = decoded(viewer.linear_data(flux, 2.0)).reshape(shape)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(flux))
+    assert np.all(found[5, 6] == pytest.approx(1e-5 * np.nanmax(flux)))
+    flux[5, 6] = np.nan
+    np.testing.assert_allclose(found[~np.isnan(flux)], flux[~np.isnan(flux)], rtol=1.6e-3)
+
+
+def test_linear_data_of_a_large_panorama_is_reduced_over_what_was_seen(monkeypatch):
+    monkeypatch.setattr(viewer, "LINEAR_VALUES", 600)
+    flux = np.full((40, 60), 0.5, np.float32)
+    flux[:, 31:] = np.nan
+    found = decoded(viewer.linear_data(flux, 1.0))[..., 0]
+    assert found.shape == (20, 30)
+    np.testing.assert_allclose(found[:, :15], 0.5, rtol=1e-3)
+    assert np.isnan(found[:, 16:]).all()
+
+
+@pytest.mark.parametrize("flux", [np.full((4, 5), np.nan, np.float32), np.zeros((4, 5), np.float32)])
+def test_linear_data_of_darkness_is_finite(flux):
+    found = viewer.linear_data(flux, 1.0)
+    assert 0 < found["low"] < found["high"] < np.inf
+
+
+def test_path_has_outlines_on_the_panorama(motion, panorama):
+    path = viewer.path_data(motion, panorama)
+    start = path["frames"][path["start"]]
+    assert abs(start - motion.reference) <= 10
+    assert path["frames"][0] == 0
+    assert path["std"][0] is None
+    outlines = np.array(path["outlines"])
+    assert outlines.shape == (len(path["frames"]), 5, 2)
+    np.testing.assert_array_equal(outlines[:, 0], outlines[:, -1])
+    height, width = panorama.canvas.shape
+    assert outlines.min() > -1.5
+    assert (outlines.max(axis=(0, 1)) < [width + 0.5, height + 0.5]).all()
+    halved = viewer.path_data(motion, replace(panorama, reduction=2))
+    np.testing.assert_allclose(np.array(halved["outlines"]), outlines, atol=1.1)
+
+
+def test_maps_are_transparent_where_nothing_was_seen(panorama):
+    source = SimpleNamespace(response=panorama_response())
+    coverage, uncertainty = viewer.panorama_maps(panorama, source)
+    weight = panorama.thumbnail.weight
+    assert coverage["low"] == 0
+    assert coverage["high"] == pytest.approx(np.quantile(weight[weight > 0], 0.99), rel=1e-3)
+    assert uncertainty["unit"].startswith("% of the flux")
+    assert coverage["box"] == [0, 0, panorama.canvas.width, panorama.canvas.height]
+
+
+def panorama_response():
+    from photonpano.photometry import BinaryResponse
+
+    return BinaryResponse()
+
+
+def test_shared_instant_is_near_an_exposure_of_each_level(motion):
+    levels = [
+        SimpleNamespace(located=SimpleNamespace(instants=np.array(instants)))
+        for instants in ([1000.0, 5000.0, 9000.0], [1000.0, 3000.0, 4990.0, 7000.0, 9000.0])
+    ]
+    assert viewer.shared_instant(motion, levels) == 9000 or viewer.shared_instant(motion, levels) == 1000
+    levels[1].located.instants[2] = 5000.0
+    assert viewer.shared_instant(motion, levels) == 5000
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_script_has_no_syntax_error():
+    subprocess.run(["node", "--check", SCRIPT], check=True, capture_output=True)
+
+
+def test_script_can_stand_in_a_page():
+    text = SCRIPT.read_text(encoding="utf-8")
+    assert not any(end in text for end in ("]]>", "</script", "{{", "{%", "{#", "http"))
