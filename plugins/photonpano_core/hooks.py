@@ -40,6 +40,7 @@ from photonpano_core.grouping import shortest_of, too_short
 from photonpano_core.midpoint import MidpointResampler
 from photonpano_core.npy import NPY
 from photonpano_core.packed_npy import PACKED_NPY
+from photonpano_core.packed_raw import PACKED_RAW
 from photonpano_core.sliding_window import SlidingWindowResampler
 from photonpano_core.stratified import StratifiedResampler
 
@@ -67,6 +68,7 @@ def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer .npy captures, packed and not."""
     yield PACKED_NPY
     yield NPY
+    yield PACKED_RAW
 
 
 @hookimpl

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from photonpano import (
+    Arrived,
     Config,
     FrameSpan,
     InputError,
@@ -31,6 +32,7 @@ from photonpano.reading import (
     NpyHeader,
     OpenFiles,
     Pieces,
+    arrived_frames,
     as_written,
     frames_are_last,
     gzipped_npy_header,
@@ -233,6 +235,19 @@ def _header(config: NpyConfig) -> NpyHeader:
     Raises:
         InputError: the file is missing, damaged, or does not agree with the config.
     """
+    path, header = config.path, _checked_header(config)
+    if not is_gzip(path):
+        require_whole(path, header)
+    if config.frame_axis is None and _frames_are_last(path, header):
+        raise InputError(
+            f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write "
+            "frame_axis: last, or frame_axis: first if it is right"
+        )
+    return header
+
+
+def _checked_header(config: NpyConfig) -> NpyHeader:
+    """Return the header of the capture, which may be incomplete. Raises as `_header` does."""
     path = config.path
     header = gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
     if header.dtype.kind not in "bui":
@@ -243,13 +258,6 @@ def _header(config: NpyConfig) -> NpyHeader:
     if len(header.shape) != 3:
         raise InputError(f"{path} has the shape {header.shape}; a capture has 3 dimensions, frames, height and width")
     require_frames(path, header, "height, width, frames" if config.frame_axis == "last" else "frames, height, width")
-    if not is_gzip(path):
-        require_whole(path, header)
-    if config.frame_axis is None and _frames_are_last(path, header):
-        raise InputError(
-            f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write "
-            "frame_axis: last, or frame_axis: first if it is right"
-        )
     return header
 
 
@@ -264,10 +272,27 @@ def _frames_are_last(path: Location, header: NpyHeader) -> bool:
 def _open(config: NpyConfig) -> NpyBits | NpySums:
     header = _header(config)
     path = unpacked(config.path) if is_gzip(config.path) else config.path
-    values = _Values(path, header, config.frame_axis == "last")
+    return _source_of(_Values(path, header, config.frame_axis == "last"), config)
+
+
+def _source_of(values: _Values, config: NpyConfig) -> NpyBits | NpySums:
     if config.frames_per_sum is None:
         return NpyBits(values, config.frame_rate_hz)
     return NpySums(values, config.frames_per_sum, config.frame_rate_hz)
+
+
+def _arrived(config: NpyConfig) -> Arrived:
+    """Open the frames that are there of a file that is still being written."""
+    if (n_frames := arrived_frames(config.path)) is None:
+        return Arrived(None)
+    if config.frame_axis == "last":
+        raise InputError(f"{config.path} has its frames along the last axis, so that none is whole before all are written")
+    header = _checked_header(config)
+    promised, *frame_shape = header.shape
+    if not n_frames:
+        return Arrived(None, promised)
+    values = _Values(config.path, header._replace(shape=(n_frames, *frame_shape)), frames_last=False)
+    return Arrived(_source_of(values, config), promised)
 
 
 def _read_some(config: NpyConfig) -> None:
@@ -311,4 +336,5 @@ NPY = SourceContribution(
     recognise=_recognise,
     recognises_urls=True,
     suffixes=(".npy", ".gz"),
+    arrived=_arrived,
 )

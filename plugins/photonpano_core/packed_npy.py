@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photonpano import Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
+from photonpano import Arrived, Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
 from photonpano.photometry import packed_along_width, reversed_bits
 from photonpano.reading import (
     FrameFile,
@@ -17,6 +17,7 @@ from photonpano.reading import (
     NpyHeader,
     PackedFileSource,
     PixelOrder,
+    arrived_frames,
     as_written,
     gzipped_npy_header,
     is_gzip,
@@ -82,6 +83,16 @@ def _open(config: PackedNpyConfig) -> PackedFileSource:
     path = unpacked(config.path) if is_gzip(config.path) else config.path
     file = FrameFile(path, header.shape[0], header.offset)
     return PackedFileSource([file], layout, config.frame_rate_hz)
+
+
+def _arrived(config: PackedNpyConfig) -> Arrived:
+    """Open the frames that are there of a file that is still being written."""
+    if (n_frames := arrived_frames(config.path)) is None:
+        return Arrived(None)
+    header, layout = _layout(config)
+    file = FrameFile(config.path, n_frames, header.offset)
+    source = PackedFileSource([file], layout, config.frame_rate_hz) if n_frames else None
+    return Arrived(source, header.shape[0])
 
 
 def _read(config: PackedNpyConfig) -> tuple[NpyHeader, FrameLayout]:
@@ -237,4 +248,5 @@ PACKED_NPY = SourceContribution(
     recognise=_recognise,
     recognises_urls=True,
     suffixes=(".npy", ".gz"),
+    arrived=_arrived,
 )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pydantic import Field
 
-from photonpano import Config, InputError, Location, SpecLocation
+from photonpano import Arrived, Config, InputError, Location, SpecLocation, Url
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, objections, size_of
 
 
@@ -24,18 +24,30 @@ def opened(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Pac
     return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
 
 
+def arrived(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Arrived:
+    """Open the frames that are there of a capture that is still being written: more files appear, and the last one grows."""
+    path = config.path
+    if isinstance(path, Url):
+        raise InputError(f"{path} is a URL, which cannot be followed: follow a folder, or a pipe")
+    if not path.exists() or (path.is_dir() and not sizes_of(path)):
+        return Arrived(None)
+    files = frame_files(path, layout, footer_bytes, growing=True)
+    return Arrived(PackedFileSource(files, layout, config.frame_rate_hz) if files else None)
+
+
 def checked(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Sequence[str]:
     """Return the message of the error that opening the capture would raise, if any."""
     return objections(frame_files, config.path, layout, footer_bytes)
 
 
-def frame_files(path: Location, layout: FrameLayout, footer_bytes: int = 0) -> list[FrameFile]:
+def frame_files(path: Location, layout: FrameLayout, footer_bytes: int = 0, *, growing: bool = False) -> list[FrameFile]:
     """Return the files of a capture with the number of frames that follows from their sizes.
 
     Args:
         path: a file, or a folder.
         layout: order of the pixels of a frame in its bytes.
         footer_bytes: number of bytes that may follow the frames of a file.
+        growing: whether the last file is still being written; it then counts with the whole frames that it has.
 
     Raises:
         InputError: there is no file; the size of a file is not a whole number of frames; or a file has another size than the
@@ -46,6 +58,9 @@ def frame_files(path: Location, layout: FrameLayout, footer_bytes: int = 0) -> l
     found = []
     for file, size in zip(files, sizes, strict=True):
         n_frames, rest = divmod(size, layout.stored_bytes)
+        if growing and file is files[-1]:
+            found += [FrameFile(file, n_frames)] if n_frames else []
+            continue
         if not n_frames or rest not in (0, footer_bytes):
             allowed = f", with or without {footer_bytes} more" if footer_bytes else ""
             raise InputError(

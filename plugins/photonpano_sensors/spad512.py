@@ -6,7 +6,7 @@ from pathlib import Path
 
 from photonpano import Recognised, SourceContribution
 from photonpano.reading import FrameLayout
-from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
+from photonpano_sensors.bin_files import BinConfig, arrived, checked, opened, sizes_of
 
 LAYOUT = FrameLayout((512, 512), (512, 64))
 FOOTER_BYTES = 4
@@ -32,5 +32,6 @@ SPAD512 = SourceContribution(
     build=lambda config, _: opened(config, LAYOUT, FOOTER_BYTES),
     check=lambda config: checked(config, LAYOUT, FOOTER_BYTES),
     recognise=_recognise,
+    arrived=lambda config: arrived(config, LAYOUT, FOOTER_BYTES),
     suffixes=(".bin",),
 )

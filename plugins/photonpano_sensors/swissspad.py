@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import Recognised, SourceContribution
 from photonpano.reading import FrameLayout, files_in
-from photonpano_sensors.bin_files import BinConfig, checked, opened, sizes_of
+from photonpano_sensors.bin_files import BinConfig, arrived, checked, opened, sizes_of
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 
@@ -98,6 +98,7 @@ SWISSSPAD_HALF = SourceContribution(
     build=lambda config, _: opened(config, HALF),
     check=lambda config: checked(config, HALF),
     recognise=lambda path: _recognise(path, "half"),
+    arrived=lambda config: arrived(config, HALF),
     suffixes=(".bin",),
 )
 SWISSSPAD_FULL = SourceContribution(
@@ -107,5 +108,6 @@ SWISSSPAD_FULL = SourceContribution(
     build=lambda config, _: opened(config, FULL),
     check=lambda config: checked(config, FULL),
     recognise=lambda path: _recognise(path, "full"),
+    arrived=lambda config: arrived(config, FULL),
     suffixes=(".bin",),
 )

@@ -19,7 +19,19 @@ from pydantic import (
 from photonpano.contributions.configs import Config
 from photonpano.contributions.contexts import ExecutorContext, SourceContext, StageContext
 from photonpano.execution import Executor
-from photonpano.protocols import Exporter, Interpolator, Locator, Merger, PoseEstimator, Refiner, Renderer, Resampler, Source
+from photonpano.protocols import (
+    Arrived,
+    Exporter,
+    Interpolator,
+    Locator,
+    Merger,
+    Piped,
+    PoseEstimator,
+    Refiner,
+    Renderer,
+    Resampler,
+    Source,
+)
 from photonpano.text import install_line
 from photonpano.values import StreamInfo
 
@@ -159,6 +171,9 @@ class SourceContribution(Contribution):
         recognises_urls: whether `recognise` also gets a `photonpano.Url`, which a path of the type `SpecLocation` may be.
         suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
             the message has the problems of the sources with its ending.
+        arrived: opens what is there of a capture that is still being written, or says that it comes from a pipe, for
+            `photonpano run --follow`; None if this source cannot. It is called some fifty times a second. A file that is not
+            there yet is no error, one that will never be a capture is an `InputError`.
     """
 
     kind: ClassVar[str] = "source"
@@ -168,6 +183,7 @@ class SourceContribution(Contribution):
     write: WriteFrames | None = None
     recognises_urls: bool = False
     suffixes: tuple[str, ...] = ()
+    arrived: Callable[[Any], Arrived | Piped] | None = None
 
     def __post_init__(self) -> None:
         Contribution.__post_init__(self)

@@ -17,6 +17,7 @@ from photonpano.protocols.motion import (
 )
 from photonpano.protocols.panorama import Exporter, FinishedPanorama, Renderer
 from photonpano.protocols.sources import (
+    Arrived,
     ColouredSource,
     KnowsSharpViews,
     KnowsTruth,
@@ -24,6 +25,7 @@ from photonpano.protocols.sources import (
     LinearlyCorrectedSource,
     LitSource,
     PackedSource,
+    Piped,
     Source,
     WeightedSource,
     camera_of,
@@ -31,6 +33,7 @@ from photonpano.protocols.sources import (
 )
 
 __all__ = [
+    "Arrived",
     "ColouredSource",
     "Exporter",
     "FinishedPanorama",
@@ -47,6 +50,7 @@ __all__ = [
     "Merger",
     "PackedSource",
     "PanoramaView",
+    "Piped",
     "PoseEstimator",
     "Refiner",
     "Renderer",

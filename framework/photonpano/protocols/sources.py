@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -48,6 +49,32 @@ class Source(Protocol):
     def __enter__(self) -> Source: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrived:
+    """What is there of a capture that is still being written.
+
+    Attributes:
+        source: the whole frames that are there; None as long as there is none.
+        promised: frames that the capture will have, if it says so.
+    """
+
+    source: Source | None
+    promised: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Piped:
+    """A capture that arrives on standard input. Written to a file as it comes, it is one of the same source.
+
+    Attributes:
+        header_bytes: what comes before the first frame.
+        frame_bytes: bytes of a frame.
+    """
+
+    header_bytes: int
+    frame_bytes: int
 
 
 @runtime_checkable

@@ -20,6 +20,7 @@ from photonpano.reading.files import (
 )
 from photonpano.reading.filter_arrays import COLOURS, bayer_array, read_filter_array
 from photonpano.reading.first_look import look_first
+from photonpano.reading.growing import arrived_frames
 from photonpano.reading.gzipped import gzipped_npy_header, is_gzip, unpacked, unpacked_start
 from photonpano.reading.npy import NpyHeader, npy_header, require_frames, require_whole
 from photonpano.reading.packed_files import FrameFile, PackedFileSource
@@ -46,6 +47,7 @@ __all__ = [
     "Pieces",
     "PixelOrder",
     "SingleFrameSource",
+    "arrived_frames",
     "as_written",
     "bayer_array",
     "files_in",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from photonpano.contributions import SourceContext, SourceContribution
 from photonpano.errors import InputError
 from photonpano.motion.attributed_source import attributed
-from photonpano.protocols import PackedSource, Source
+from photonpano.protocols import Arrived, PackedSource, Source
 from photonpano.testing.conformance import Conformance, must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
 from photonpano.values import FrameSpan, StreamInfo
@@ -32,6 +32,7 @@ class SourceConformance(Conformance):
         n_frames: number of these frames.
         bit_depth: bits per pixel of these frames.
         wrong: keys that replace those of the config and that `check` must reject, such as a missing file.
+        grows: whether this capture can be read while it is being written, if the contribution has an `arrived`.
     """
 
     kind: ClassVar[str] = "source"
@@ -42,6 +43,7 @@ class SourceConformance(Conformance):
     n_frames: int = 75
     bit_depth: int = 1
     wrong: Sequence[Mapping[str, Any]] = ()
+    grows: bool = True
 
     def write(self, frames: NDArray[np.generic], folder: Path) -> Mapping[str, Any]:
         """Write frames as a capture and return the keys that open it; override this for a source that reads files.
@@ -182,6 +184,19 @@ class SourceConformance(Conformance):
                 f"{len(wrong)} of {len(known)} frames differ from those that were written; in frame {wrong[0]}, "
                 f"{_difference(read[wrong[0]], known[wrong[0]])}"
             )
+
+    def test_arrived_frames_are_those_of_the_capture(self) -> None:
+        """Of a capture that is complete, all frames have arrived; a source that cannot be followed has no `arrived`."""
+        if self.contribution.arrived is None or not self.grows:
+            pytest.skip("the source cannot read this capture while it is being written")
+        found = self.contribution.arrived(self.settings())
+        assert isinstance(found, Arrived), f"arrived() of a file must return an Arrived, got a {type(found).__name__}"
+        assert found.source is not None, "arrived() of a complete capture must have its frames"
+        with self.opened() as whole, found.source as source:
+            assert source.info == whole.info, f"arrived() has {source.info}, and the complete capture {whole.info}"
+            assert found.promised in (None, whole.info.n_frames), f"arrived() promises {found.promised} frames"
+            difference = _difference(source.counts(_first(source)), whole.counts(_first(whole)))
+            assert not difference, f"the frames of arrived() must be those of the capture, but {difference}"
 
     def test_span_beyond_capture_raises_input_error(self) -> None:
         """Missing frames are neither invented nor silently left out."""

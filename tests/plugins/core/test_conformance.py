@@ -31,6 +31,17 @@ class TestPackedNpy(SourceConformance):
         return {"path": folder / "capture.npy", "width": frames.shape[2]}
 
 
+class TestPackedRaw(SourceConformance):
+    contribution = CATALOG.find("source", "packed-raw").contribution
+    config = {"height": 18, "width": 27, "bit_order": "little", "header_bytes": 5}
+    wrong = ({"path": "there-is-no-such-file.raw"}, {"height": 1000}, {"header_bytes": 4})
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        packed = np.packbits(frames, axis=-1, bitorder="little")
+        (folder / "capture.raw").write_bytes(b"12345" + packed.tobytes())
+        return {"path": folder / "capture.raw"}
+
+
 class TestNpyBits(SourceConformance):
     contribution = CATALOG.find("source", "npy").contribution
     config = {"holds": "bits"}
@@ -42,6 +53,7 @@ class TestNpyBits(SourceConformance):
 
 
 class TestNpyBitsFramesLast(TestNpyBits):
+    grows = False
     config = {"holds": "bits", "frame_axis": "last"}
 
     def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
@@ -61,6 +73,7 @@ class TestNpySums(SourceConformance):
 
 
 class TestNpySumsFramesLast(TestNpySums):
+    grows = False
     config = {"holds": "sums", "frames_per_sum": 1023, "frame_axis": "last"}
 
     def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
