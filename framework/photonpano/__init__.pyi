@@ -66,6 +66,7 @@ from .pipeline.components import open_source as open_source
 from .pipeline.forecast import Forecast as Forecast
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run
+from .protocols import Arrived as Arrived
 from .protocols import ColouredSource as ColouredSource
 from .protocols import Exporter as Exporter
 from .protocols import FinishedPanorama as FinishedPanorama
@@ -82,6 +83,7 @@ from .protocols import Locator as Locator
 from .protocols import Merger as Merger
 from .protocols import PackedSource as PackedSource
 from .protocols import PanoramaView as PanoramaView
+from .protocols import Piped as Piped
 from .protocols import PoseEstimator as PoseEstimator
 from .protocols import Refiner as Refiner
 from .protocols import Renderer as Renderer
@@ -92,6 +94,7 @@ from .protocols import WeightedSource as WeightedSource
 from .record.batch_row import BatchRow as BatchRow
 from .registry import Catalog as Catalog
 from .registry import discover as discover
+from .report import LiveFigures as LiveFigures
 from .specs import Plan as Plan
 from .specs import capture_plan as capture_plan
 from .specs import load_spec as load_spec

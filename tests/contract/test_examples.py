@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -89,6 +91,8 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
 """Specs to run, with overrides that make them small."""
+OTHERS = {"poses", "stratified-poses", "many-captures", "as-it-arrives"}
+"""Specs that have tests of their own."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
 NEEDS = {
@@ -163,7 +167,7 @@ def write_as_published(frames: np.ndarray, folder: Path) -> None:
 
 
 def test_every_example_spec_is_in_this_file():
-    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, "poses", "stratified-poses", "many-captures"}
+    assert {file.stem for file in EXAMPLES.glob("*.yaml")} == {*CAPTURES, *RUNS, *OTHERS}
 
 
 def test_examples_readme_links_every_spec():
@@ -201,6 +205,37 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
     assert record["spec"]["merge"]["with"].get("compensate", True) == (name != "naive-average")
     assert any(level["revisits"]["located"] for level in record["levels"]) == (name == "revisits")
     assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
+
+
+def test_example_follows_a_program_that_writes_frames(examples, tmp_path):
+    """Both are processes of their own, with a pipe between them."""
+    frames = examples / "capture.npy"
+    write = f"import numpy, sys; sys.stdout.buffer.write(numpy.load({str(frames)!r}).tobytes())"
+    changes = ("source.with.height=128", "source.with.width=160", "resample.with.group_size=50", "levels=1", "refine=[]")
+    command = [
+        sys.executable,
+        "-m",
+        "photonpano",
+        "run",
+        examples / "as-it-arrives.yaml",
+        "--follow",
+        "--output",
+        tmp_path / "run",
+    ]
+    with subprocess.Popen([sys.executable, "-c", write], stdout=subprocess.PIPE) as writer:
+        done = subprocess.run(
+            [*command, *(word for change in changes for word in ("--set", change))],
+            stdin=writer.stdout,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert (writer.returncode, done.returncode) == (0, 0), done.stderr
+    assert done.stdout.startswith("followed  300 of 300 frames were located as they arrived, ")
+    assert (tmp_path / "run.live" / "frames.raw").read_bytes() == np.load(frames).tobytes()
+    photonpano("run", examples / "scan.yaml", "--output", tmp_path / "scan", levels=1, refine="[]", **GROUPS)
+    for name in ("panorama.tiff", "coverage.tiff", "trajectory.npz"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "scan" / name).read_bytes(), name
 
 
 def test_example_of_many_captures_runs(examples, tmp_path):

@@ -10,6 +10,7 @@ from photonpano.cli.verdict import Strict
 
 if TYPE_CHECKING:
     from photonpano.record.schema import PanoramaRecord, RefinementRecord
+    from photonpano.report import LiveFigures
 
 
 def run(
@@ -35,6 +36,23 @@ def run(
     keep_work: Annotated[
         bool, typer.Option("--keep-work", help="Keep what each level has found, for --from-level, in the folder DIR.work.")
     ] = False,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="Follow a capture that is still being written, or comes on standard input: locate its frames as they arrive, "
+            "and write a page with the picture so far, DIR.live/live.html. Run the whole once it is complete.",
+        ),
+    ] = False,
+    end_after: Annotated[
+        float,
+        typer.Option(
+            "--end-after",
+            metavar="SECONDS",
+            min=0.1,
+            help="With --follow: a growing file is complete when nothing has come for so long.",
+        ),
+    ] = 5.0,
     strict: Strict = False,
 ) -> None:
     """Make a panorama from a spec.
@@ -56,14 +74,28 @@ def run(
 
     if resume and from_level is not None:
         raise WrongArgumentError("--resume and --from-level: give one of them")
-    plan = load_spec(spec, overrides or (), output)
+    if follow and (resume or from_level is not None):
+        raise WrongArgumentError(
+            "--follow begins a new run, which --resume and --from-level do not; to go on with frames that have arrived, leave "
+            "out --follow"
+        )
+    plan = load_spec(spec, overrides or (), output, arriving=follow)
     result = run_plan(
-        plan, progress_for_stderr(), overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work
+        plan,
+        progress_for_stderr(notes=follow),
+        overwrite=overwrite,
+        resume=resume,
+        from_level=from_level,
+        keep_work=keep_work,
+        follow=follow,
+        end_after=end_after,
     )
     record, directory = result.record, result.directory.resolve()
     log_decisions(record)
     if result.was_finished:
         typer.echo("finished  this run was finished before; nothing was left to do")
+    if result.followed is not None:
+        typer.echo(f"followed  {_delays(result.followed)}")
     if result.verdict is not None:
         print_verdict(result.verdict)
     for warning in record["warnings"]:
@@ -87,6 +119,16 @@ def run(
         require_trust(result.verdict, "all files of the run folder are written")
     if strict and poses and poses["doubts"]:
         raise DoubtfulError("the poses are doubtful, and --strict accepts only trusted ones; all files of the run are written")
+
+
+def _delays(figures: "LiveFigures") -> str:
+    """Describe how fast frames were located."""
+    from photonpano.text import counted, duration
+
+    text = f"{figures.located:,} of {counted(figures.frames, 'frame')} were located as they arrived"
+    if figures.delay_mean_s is None or figures.delay_longest_s is None:
+        return text
+    return f"{text}, {duration(figures.delay_mean_s)} later on average and {duration(figures.delay_longest_s)} at most"
 
 
 def _range(panorama: "PanoramaRecord | None") -> str:

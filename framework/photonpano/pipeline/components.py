@@ -34,7 +34,7 @@ from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
 from photonpano.threads import InOrder, in_order, thread_count
-from photonpano.values import CaptureSummary, Decision, DecisionValue, FrameSpan, Group
+from photonpano.values import CaptureSummary, Decision, DecisionValue, FrameSpan, Group, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.pipeline.exports import AttributedExporter
@@ -59,13 +59,27 @@ def open_source(plan: Plan) -> Iterator[Source]:
     """
     opened = build_source(plan)
     with without_still_pixels(opened) if plan.corrects_itself else opened as source:
-        problems = check_stream(plan, source.info)
-        if plan.render.white_balance != "none" and not isinstance(source, ColouredSource):
-            message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
-            problems.append(plan.place("render.white_balance").problem(message))
-        if problems:
-            raise SpecError(problems)
+        require_suitable(plan, source, source.info)
         yield source
+
+
+def require_suitable(plan: Plan, source: Source, info: StreamInfo) -> None:
+    """Check the stages of a plan against its capture.
+
+    Args:
+        plan: the plan.
+        source: the capture.
+        info: its frames, which may be more than those that are there.
+
+    Raises:
+        SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
+    """
+    problems = check_stream(plan, info)
+    if plan.render.white_balance != "none" and not isinstance(source, ColouredSource):
+        message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
+        problems.append(plan.place("render.white_balance").problem(message))
+    if problems:
+        raise SpecError(problems)
 
 
 def build_source(plan: Plan) -> Source:
@@ -85,6 +99,15 @@ def build_source(plan: Plan) -> Source:
             raise
         # The spec says `auto`, so the message explains how this source was chosen.
         raise InputError(f"{error} (source {found.value}: {found.reason})") from error
+    return with_corrections(plan, source)
+
+
+def with_corrections(plan: Plan, source: Source) -> Source:
+    """Return a capture with the corrections of a plan.
+
+    Raises:
+        SpecError: a correction does not suit the capture, or its file is not what it should be; the capture is closed.
+    """
     if not plan.corrections:
         return source
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Context, Progress, usual
+from photonpano.errors import InputError
 from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
 from photonpano.pipeline.checkpoints.finished import finished_run
@@ -16,6 +17,7 @@ from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.failed_run import reporting_failure
+from photonpano.pipeline.following.follow import followed
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.pose_run import run_poses
 from photonpano.pipeline.rendering import render_into
@@ -23,7 +25,7 @@ from photonpano.pipeline.run_steps import begun_run, first_decisions, with_repor
 from photonpano.protocols import light_of
 from photonpano.record.run_json import record_of, verdict_of
 from photonpano.record.schema import RunRecord
-from photonpano.report import OpenCapture, render_report
+from photonpano.report import LiveFigures, OpenCapture, render_report
 from photonpano.report.notebook import run_html
 from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
@@ -39,12 +41,14 @@ class RunResult:
         record: the content of its `run.json`.
         verdict: whether motion and panorama explain the photons; None for poses, whose doubts are in the record.
         was_finished: whether `resume` found that nothing was left to do.
+        followed: how fast the frames of a capture were located that was followed.
     """
 
     directory: Path
     record: RunRecord = field(repr=False)
     verdict: Verdict | None
     was_finished: bool = False
+    followed: LiveFigures | None = None
 
     def _repr_html_(self) -> str:
         """Show picture, verdict and files in a notebook."""
@@ -59,6 +63,8 @@ def run(
     resume: bool = False,
     from_level: int | None = None,
     keep_work: bool = False,
+    follow: bool = False,
+    end_after: float = 5.0,
 ) -> RunResult:
     """Run a plan and write its run folder: panorama, coverage, trajectory, record and report; or poses, for a plan with `pose`.
 
@@ -71,15 +77,24 @@ def run(
         from_level: take the levels before this one from the run before, whose work was kept; compute this one and what follows.
             The work is kept again. A run of poses keeps no work.
         keep_work: keep what each level has found, beside the run folder, for `from_level`.
+        follow: follow a capture that is still being written: locate its frames as they arrive, and write a page with the
+            picture so far to the folder `DIR.live` beside the run folder. Once the capture is complete, it is run as any other.
+        end_after: with `follow`, the seconds without a new frame after which a growing file counts as complete.
 
     Raises:
-        InputError: the capture cannot be used, shows nothing, or does not suit the plan.
+        InputError: the capture cannot be used or followed, shows nothing, or does not suit the plan.
         LocationError: the motion could not be estimated; `report` is a page with the exposures that did not match, beside the
             run folder. So it is for the next two.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
         PluginError: a component failed in its own way, or broke its contract.
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
     """
+    if follow:
+        if resume or from_level is not None:
+            raise InputError("a run that follows a capture begins anew: without resume and from_level")
+        with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as complete:
+            result = run(complete.plan, progress, overwrite=overwrite, keep_work=keep_work)
+            return replace(result, followed=complete.figures)
     if plan.pose is not None:
         keeps_work = keep_work or from_level is not None
         poses, was_finished = run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keeps_work)

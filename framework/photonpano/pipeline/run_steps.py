@@ -31,7 +31,7 @@ from photonpano.values import Decision
 
 logger = logging.getLogger(__name__)
 
-_COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
+COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +71,7 @@ def begun_run(plan: Plan, observers: Observers, progress: Progress, *, overwrite
         run_folder(plan.output.directory, overwrite=overwrite, inputs=_read_files(plan)) as folder,
         loading_figures(),
         one_thread_inside(),
-        notify_on_first_compile(partial(progress.note, _COMPILING)),
+        notify_on_first_compile(partial(progress.note, COMPILING)),
     ):
         start = time.perf_counter()
         _require_photons(plan, source)

@@ -26,6 +26,7 @@ def load_spec(
     overrides: Sequence[str] = (),
     output: str | Path | None = None,
     catalog: Catalog | None = None,
+    arriving: bool = False,
 ) -> Plan:
     """Load a spec file and resolve it.
 
@@ -35,13 +36,14 @@ def load_spec(
             another capture, its name is added to that of the default run folder.
         output: the run folder, relative to the current folder, in place of the spec's `output.directory`.
         catalog: what can be chosen; by default what the installed plugins offer.
+        arriving: whether the capture is still being written, so that its files are not checked: see `run` with `follow`.
 
     Raises:
         SpecError: the file cannot be read, or the spec is wrong; carries all problems, each with line and column.
     """
     path, catalog = Path(path), discover() if catalog is None else catalog
     try:
-        return _load(read_spec(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog)
+        return _load(read_spec(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog, arriving)
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
             raise
@@ -58,6 +60,7 @@ def parse_spec(
     output: str | Path | None = None,
     catalog: Catalog | None = None,
     file: Path | None = None,
+    arriving: bool = False,
 ) -> Plan:
     """Resolve a spec that is given as plain data, or as the text of a YAML file.
 
@@ -70,12 +73,13 @@ def parse_spec(
         output: the run folder, relative to the current folder, in place of the spec's `output.directory`.
         catalog: what can be chosen; by default what the installed plugins offer.
         file: what the text was read from, for messages and for the record of a run.
+        arriving: whether the capture is still being written, so that its files are not checked: see `run` with `follow`.
 
     Raises:
         SpecError: the spec is wrong; carries all problems.
     """
     catalog = discover() if catalog is None else catalog
-    return _load(spec, Place(file=file), Path(directory).absolute(), name, overrides, output, catalog)
+    return _load(spec, Place(file=file), Path(directory).absolute(), name, overrides, output, catalog, arriving)
 
 
 def capture_plan(
@@ -143,6 +147,7 @@ def _load(
     overrides: Sequence[str],
     output: str | Path | None,
     catalog: Catalog,
+    arriving: bool,
 ) -> Plan:
     written = read_yaml(spec, place) if isinstance(spec, str) else from_python(spec, place)
     if written.data is None:
@@ -154,7 +159,7 @@ def _load(
     other = _capture(written)
     named = name if other in (own, None) or refusal(Path(str(other))) else f"{name}-{other}"
     _set_output(written, None if output is None else Path(output).absolute(), Path("runs", named))
-    written.directory, written.catalog = directory, catalog
+    written.directory, written.catalog, written.arriving = directory, catalog, arriving
     return resolve(written)
 
 

@@ -95,7 +95,7 @@ class _Resolver:
         elif type(root["version"]) is not int or root["version"] != VERSION:
             spec.wrong("version", f"expected {VERSION}, the version of the format, got {given(root['version'])}")
         source = self.components.stage("source", root.get("source"), "source").choice
-        for complaint in complaints(source) if source else ():
+        for complaint in complaints(source) if source and not spec.arriving else ():
             spec.wrong_key("source", complaint)
         spec.remark = ""
         spec.places = {name: spec.place(name) for name in STAGES} | spec.places

@@ -56,6 +56,7 @@ class WrittenSpec:
         unreadable: the paths of values that could not be read; no further problem with them is reported.
         sections_of: the sections in which a key may stand, such as `resample.with` for `group_size`; "" for a section itself.
         remark: added to the message of every problem.
+        arriving: whether the capture is still being written, so that its files are not checked.
         directory: what relative paths count from.
         catalog: what can be chosen.
         decisions: choices that the spec leaves open and that reading it made.
@@ -70,6 +71,7 @@ class WrittenSpec:
     decisions: list[Decision] = field(default_factory=list)
     sections_of: dict[str, list[str]] = field(default_factory=dict)
     remark: str = ""
+    arriving: bool = False
 
     def place(self, where: str) -> Place:
         """Return the place of a value; if it was not written, that of the mapping or list where it would stand."""

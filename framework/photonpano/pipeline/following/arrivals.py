@@ -1,0 +1,125 @@
+"""Watch a capture that is still being written: how many frames are there, since when, and whether more will come."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from photonpano.errors import PhotonpanoError
+from photonpano.protocols import Arrived, Source
+
+_POLL_S = 0.02
+_MOST_MARKS = 4096
+"""Times of arrival that are kept: if frames wait for minutes, they get coarser."""
+
+
+class Arrivals:
+    """Watches a capture in a thread.
+
+    Attributes:
+        n_frames: whole frames that are there.
+        promised: frames that the capture will have; None if it does not say so.
+        ended: whether no more frames are expected.
+        fell_silent: whether that is because nothing came for long.
+        seconds: from the first frame to the last.
+    """
+
+    def __init__(self, look: Callable[[], Arrived], is_over: Callable[[], bool] | None, silence_s: float) -> None:
+        """Begin to watch.
+
+        Args:
+            look: returns what is there.
+            is_over: returns whether no more will come, for a capture that is copied from a pipe. Otherwise a capture is over
+                when all frames are there that it promises, or when nothing comes.
+            silence_s: for how long, in seconds.
+        """
+        self.n_frames, self.ended, self.fell_silent, self.seconds = 0, False, False, 0.0
+        self.promised: int | None = None
+        self._look, self._is_over, self._silence_s = look, is_over, silence_s
+        self._source: Source | None = None
+        self._failure: PhotonpanoError | None = None
+        self._marks: deque[tuple[int, float]] = deque()
+        """Numbers of frames, and when they were not there yet."""
+        self._forgotten = 0
+        self._lock, self._changed, self._stopped = threading.Lock(), threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="arrivals", daemon=True)
+        self._thread.start()
+
+    def source(self) -> Source | None:
+        """Return the frames that are there; None as long as there is none.
+
+        Raises:
+            InputError: what arrives is no capture.
+        """
+        if self._failure is not None:
+            raise self._failure
+        return self._source
+
+    def wait(self, seconds: float) -> None:
+        """Wait until frames arrive or the capture ends, but no longer than that."""
+        self._changed.wait(seconds)
+        self._changed.clear()
+
+    def waited(self, n_frames: int, now: float) -> list[tuple[int, float]]:
+        """Return how long ago the frames up to a number arrived, and forget them: numbers of frames, and seconds.
+
+        A frame counts as arrived at the last look at which it was not there, so that no time is too short.
+        """
+        found = []
+        with self._lock:
+            first = self._forgotten
+            while self._marks and first < n_frames:
+                stop, when = self._marks[0]
+                part = min(stop, n_frames) - first
+                found.append((part, now - when))
+                first += part
+                if first == stop:
+                    self._marks.popleft()
+            self._forgotten = first
+        return found
+
+    def oldest(self, now: float) -> float:
+        """Return how long ago the first of the frames arrived that are not forgotten, in seconds; 0 if there is none."""
+        with self._lock:
+            return now - self._marks[0][1] if self._marks else 0.0
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._stopped.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        before = began = changed = time.monotonic()
+        while not self._stopped.is_set():
+            over = self._is_over is not None and self._is_over()  # asked first: what came before that is seen now
+            now = time.monotonic()
+            try:
+                arrived = self._look()
+            except PhotonpanoError as error:
+                self._failure, self.ended = error, True
+                break
+            self._source, self.promised = arrived.source, arrived.promised
+            n_frames = 0 if arrived.source is None else arrived.source.info.n_frames
+            if n_frames > self.n_frames:
+                began = began if self.n_frames else before
+                self._mark(n_frames, before)
+                self.n_frames, changed, self.seconds = n_frames, now, now - began
+                self._changed.set()
+            self.fell_silent = self._is_over is None and now - changed > self._silence_s
+            if over or self.fell_silent or (n_frames and n_frames == self.promised):
+                self.ended = True
+                break
+            before = now
+            self._stopped.wait(_POLL_S)
+        self._changed.set()
+
+    def _mark(self, n_frames: int, when: float) -> None:
+        with self._lock:
+            self._marks.append((n_frames, when))
+            if len(self._marks) > _MOST_MARKS:
+                marks = list(self._marks)
+                self._marks = deque((later[0], earlier[1]) for earlier, later in zip(marks[::2], marks[1::2], strict=False))
+                if len(marks) % 2:
+                    self._marks.append(marks[-1])

@@ -1,0 +1,294 @@
+"""Follow a capture until it is complete: locate its frames as they arrive, and show the picture so far."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import os
+import shlex
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from photonpano.captures.fingerprint import capture_files
+from photonpano.compiling import notify_on_first_compile
+from photonpano.context import Context, Progress
+from photonpano.contributions import PartOfCapture, SourceContribution
+from photonpano.errors import InputError, OutputError, PhotonpanoError
+from photonpano.folders import lock_path
+from photonpano.locks import locked
+from photonpano.pipeline.following.arrivals import Arrivals
+from photonpano.pipeline.following.delays import Delays
+from photonpano.pipeline.following.located import LocatedSoFar
+from photonpano.pipeline.following.page import PAGE, LivePage
+from photonpano.pipeline.following.picture import PictureSoFar
+from photonpano.pipeline.following.reading import ArrivedFrames
+from photonpano.pipeline.following.rehearsal import rehearse
+from photonpano.pipeline.following.spool import Spool
+from photonpano.pipeline.run_folder import run_folder
+from photonpano.pipeline.run_steps import COMPILING
+from photonpano.protocols import Arrived, Piped
+from photonpano.report import LiveFigures
+from photonpano.specs.plan import Plan
+from photonpano.text import counted, duration
+from photonpano.threads import one_thread_inside, thread_count
+
+logger = logging.getLogger(__name__)
+
+SPOOL = "frames.raw"
+"""The file of the frames of a pipe."""
+_REFRESH_S = 1.0
+_NOTE_S = 10.0
+_IDLE_S = 0.1
+"""How long to wait for frames before the page is looked after."""
+_RATE_S = 3.0
+"""The rate of arrival is that of the last seconds."""
+_FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
+"""If frames wait for longer, so long after the first were located, they come faster than they are located."""
+
+
+@dataclass(slots=True)
+class Followed:
+    """A capture that was followed until it was complete.
+
+    Attributes:
+        plan: runs the whole capture, which is now in a file.
+        figures: how far behind the frames were located.
+    """
+
+    plan: Plan
+    figures: LiveFigures
+
+
+def live_folder(run_directory: Path) -> Path:
+    """Return the folder of the page, beside a run folder."""
+    return run_directory.with_name(f"{run_directory.name}.live")
+
+
+@contextmanager
+def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[Followed]:
+    """Follow a capture until it is complete; the block then runs the whole of it, and the page says how that ended.
+
+    Args:
+        plan: what to do with the capture. One on standard input is copied to a file in the `live_folder`, as it comes.
+        progress: receives messages.
+        overwrite: whether a file of an earlier capture there is replaced, and the run folder; see `run`.
+        end_after: seconds without a new frame after which a growing file counts as complete, unless it promises more frames.
+
+    Raises:
+        InputError: the source cannot be followed; or what arrives is no capture, or is incomplete. What arrived is kept.
+        OutputError: a file cannot be written, or another process follows a capture into the same folder.
+        SpecError: a stage does not suit the capture.
+    """
+    directory = plan.output.directory.absolute()
+    folder = live_folder(directory)
+    look = _followable(plan)
+    with ExitStack() as stack:
+        stack.enter_context(_made(folder))
+        stack.enter_context(locked(lock_path(folder), f"the folder {folder}"))
+        what = look(plan.source.config)
+        spool: Spool | None = None
+        spooled = folder / SPOOL
+        if isinstance(what, Piped):
+            plan = _from_file(plan, spooled)
+        with run_folder(directory, overwrite=overwrite, inputs=capture_files(plan)):
+            pass  # what forbids to write it is told now, and not when the capture is complete
+        page = LivePage(folder, directory)
+        if isinstance(what, Piped):
+            spool = Spool(_standard_input(), _free(spooled, plan, overwrite), what)
+            stack.callback(spool.close)
+        arrivals = Arrivals(partial(_arrived, look, plan), None if spool is None else lambda: spool.ended, end_after)
+        stack.callback(arrivals.close)
+        progress.note(f"following the capture; {folder / PAGE} shows the panorama so far")
+        try:
+            figures = _located_so_far(plan, arrivals, page, progress)
+            arrivals.close()
+            if spool is not None:
+                spool.close()
+                spool.require_whole()
+            _require_complete(plan, arrivals, end_after)
+            page.write(replace(figures, state="finishing"))
+            yield Followed(plan, figures)
+            page.write(replace(figures, state="finished"))
+        except BaseException as error:
+            arrivals.close()  # nobody looks for the file any more, which is removed if it is empty
+            if spool is not None:
+                spool.close()
+                if spool.path.exists():
+                    logger.warning(f"the frames that arrived are in {spool.path}; {_way_on(plan)}")
+            message = str(error) if isinstance(error, PhotonpanoError) else "interrupted"
+            page.end(message, arrivals.n_frames)
+            raise
+
+
+def _followable(plan: Plan) -> Callable[..., Arrived | Piped]:
+    """Return what opens the part of the capture that is there."""
+    contribution, config = plan.source.contribution, plan.source.config
+    assert isinstance(contribution, SourceContribution)
+    if plan.pose is not None:
+        raise InputError("a spec with 'pose' cannot be followed: poses need the whole capture; run it without --follow")
+    if contribution.arrived is None:
+        raise InputError(
+            f"{plan.source.label} cannot read a capture that is still being written; run it without --follow once it is "
+            "complete, or have frames written one after the other, for the source packed-raw"
+        )
+    if isinstance(config, PartOfCapture) and config.frames is not None:
+        raise InputError(
+            str(plan.place("source.with.frames").problem("a part of a capture cannot be followed; remove this key"))
+        )
+    return contribution.arrived
+
+
+def _arrived(look: Callable[..., Arrived | Piped], plan: Plan) -> Arrived:
+    found = look(plan.source.config)
+    assert isinstance(found, Arrived)
+    return found
+
+
+def _from_file(plan: Plan, path: Path) -> Plan:
+    """Return a plan whose capture is a file and not standard input."""
+    config = plan.source.config.model_copy(update={"path": path})
+    section = plan.document["source"]
+    source = {**section, "with": {**section["with"], "path": str(path)}}
+    return replace(plan, source=replace(plan.source, config=config), document={**plan.document, "source": source})
+
+
+def _standard_input() -> int:
+    """Return the descriptor of standard input.
+
+    Raises:
+        InputError: it is closed, or a terminal.
+    """
+    if sys.__stdin__ is None or sys.__stdin__.closed or os.isatty(0):
+        raise InputError("no frames come on standard input; write PROGRAM | photonpano run SPEC --follow")
+    return 0
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder, and remove it after the block if it is empty."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = "there is a file of this name" if error.errno == errno.EEXIST else error.strerror
+        raise OutputError(f"the folder {folder} cannot be made ({reason}); choose another one with --output") from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _free(path: Path, plan: Plan, overwrite: bool) -> Path:
+    """Return the path of a file that is not there.
+
+    Raises:
+        OutputError: it holds the frames of an earlier capture.
+    """
+    if path.exists() and path.stat().st_size and not overwrite:
+        raise OutputError(
+            f"{path} holds the frames of an earlier capture: {_way_on(plan)}. To follow another capture, choose another folder "
+            "with --output, or replace these frames with --overwrite"
+        )
+    path.unlink(missing_ok=True)
+    return path
+
+
+def _way_on(plan: Plan) -> str:
+    """Return what makes the panorama of frames that were copied from a pipe."""
+    path = str(plan.document["source"]["with"]["path"])
+    if plan.file is None:
+        return f"run them with source.with.path = {path!r}, and without follow"
+    words = ["photonpano", "run", str(plan.file), "--set", f"source.with.path={path}", "--output", str(plan.output.directory)]
+    return f"run them with `{shlex.join(words)}`"
+
+
+def _require_complete(plan: Plan, arrivals: Arrivals, end_after: float) -> None:
+    """Refuse a capture with too few frames.
+
+    Raises:
+        InputError: none has come, or fewer than it promises.
+    """
+    where = plan.document["source"]["with"].get("path", "the capture")
+    waited = f"within {end_after:g} s"
+    if not arrivals.n_frames:
+        raise InputError(f"{where}: no frame has come {waited}; check the path, or wait longer with --end-after")
+    if arrivals.promised is not None and arrivals.n_frames < arrivals.promised:
+        raise InputError(
+            f"{where} holds {arrivals.n_frames:,} of the {arrivals.promised:,} frames that it promises, and no more have come "
+            f"{waited}: its writer has died, or pauses for longer. Then wait longer with --end-after. Otherwise record it "
+            "again, or read the frames that are there with the source packed-raw and its key header_bytes"
+        )
+
+
+def _located_so_far(plan: Plan, arrivals: Arrivals, page: LivePage, progress: Progress) -> LiveFigures:
+    """Locate frames as they arrive, until no more come, and write the page each second."""
+    context = Context(thread_count(plan.run.threads))
+    reading, located, picture, delays = ArrivedFrames(plan), LocatedSoFar(plan, context), PictureSoFar(), Delays()
+    rates: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
+    noted = time.monotonic()
+    written, first, changed, failed, warned = 0.0, math.inf, True, "", False
+    page.write(LiveFigures())
+    with one_thread_inside(), notify_on_first_compile(partial(progress.note, COMPILING)):
+        arrivals.wait(_IDLE_S)
+        if not arrivals.n_frames:
+            rehearse(plan, context)
+        while True:
+            ended, arrived = arrivals.ended, arrivals.source()
+            window = None
+            if arrived is not None and not failed:
+                source = reading.of(arrived, arrivals.promised)
+                try:
+                    window = located.next_window(source, last=ended)
+                except PhotonpanoError as error:  # the frames still count: the run of the whole capture says more
+                    failed = f"frames are no longer located as they arrive: {error}"
+                    logger.warning(failed)
+            now = time.monotonic()
+            waited = arrivals.waited(located.n_frames, now)
+            if window is not None:
+                for n_frames, seconds in waited:
+                    delays.add(n_frames, seconds)
+                first = min(first, now)
+                picture.add(window)
+                changed = True
+            behind_s = arrivals.oldest(now)
+            if ended or now - written >= _REFRESH_S:
+                rates.append((now, arrivals.n_frames))
+                while len(rates) > 2 and now - rates[1][0] > _RATE_S:
+                    rates.popleft()
+                rate = (rates[-1][1] - rates[0][1]) / max(now - rates[0][0], 1e-6)
+                figures = LiveFigures(
+                    "following" if arrivals.n_frames else "waiting",
+                    arrivals.n_frames,
+                    arrivals.promised,
+                    delays.n_frames,
+                    arrivals.n_frames - located.n_frames,
+                    behind_s,
+                    rate,
+                    delays.mean,
+                    delays.quantile(0.95),
+                    delays.longest,
+                    failed or located.problem,
+                )
+                page.write(figures, picture if changed else None)
+                written, changed = now, False
+            if behind_s > _FAR_BEHIND_S and now - first > _STARTED_S and not (warned or failed):
+                logger.warning(
+                    "frames come faster than they are located; none is lost, and the result is the same. Larger groups "
+                    "(resample.with.group_size), or the first level at a smaller scale, take less time"
+                )
+                warned = True
+            if now - noted >= _NOTE_S:
+                behind = f"{figures.behind_frames:,} are not located yet, the first for {duration(behind_s)}"
+                progress.note(f"following: {counted(arrivals.n_frames, 'frame')} so far; {behind}")
+                noted = now
+            if ended:
+                return figures
+            if window is None:
+                arrivals.wait(_IDLE_S)

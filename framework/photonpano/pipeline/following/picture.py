@@ -1,0 +1,141 @@
+"""The picture so far: frames that were located are summed on a canvas that grows."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.geometry import Canvas, apply, corners, normalised, rescaling, translation
+from photonpano.merging import accumulate
+from photonpano.merging.accumulate import PhotonSum
+from photonpano.merging.chunks import chunks_of
+from photonpano.photometry import picture_of
+from photonpano.pipeline.following.located import Window
+from photonpano.values import FloatArray, FluxImage, Homography, Response
+
+_MOST_PIXELS = 2_000_000
+"""Pixels of the canvas: if it needs more, its scale is halved."""
+_LEAST_SCALE = 1 / 8
+"""If even at this scale it needs more, the picture begins anew."""
+_MOST_AREA_CHANGE = 4.0
+"""By this factor, the area of a frame on the canvas differs from that of the first frame at most."""
+_MARGIN = 0.25
+"""By how much more than necessary the canvas grows, in sides of a frame."""
+_TOLERANCE_PX = 1.0
+"""Motion within which frames are summed before they are warped, px."""
+_WHITE = 0.995
+"""Quantile of the flux that is white."""
+_SAMPLES = 100_000
+"""Pixels from which that is estimated."""
+
+
+class PictureSoFar:
+    """Sums the frames of windows.
+
+    Convention:
+        The plane of the canvas is that of the first window; (x, y) of the canvas are those of the plane times the scale.
+
+    Attributes:
+        scale: pixels of the canvas per pixel of a frame.
+    """
+
+    def __init__(self) -> None:
+        self.scale = 1.0
+        self._sums = np.zeros((2, 0, 0), np.float32)
+        """Counts, and their weights in frames."""
+        self._origin: NDArray[np.integer] = np.zeros(2, int)
+        """(x, y) of the first pixel."""
+        self._to_plane: Homography = np.eye(3)
+        """From the frame that the next window has in common with the last one."""
+        self._response: Response | None = None
+
+    def add(self, window: Window) -> None:
+        """Add the new frames of a window. If they do not join, or lie too askew or too far away, the picture begins anew."""
+        shape, self._response = window.source.info.frame_shape, window.source.response
+        ends = window.trajectory.at([window.new.start, window.new.centre, window.new.stop - 1])
+        if not (window.joins and _upright(self._to_plane @ ends, shape) and self._grow(self._to_plane @ ends, shape)):
+            self.scale, self._sums, self._to_plane = 1.0, np.zeros((2, 0, 0), np.float32), np.eye(3)
+            self._grow(ends, shape)
+        low, high = self._box(self._to_plane @ ends, shape)
+        low, high = np.maximum(low, self._origin), np.minimum(high, self._origin + self._sums.shape[:0:-1])
+        (left, top), (width, height) = (low - self._origin).tolist(), (high - low).tolist()
+        canvas = Canvas(height, width, translation(*-low.astype(float)) @ rescaling(self.scale) @ self._to_plane)
+        chunks = chunks_of(window.new, window.trajectory, shape, _TOLERANCE_PX)
+        added = accumulate(window.source, chunks, canvas, canvas.shape)
+        self._sums[:, top : top + height, left : left + width] += added.counts, added.weight
+        self._to_plane = normalised(self._to_plane @ window.to_next)
+
+    def png(self) -> bytes | None:
+        """Return the picture as PNG, in sRGB; None as long as nothing was added."""
+        flux = self._flux()
+        if flux is None:
+            return None
+        lit = flux[np.isfinite(flux)]
+        white = float(np.quantile(lit[:: -(-lit.size // _SAMPLES)], _WHITE)) if lit.size else 0.0
+        encoded, png = cv2.imencode(".png", picture_of(flux, white or 1.0), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        return png.tobytes() if encoded else None
+
+    def _flux(self) -> FluxImage | None:
+        """Return the flux of the part of the canvas that was seen: (H, W), NaN where it is unknown."""
+        counts, weight = self._sums
+        rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
+        if self._response is None or not rows.size:
+            return None
+        seen = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        return PhotonSum(counts[seen], weight[seen]).estimate(self._response)[0]
+
+    def _grow(self, placed: FloatArray, shape: tuple[int, int]) -> bool:
+        """Make room for frames; return whether there is enough.
+
+        Args:
+            placed: (N, 3, 3), from frames to the plane.
+            shape: (height, width) of a frame.
+        """
+        while True:
+            low, high = self._box(placed, shape)
+            first, last = self._origin, self._origin + self._sums.shape[:0:-1]
+            if not self._sums.size:
+                first, last = low, high
+            elif (low >= first).all() and (high <= last).all():
+                return True
+            margin = round(_MARGIN * self.scale * max(shape))
+            first, last = np.where(low < first, low - margin, first), np.where(high > last, high + margin, last)
+            if np.prod(last - first) <= _MOST_PIXELS:
+                self._enlarge(first, last)
+                return True
+            if self.scale <= _LEAST_SCALE:
+                return False
+            self._halve()
+
+    def _enlarge(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> None:
+        """Enlarge the canvas to the pixels from `first` to the one before `last`, (x, y)."""
+        (width, height), (left, top) = (last - first).tolist(), (self._origin - first).tolist()
+        grown = np.zeros((2, height, width), np.float32)
+        if self._sums.size:
+            grown[:, top : top + self._sums.shape[1], left : left + self._sums.shape[2]] = self._sums
+        self._sums, self._origin = grown, first
+
+    def _halve(self) -> None:
+        """Halve the scale: each pixel gets the mean of four, of counts and weights alike."""
+        first, last = self._origin, self._origin + self._sums.shape[:0:-1]
+        self._enlarge(first - first % 2, last + last % 2)
+        height, width = self._sums.shape[1:]
+        self._sums = self._sums.reshape(2, height // 2, 2, width // 2, 2).mean(axis=(2, 4), dtype=np.float32)
+        self.scale, self._origin = self.scale / 2, self._origin // 2
+
+    def _box(self, placed: FloatArray, shape: tuple[int, int]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        """Return the first (x, y) of the canvas that frames touch, and the one beyond the last."""
+        points = apply(rescaling(self.scale) @ placed, corners(shape)).reshape(-1, 2)
+        return np.floor(points.min(axis=0)).astype(int), np.ceil(points.max(axis=0)).astype(int) + 1
+
+
+def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
+    """Return whether frames lie before the plane, and are neither much smaller nor much larger there than the first one."""
+    outline = corners(shape)
+    if not (np.isfinite(placed).all() and (outline @ placed[:, 2, :2, None] + placed[:, 2, 2, None, None] > 0).all()):
+        return False
+    x, y = np.moveaxis(apply(placed, outline), -1, 0)
+    areas = 0.5 * np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1)
+    change = areas / ((shape[0] - 1) * (shape[1] - 1))
+    return bool(((change > 1 / _MOST_AREA_CHANGE) & (change < _MOST_AREA_CHANGE)).all())

@@ -1,0 +1,271 @@
+"""Runs that follow a capture: same results as without, and errors with a way on."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from photonpano import InputError, OutputError, RunResult, SpecError, parse_spec, run
+from photonpano.report import LiveFigures
+
+
+def spec(source: str = "packed-raw", **keys: Any) -> dict[str, Any]:
+    """Return a small spec of frames of 64x96 px."""
+    return {
+        "version": 1,
+        "source": {"use": source, "with": keys},
+        "resample": {"with": {"group_size": 50}},
+        "levels": 2,
+        "refine": [],
+    }
+
+
+RESULTS = ("panorama.tiff", "coverage.tiff", "trajectory.npz", "panorama.png")
+PIPED = spec(path="-", height=64, width=96)
+POSES = {"pose": {"use": "colmap-averages"}, "resample": None, "levels": None, "refine": None}
+pytestmark = pytest.mark.usefixtures("without_report")
+
+
+def follow(document: dict[str, Any], output: Path, **options: Any) -> RunResult:
+    return run(parse_spec(document, output=output, arriving=True), follow=True, **options)
+
+
+def write_slowly(path: Path, frames: np.ndarray, n_frames: int, seconds: float) -> threading.Thread:
+    """Write a .npy file of frames of which not all come."""
+
+    def write() -> None:
+        with path.open("wb", buffering=0) as file:
+            header = {"descr": "|u1", "fortran_order": False, "shape": frames.shape}
+            np.lib.format.write_array_header_1_0(file, header)
+            for part in np.array_split(frames[:n_frames], 30):
+                file.write(part.tobytes())
+                time.sleep(seconds / 30)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    return thread
+
+
+@dataclass(frozen=True)
+class Grown:
+    """A run that followed a file, the run of the same file when it was complete, and pages on the way."""
+
+    followed: RunResult
+    complete: RunResult
+    states: list[str]
+
+
+@pytest.fixture(scope="module")
+def grown(moving_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Grown:
+    folder = tmp_path_factory.mktemp("grown")
+    document, states = spec("packed-npy", path=str(folder / "capture.npy")), []
+    patch = pytest.MonkeyPatch()
+    patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
+    patch.setattr("photonpano.pipeline.following.follow._REFRESH_S", 0.05)
+
+    def render(figures: LiveFigures, *_: object) -> str:
+        states.append(figures.state)
+        return "<html></html>"
+
+    patch.setattr("photonpano.pipeline.following.page.render_live", render)
+    writer = write_slowly(folder / "capture.npy", moving_frames, 300, 1.5)
+    try:
+        followed = follow(document, folder / "followed")
+        writer.join()
+        return Grown(followed, run(parse_spec(document, output=folder / "complete")), states)
+    finally:
+        patch.undo()
+
+
+def test_result_of_a_followed_capture_is_that_of_the_complete_one(grown: Grown) -> None:
+    for name in RESULTS:
+        assert (grown.followed.directory / name).read_bytes() == (grown.complete.directory / name).read_bytes(), name
+
+
+def test_frames_are_located_as_they_arrive(grown: Grown) -> None:
+    figures = grown.followed.followed
+    assert figures is not None
+    assert (figures.frames, figures.promised, figures.located, figures.message) == (300, 300, 300, "")
+    assert figures.delay_mean_s is not None
+    assert figures.delay_longest_s is not None
+    assert 0 < figures.delay_mean_s <= figures.delay_longest_s < 10
+    assert grown.complete.followed is None
+
+
+def test_page_shows_how_far_the_run_is(grown: Grown) -> None:
+    states = list(dict.fromkeys(grown.states))
+    assert states == ["waiting", "following", "finishing", "finished"]
+    folder = grown.followed.directory.with_name("followed.live")
+    assert {file.name for file in folder.iterdir()} == {"live.html", "live.png", "live.json"}
+    assert json.loads((folder / "live.json").read_text())["state"] == "finished"
+
+
+def test_picture_so_far_shows_the_panorama(grown: Grown) -> None:
+    picture = cv2.imread(str(grown.followed.directory.with_name("followed.live") / "live.png"), cv2.IMREAD_GRAYSCALE)
+    panorama = cv2.imread(str(grown.followed.directory / "panorama.png"), cv2.IMREAD_GRAYSCALE)
+    best = cv2.matchTemplate(panorama.astype(np.float32), picture[8:-8, 8:-8].astype(np.float32), cv2.TM_CCOEFF_NORMED).max()
+    assert best > 0.95
+    assert abs(picture.shape[1] - panorama.shape[1]) <= 3
+
+
+def test_frames_of_a_pipe_are_kept_and_give_the_same_result(
+    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], grown: Grown, tmp_path: Path
+) -> None:
+    pipe_on_stdin(moving_frames.tobytes(), 7, 0.3)  # pieces that end within frames
+    result = follow(PIPED, tmp_path / "piped")
+    kept = tmp_path / "piped.live" / "frames.raw"
+    assert kept.read_bytes() == moving_frames.tobytes()
+    assert result.record["spec"]["source"]["with"]["path"] == str(kept)
+    for name in RESULTS:
+        assert (result.directory / name).read_bytes() == (grown.complete.directory / name).read_bytes(), name
+    with pytest.raises(OutputError, match=r"frames\.raw holds the frames of an earlier capture: run them with source"):
+        follow(PIPED, tmp_path / "piped")
+    assert kept.stat().st_size == moving_frames.nbytes
+
+
+def test_pipe_that_ends_within_a_frame(
+    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pipe_on_stdin(moving_frames[:120].tobytes()[:-68])
+    kept = tmp_path / "piped.live" / "frames.raw"
+    with caplog.at_level(logging.WARNING, "photonpano"), pytest.raises(InputError) as caught:
+        follow(PIPED, tmp_path / "piped")
+    assert str(caught.value) == (
+        "standard input ended within a frame: after 119 frames of 768 bytes came 700 bytes more. Either the program that "
+        f"writes has died, or height and width are wrong; the 119 whole frames are in {kept}"
+    )
+    assert caplog.messages[-1] == (
+        f"the frames that arrived are in {kept}; run them with source.with.path = {str(kept)!r}, and without follow"
+    )
+    assert kept.read_bytes() == moving_frames[:119].tobytes()
+    page = (tmp_path / "piped.live" / "live.html").read_text()
+    assert "stopped" in page
+    assert 'http-equiv="refresh"' not in page
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["piped.live"]
+    assert threading.active_count() == len([each for each in threading.enumerate() if each.name not in ("spool", "arrivals")])
+
+
+@pytest.mark.parametrize("data", [b"", b"not a frame"])
+def test_pipe_without_a_frame_leaves_nothing(data: bytes, pipe_on_stdin: Callable[..., None], tmp_path: Path) -> None:
+    pipe_on_stdin(data)
+    with pytest.raises(InputError, match=r"^standard input ended (before the first|within a) frame"):
+        follow(PIPED, tmp_path / "piped")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_run_keeps_its_frames_and_says_how_to_go_on(moving_frames: np.ndarray, tmp_path: Path) -> None:
+    (tmp_path / "pipe.yaml").write_text(json.dumps(PIPED))
+    live, kept = tmp_path / "run.live" / "live.json", tmp_path / "run.live" / "frames.raw"
+    command = [sys.executable, "-m", "photonpano", "run", "pipe.yaml", "--follow", "--output", "run"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as program:
+        assert program.stdin is not None
+        program.stdin.write(moving_frames[:110].tobytes() + b"part of a frame")
+        program.stdin.flush()
+        last = time.monotonic() + 60
+        while not (live.exists() and json.loads(live.read_text())["frames"] == 110) and time.monotonic() < last:
+            time.sleep(0.05)
+        program.send_signal(signal.SIGINT)
+        assert program.stderr is not None
+        printed = program.stderr.read().decode()
+        assert program.wait() in (130, -signal.SIGINT), printed  # the latter where a busy machine takes long to clean up
+    way_on = f"photonpano run pipe.yaml --set source.with.path={kept} --output {tmp_path / 'run'}"
+    assert f"warning: the frames that arrived are in {kept}; run them with `{way_on}`\n" in printed
+    assert "interrupted; no file is left half-written" in printed
+    assert kept.read_bytes() == moving_frames[:110].tobytes()
+    assert json.loads(live.read_text())["state"] == "stopped"
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["pipe.yaml", "run.live"]
+
+
+def test_writer_that_dies_is_told_from_one_that_has_finished(moving_frames: np.ndarray, tmp_path: Path) -> None:
+    writer = write_slowly(tmp_path / "capture.npy", moving_frames, 120, 0.0)
+    with pytest.raises(InputError) as caught:
+        follow(spec("packed-npy", path=str(tmp_path / "capture.npy")), tmp_path / "run", end_after=0.3)
+    writer.join()
+    assert str(caught.value) == (
+        f"{tmp_path / 'capture.npy'} holds 120 of the 300 frames that it promises, and no more have come within 0.3 s: its "
+        "writer has died, or pauses for longer. Then wait longer with --end-after. Otherwise record it again, or read the "
+        "frames that are there with the source packed-raw and its key header_bytes"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_file_is_waited_for(tmp_path: Path) -> None:
+    start = time.monotonic()
+    with pytest.raises(InputError, match=r"no\.npy: no frame has come within 0\.3 s; check the path, or wait longer with"):
+        follow(spec("packed-npy", path=str(tmp_path / "no.npy")), tmp_path / "run", end_after=0.3)
+    assert time.monotonic() - start > 0.3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_file_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "a.npy").write_text("This is a text, and no array, however long it gets. " * 5)
+    with pytest.raises(InputError, match=r"a\.npy is not a \.npy file"):
+        follow(spec("packed-npy", path=str(tmp_path / "a.npy")), tmp_path / "run", end_after=60)
+
+
+def test_spec_that_does_not_suit_the_frames_is_refused_while_they_arrive(
+    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path
+) -> None:
+    pipe_on_stdin(moving_frames[:60].tobytes())
+    document = PIPED | {"render": {"white_balance": "grey-world"}}
+    with pytest.raises(SpecError, match="the capture is grey; remove this key"):
+        follow(document, tmp_path / "piped")
+    assert json.loads((tmp_path / "piped.live" / "live.json").read_text())["state"] == "stopped"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"source": {"use": "simulator"}}, "^source 'simulator' of .* cannot read a capture that is still being written"),
+        (POSES, "^a spec with 'pose' cannot be followed"),
+        ({"source": {"use": "packed-raw", "with": PIPED["source"]["with"] | {"frames": [0, 5]}}}, "a part of a capture cannot"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    document = {key: value for key, value in (PIPED | changes).items() if value is not None}
+    with pytest.raises(InputError, match=message):
+        follow(document, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_terminal_is_no_pipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("os.isatty", lambda _: True)
+    with pytest.raises(InputError, match=r"no frames come on standard input; write PROGRAM \| photonpano run SPEC --follow"):
+        follow(PIPED, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_that_begins_anew_resumes_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a run that follows a capture begins anew"):
+        follow(PIPED, tmp_path / "run", resume=True)
+
+
+def test_frames_that_cannot_be_located_are_run_all_the_same(
+    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise InputError("no luck")
+
+    monkeypatch.setattr("photonpano.pipeline.following.located.estimate_motion", fail)
+    pipe_on_stdin(moving_frames.tobytes())
+    with caplog.at_level(logging.WARNING, "photonpano"):
+        result = follow(PIPED, tmp_path / "piped")
+    assert caplog.messages[0] == "frames are no longer located as they arrive: no luck"
+    assert result.followed is not None
+    assert (result.followed.frames, result.followed.located) == (300, 0)
+    assert result.record["status"] == "done"
