@@ -18,6 +18,7 @@ from photonpano.captures.writing import truth_path
 from photonpano.evaluation import Evaluation, corner_errors
 from photonpano.geometry import rescaling, translation
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL
+from photonpano.photometry import tone_mapped
 from photonpano.pipeline.run import RunResult
 from photonpano.specs import Plan, parse_spec
 
@@ -186,3 +187,60 @@ def test_masked_hot_pixels_do_not_show_in_panorama(simulated: Callable, outcome_
     assert not np.isnan(masked.flux[20:-20, 60:-60]).any()  # the part that all frames saw
     # A streak of light 40 px long behind each of 200 pixels raises the mean.
     assert np.nanmean(lit.flux) > 1.01 * np.nanmean(masked.flux)
+
+
+@pytest.fixture(scope="module")
+def kept(small_spec: dict[str, Any], outcome_of: Callable[[Plan], Any]) -> Any:
+    return outcome_of(parse_spec(small_spec, overrides=("output.keep=exposures", "levels=2")))
+
+
+def test_kept_exposures_are_described_and_pictured(kept: Any) -> None:
+    folder = kept.directory / "exposures"
+    for level in kept.record["levels"]:
+        name = f"level-{level['level']}"
+        flux = np.load(folder / f"{name}.npy")
+        with np.load(folder / f"{name}.npz") as found:
+            frames, instants, located, scale = (found[key] for key in ("frames", "instants", "located", "scale"))
+            homographies = found["homographies"]
+        assert flux.dtype == np.float32
+        assert flux.shape == (level["groups"], round(SHAPE[0] * scale), round(SHAPE[1] * scale))
+        assert located.sum() == level["located"]
+        assert homographies.shape == (level["groups"], 3, 3)
+        assert ((frames[:, 0] <= instants) & (instants < frames[:, 1])).all()
+        for number, image in enumerate(flux):
+            file = folder / f"{name}-{number:0{len(str(len(flux) - 1))}}.png"
+            picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(picture, tone_mapped(image, kept.record["panorama"]["white_flux"]))
+    assert {f"exposures/{file.name}" for file in folder.iterdir()} <= set(kept.record["files"])
+
+
+def test_kept_exposures_lie_where_the_panorama_shows_them(kept: Any) -> None:
+    """An exposure of the last level, laid on the panorama by its homography, is like it; by that of another one it is not."""
+    flux = np.load(kept.directory / "exposures" / "level-2.npy")
+    panorama = np.nan_to_num(tifffile.imread(kept.directory / "panorama.tiff"))
+    with np.load(kept.directory / "exposures" / "level-2.npz") as level, np.load(kept.directory / "trajectory.npz") as motion:
+        assert level["scale"] == 1
+        to_panorama = motion["canvas"] @ level["homographies"]
+
+    def alike(index: int, place: int) -> float:
+        back = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+        seen = cv2.warpPerspective(panorama, to_panorama[place], SHAPE[::-1], flags=back)
+        smooth = [cv2.GaussianBlur(image, (0, 0), 1).ravel() for image in (seen, flux[index])]
+        return float(np.corrcoef(*smooth)[0, 1])
+
+    assert alike(3, 3) > 0.9
+    assert alike(3, 3) > alike(3, 5) + 0.05
+
+
+def test_resumed_run_writes_exposures_that_were_not_kept(small_spec: dict[str, Any], tmp_path: Path) -> None:
+    def resumed(*overrides: str) -> RunResult:
+        return photonpano.run(parse_spec(small_spec | {"levels": 1}, overrides=overrides, output=tmp_path / "run"), resume=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
+        resumed()
+        assert not resumed("output.keep=exposures").was_finished
+        assert (tmp_path / "run" / "exposures" / "level-1.npy").exists()
+        assert resumed("output.keep=exposures").was_finished
+        photonpano.run(parse_spec(small_spec | {"levels": 1}, output=tmp_path / "run"))
+    assert not (tmp_path / "run" / "exposures").exists()

@@ -130,6 +130,8 @@ def run(
         rendering = render_into(folder, plan, source, found.vignette, motion, context, (explained.canvas, explained.panorama))
         panorama, rendered = rendering.panorama, rendering.decisions
         observers.rendered(panorama.canvas, panorama.seconds)
+        if plan.output.keep == "exposures":
+            folder.write_exposures(found.results, panorama.white_flux, context)
         record = folder.commit(
             record_of(
                 *(plan, source.info, decisions, found.results, explained, verdict, panorama, rendered, begun.seconds),

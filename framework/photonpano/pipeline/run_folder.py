@@ -17,6 +17,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from photonpano.context import Context
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.errors import OutputError
 from photonpano.folders import (
@@ -33,6 +34,8 @@ from photonpano.lighting import write_light
 from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.pipeline.kept_exposures import write_exposures
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import FileContent, RunRecord
@@ -93,6 +96,11 @@ class RunFolder:
         """Write vignette.npz."""
         with _writing(self.directory):
             write_vignette(self.staging, vignette)
+
+    def write_exposures(self, levels: Sequence[LevelResult], white_flux: float, context: Context) -> None:
+        """Write the exposures of each level into exposures/."""
+        with _writing(self.directory):
+            write_exposures(self.staging, levels, white_flux, context)
 
     def write_report(self, page: str) -> None:
         """Write report.html."""

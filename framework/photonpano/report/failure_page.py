@@ -17,7 +17,7 @@ from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.environment import environment_of
 from photonpano.report.failures import FailureGroup, failure_groups
 from photonpano.report.page import head_of
-from photonpano.values import VirtualExposure
+from photonpano.values import NotLocated, VirtualExposure
 
 MAX_PAIRS = 8
 """Number of pairs whose exposures are shown."""
@@ -49,7 +49,8 @@ def render_failure(record: RunRecord, error: PhotonpanoError) -> str:
         error: that ended the run. Of an `UntiedError` the page shows the pairs that were not located.
     """
     lost = error if isinstance(error, UntiedError) else None
-    groups = [] if lost is None else _groups(lost)
+    failed = [] if lost is None else failure_records(lost.groups, lost.edges)
+    groups = [] if lost is None else failure_groups([{"level": lost.level, "failures": failed}])
     page: str = (
         environment_of()
         .get_template("failure.html")
@@ -59,9 +60,9 @@ def render_failure(record: RunRecord, error: PhotonpanoError) -> str:
             level=None if lost is None else lost.level,
             lost_groups=groups,
             n_pairs=0 if lost is None else len(lost.edges),
-            n_failed=sum(len(group.failures) for group in groups),
+            n_failed=len(failed),
             parts=None if lost is None else figures.tied_parts(lost.groups, lost.parts),
-            pairs=[] if lost is None else _shown(lost, groups),
+            pairs=[] if lost is None else _shown(lost, failed, groups),
             stages=figures.STAGE_NAMES,
             failures=failure_groups(record["levels"]),
         )
@@ -75,21 +76,23 @@ def _lines(error: PhotonpanoError) -> list[str]:
     return [line for line in lines if not line.startswith("  ")] if isinstance(error, UntiedError) else lines
 
 
-def _groups(lost: UntiedError) -> list[FailureGroup]:
-    return failure_groups([{"level": lost.level, "failures": failure_records(lost.groups, lost.edges)}])
+def _shown(lost: UntiedError, failures: Sequence[FailureRecord], groups: Sequence[FailureGroup]) -> list[ShownPair]:
+    """Return some pairs of each reason with their exposures; none where these cannot be merged again.
 
-
-def _shown(lost: UntiedError, groups: Sequence[FailureGroup]) -> list[ShownPair]:
-    """Return some pairs of each reason with their exposures; none where these cannot be merged again."""
+    Args:
+        lost: the error.
+        failures: of all its pairs that were not located, in order.
+        groups: the same by their reasons.
+    """
     if lost.merged is None:
         return []
-    number = {(group.span.start, group.span.stop): index for index, group in enumerate(lost.groups)}
+    edges = [edge for edge in lost.edges if isinstance(edge.motion, NotLocated)]
+    edge_of = {id(failure): edge for failure, edge in zip(failures, edges, strict=True)}
     each = max(1, MAX_PAIRS // max(1, len(groups)))
-    chosen = [failure for group in groups for failure in _spread(group.failures, each)][:MAX_PAIRS]
     found = []
-    for failure in chosen:
-        pair = [lost.merged(number[span[0], span[1]]) for span in (failure["moving"], failure["fixed"])]
-        moving, fixed = _pictures(pair)
+    for failure in [failure for group in groups for failure in _spread(group.failures, each)][:MAX_PAIRS]:
+        edge = edge_of[id(failure)]
+        moving, fixed = _pictures([lost.merged(edge.moving), lost.merged(edge.fixed)])
         found.append(ShownPair(failure, moving, fixed))
     return found
 

@@ -35,7 +35,7 @@ def without_panorama(root: dict[str, Any], spec: WrittenSpec) -> dict[str, Any]:
 def document_of_poses(document: dict[str, Any]) -> dict[str, Any]:
     """Return a resolved spec without what does not apply with `pose`."""
     own = {key: value for key, value in document.items() if key not in PANORAMA_ONLY}
-    return own | {"output": {key: value for key, value in document["output"].items() if key != "formats"}}
+    return own | {"output": {key: value for key, value in document["output"].items() if key not in ("formats", "keep")}}
 
 
 def check_posed_camera(camera: CameraSettings, spec: WrittenSpec) -> None:

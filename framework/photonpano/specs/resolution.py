@@ -164,6 +164,9 @@ class _Resolver:
         if not posed and output is not None and output.exposures:
             message = "true needs a section `pose`: a panorama has no exposures with poses; remove it"
             self.spec.wrong("output.exposures", message)
+        if posed and output is not None and output.keep is not None:
+            message = "exposures are those of the levels of a panorama; remove it, or write exposures: true"
+            self.spec.wrong("output.keep", message)
         if motion is not None and render is not None:
             self.check_projection(motion, render)
         return found

@@ -149,6 +149,11 @@ class OutputSettings(Config):
     exposures: bool = Field(
         False, description="with `pose`: whether the exposures whose poses were found are written, as pictures in images/"
     )
+    keep: Literal["exposures"] | None = Field(
+        None,
+        description="exposures writes the exposures of each level of a panorama into exposures/: linear flux, and pictures; "
+        "each level is merged once more for that",
+    )
 
 
 class RunSettings(Config):

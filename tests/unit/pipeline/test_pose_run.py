@@ -308,10 +308,11 @@ def test_observers_see_the_stage_pose(plan_of: Callable[..., Plan], without_repo
 
 
 def test_other_sections_are_refused(plan_of: Callable[..., Plan], without_report: None) -> None:
+    output = {"formats": ["hdr"], "keep": "exposures"}
     with pytest.raises(photonpano.SpecError) as caught:
-        plan_of(levels=2, output={"formats": ["hdr"]}, camera={"distortion": {"k1": "find"}}, run={"executor": "threads"})
+        plan_of(levels=2, output=output, camera={"distortion": {"k1": "find"}}, run={"executor": "threads"})
     where = [problem.where for problem in caught.value.problems]
-    assert where == ["levels", "output.formats", "run.executor", "camera.distortion.k1"]
+    assert sorted(where) == sorted(["levels", "output.formats", "run.executor", "camera.distortion.k1", "output.keep"])
 
 
 def test_document_is_a_spec_itself(plan_of: Callable[..., Plan], without_report: None) -> None:

@@ -185,7 +185,7 @@ def test_paths_count_from_the_folder_of_the_spec(catalog, tmp_path, monkeypatch)
     plan = load_spec("specs/scan.yaml", catalog=catalog)
     assert plan.source.config.path == tmp_path / "specs" / ".." / "cube.npy"
     assert plan.output.directory == tmp_path / "specs" / "runs" / "scan"
-    assert plan.document["output"] == {"directory": str(plan.output.directory), "formats": []}
+    assert plan.document["output"] == {"directory": str(plan.output.directory), "formats": [], "keep": None}
 
 
 def test_output_counts_from_the_current_folder(catalog, tmp_path, monkeypatch):
