@@ -1,4 +1,4 @@
-"""Make the pictures of the README and of the docs from simulated captures.
+"""Make the pictures of the README and of the docs from simulated captures, and from a real one.
 
     python docs/make_pictures.py
 
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import tifffile
 from interpolation_picture import interpolation
+from mandrill_picture import mandrill
 from matplotlib.figure import Figure
 from picture_parts import GAP, beside, drawn, labelled, picture, stacked
 from room_picture import room
@@ -166,6 +167,7 @@ def main() -> None:
     save("night.png", night())
     save("depth.png", depths())
     save("room.png", room(in_folder(folder, "room")))
+    save("mandrill.png", mandrill(in_folder(folder, "mandrill")))
 
     fine = written(parse_spec(FINE), folder / "fine.npy")
     finish(parse_spec(fine_spec(fine, "super-resolution"), output=in_folder(folder, "fine")), "super-resolution", fine)

@@ -91,7 +91,7 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
 """Specs to run, with overrides that make them small."""
-OTHERS = {"poses", "stratified-poses", "many-captures", "as-it-arrives"}
+OTHERS = {"mandrill", "poses", "stratified-poses", "many-captures", "as-it-arrives"}
 """Specs that have tests of their own."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
@@ -247,6 +247,18 @@ def test_example_of_many_captures_runs(examples, tmp_path):
     assert printed.splitlines()[1].startswith("capture, resample.with.group_size=50  trusted")
     assert (out / "capture,resample.with.group_size=50" / "report.html").is_file()
     assert "<svg" in (out / "summary.html").read_text(encoding="utf-8")
+
+
+def test_example_of_a_real_capture_runs(examples, tmp_path, without_report):
+    """Groups of 16 frames are located along the velocity that all frames show; the fan turns by 3.7 degrees a frame."""
+    photonpano("run", examples / "mandrill.yaml", "--output", tmp_path / "run", refine="[]", levels=1, light="steady")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["levels"][0]["located"] == record["levels"][0]["groups"] == 6
+    start = next(decision for decision in record["decisions"] if decision["what"] == "start")
+    assert start["value"].startswith("a turn by -3.71")
+    homographies = np.load(tmp_path / "run" / "trajectory.npz")["homographies"]
+    turned = np.degrees(np.unwrap(np.arctan2(homographies[:, 1, 0], homographies[:, 0, 0])))
+    assert np.polyfit(np.arange(8, 90), turned[8:90], 1)[0] == pytest.approx(3.71, abs=0.05)
 
 
 @pytest.mark.parametrize(("name", "pictures", "std"), [("poses", 16, 0.02), ("stratified-poses", 0, 0.005)])

@@ -166,7 +166,9 @@ CASES = {
         "  frames 30 to 39 onto frames 0 to 9: direct: where the images overlap after alignment, nothing stands out from "
         "photon noise; opencv-sift: # matches, fewer than min_inliers = 12 (# and # keypoints)\n"
         "In these exposures of 10 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
-        "(try larger groups, such as resample.with.group_size=20), or the scene has no texture there.\n",
+        "(try larger groups, such as resample.with.group_size=20), or the scene has no texture there.\n"
+        "If the image turns or shifts at a constant velocity, write motion: {start: constant-velocity}.\n"
+        "report    DIR/runs/spec.failed.html\n",
     ),
 }
 
@@ -183,7 +185,9 @@ def test_wrong_input_exits_with_message_and_leaves_nothing(tmp_path: Path, case:
     result = CliRunner().invoke(app, ["run", str(tmp_path / "spec.yaml")])
     assert re.fullmatch(pattern(case.golden, tmp_path), result.stderr), result.stderr
     assert (result.exit_code, result.stdout) == (case.code, "")
-    assert sorted(tmp_path.rglob("*")) == before
+    report = tmp_path / "runs" / "spec.failed.html"
+    assert report.exists() == ("report    " in case.golden)
+    assert {*tmp_path.rglob("*")} == {*before} | ({report, report.parent} if report.exists() else set())
 
 
 def test_run_accepts_width_not_multiple_of_eight(simulated: Callable[..., Path], tmp_path: Path) -> None:

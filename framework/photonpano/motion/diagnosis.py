@@ -28,6 +28,9 @@ _SHOWN = 6
 """Most pairs, spans or parts that a message lists."""
 
 
+_START = "If the image turns or shifts at a constant velocity, write motion: {start: constant-velocity}."
+
+
 @dataclass(frozen=True, slots=True)
 class Contrast:
     """How much there is to see in an exposure.
@@ -89,6 +92,7 @@ def require_tied(
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
     merged: Callable[[int], VirtualExposure] | None = None,
+    started: bool = True,
 ) -> None:
     """Refuse a level where too many exposures are not tied to the others.
 
@@ -103,6 +107,7 @@ def require_tied(
         contrasts: how much there is to see in each exposure.
         disconnected: the option of the spec.
         merged: returns an exposure by its number, for whoever looks at those that are lost.
+        started: whether a motion was known before the level.
 
     Raises:
         UntiedError: names the frames that are lost, those that are tied together, and why pairs failed.
@@ -120,7 +125,7 @@ def require_tied(
         if isinstance(edge.motion, NotLocated)
     ]
     more = [f"  ... and {len(reasons) - _SHOWN} more"] if len(reasons) > _SHOWN else []
-    lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts)]
+    lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts), *([] if started else [_START])]
     if tied.sum() < 2:
         lines.insert(0, f"level {level}: none of the {len(edges)} pairs of exposures could be located")
     else:

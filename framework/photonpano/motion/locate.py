@@ -107,7 +107,10 @@ def locate(
         with exposures.clock("locate"), solving(level.number):
             edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
-            require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged)
+            started = registrar.to_plane is not None
+            require_tied(
+                level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged, started
+            )
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             start = registrar.to_plane

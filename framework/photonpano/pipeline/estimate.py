@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from photonpano.captures.repeats import timeline_of
 from photonpano.context import Context
 from photonpano.contributions import MergerContribution
@@ -18,6 +20,8 @@ from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
+from photonpano.motion.velocity import ConstantVelocity
+from photonpano.motion.velocity_search import find_velocity
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.run_steps import require_centre
 from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
@@ -44,6 +48,7 @@ class Estimate:
         timeline: where frames repeat, and where the image jumps.
         look: the motion, the panorama along it, and what that does not explain.
         vignette: by which the source is divided.
+        start: the motion that was known before the first level; None if there was none.
     """
 
     source: Source
@@ -52,6 +57,7 @@ class Estimate:
     timeline: Timeline
     look: Look
     vignette: Vignette | None
+    start: Trajectory | None = None
 
 
 def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Context) -> Estimate:
@@ -73,7 +79,10 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     reference = _reference_frame(plan, source)
     levels = build_levels(plan, source, decisions)
     timeline = timeline_of(source, context)
-    results = estimate_motion(source, levels[:1], plan.graph, reference, context, timeline=timeline, model=model_of(plan))
+    start = start_of(plan, source, reference, decisions, context)
+    results = estimate_motion(
+        source, levels[:1], plan.graph, reference, context, previous=start, timeline=timeline, model=model_of(plan)
+    )
     if model_of(plan).finds_lens and camera_of_motion(results[0].trajectory) is not None:
         # Through a lens that nobody knew, pairs are located with errors of pixels: once more, through the one that was found.
         known = results[0].trajectory
@@ -97,7 +106,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
     results += estimate_motion(
         source, later, plan.graph, reference, context, plan.until_converged, known, timeline, model_of(plan)
     )
-    found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context), vignette)
+    found = Estimate(source, context, results, timeline, _look(plan, source, results, reference, context), vignette, start)
     if cuts := find_cuts(source, found.look, context):
         found = _cut_at(cuts, plan, found)
     decisions += [*found.timeline.decisions, *_model_decisions(plan, found.results)]
@@ -207,7 +216,7 @@ def _cut_at(cuts: Sequence[Cut], plan: Plan, found: Estimate) -> Estimate:
     try:
         levels = build_levels(plan, source, [])
         results = estimate_motion(
-            source, levels, plan.graph, reference, context, plan.until_converged, timeline=timeline, model=model_of(plan)
+            source, levels, plan.graph, reference, context, plan.until_converged, found.start, timeline, model_of(plan)
         )
         look = _look(plan, source, results, reference, context)
         # Frames that show nothing contradict any motion, and the surer it is the more; such a run is doubtful in any case.
@@ -221,6 +230,26 @@ def _cut_at(cuts: Sequence[Cut], plan: Plan, found: Estimate) -> Estimate:
     motion = look.motion
     measured = [each.along(motion.trajectory, motion.frame_shape) for each in cuts]
     return replace(found, results=results, timeline=timeline.cut_at(measured), look=look)
+
+
+def start_of(
+    plan: Plan, source: Source, reference: int, decisions: list[Decision], context: Context
+) -> ConstantVelocity | None:
+    """Return the motion with which the first level starts; None if nothing is known of it.
+
+    Raises:
+        LocationError: the spec asks for a constant velocity, and none was found.
+    """
+    if plan.motion.start == "none":
+        return None
+    found = find_velocity(source, context)
+    halves = " and ".join(f"{np.degrees(each.turn):.4g}" for each in found.halves)
+    reason = (
+        f"photons merged along it stand out by {found.significance:.2g} standard deviations; the halves of the capture alone "
+        f"turn by {halves} degrees a frame"
+    )
+    decisions.append(Decision("start", found.text, reason))
+    return ConstantVelocity(found.velocity, reference)
 
 
 def model_of(plan: Plan) -> MotionModel:

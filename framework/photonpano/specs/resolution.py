@@ -172,7 +172,10 @@ class _Resolver:
         return found
 
     def check_camera(self, motion: MotionSettings, camera: CameraSettings) -> None:
-        """Refuse what the model homography cannot find, as it knows no camera."""
+        """Refuse what the model homography cannot find, as it knows no camera, and a start that only it can have."""
+        if motion.start != "none" and motion.model != "homography":
+            message = f"{motion.start} is the start of motion.model: homography, not of {motion.model}"
+            self.spec.wrong("motion.start", message)
         if motion.model != "homography":
             return
         distortion = camera.distortion.model_dump()

@@ -50,6 +50,11 @@ class MotionSettings(Config):
         description="homography lets each frame have any homography; rotation is for a camera that only turns, by any angle, "
         "and is more accurate there; auto takes rotation where homographies explain the pairs no better",
     )
+    start: Literal["none", "constant-velocity"] = Field(
+        "none",
+        description="what is known of the motion before the first level: none, or the constant-velocity of the image, a turn "
+        "about any point or a shift, that is found from all frames together, where groups of them are too dark or too blurred",
+    )
 
 
 Distortion = Literal["find"] | Annotated[float, Field(ge=-2, le=2)]

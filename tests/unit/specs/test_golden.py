@@ -18,6 +18,7 @@ BEYOND_A_SCHEMA = {
     "lens_of_homographies",
     "projection_of_homographies",
     "source_check",
+    "start_of_rotations",
     "surrogate",
     "validator",
 }

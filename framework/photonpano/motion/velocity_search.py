@@ -1,0 +1,302 @@
+"""The constant velocity at which photons of different frames fit together best, where pairs of exposures show nothing.
+
+Sums of photons along the right motion have the highest contrast, as in event-camera work (Gallego et al. 2018). Photon noise
+adds to the contrast, too, by the product of each frame with itself; only products of different frames are therefore summed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, optimize
+
+from photonpano.context import Context
+from photonpano.errors import LocationError
+from photonpano.geometry import apply, corners
+from photonpano.merging import binned_mean, binning_of
+from photonpano.motion.velocity import Velocity, mean_shift
+from photonpano.protocols import Source
+from photonpano.values import FloatArray, FrameSpan
+
+_SPANS = 128
+"""A capture is divided into at most this many spans."""
+_FEWEST_SPANS = 8
+_LAGS = 4
+"""Spans that are up to this many apart are compared in the search over all velocities."""
+_FASTEST = np.radians(20)
+"""Fastest turn that is considered, in radians from span to span."""
+_FASTEST_SHIFT = 8.0
+"""Fastest shift that is considered, in binned pixels from span to span."""
+_FINE, _COARSE = 1.0, 4.0
+"""Standard deviations of the Gaussians between whose scales structure is compared, in binned pixels. Brightness that varies
+over longer distances is light rather than scene, and has no sharp optimum."""
+_STEP_PX = 1.0
+"""Steps of the search, in binned pixels between the two farthest spans that are compared, at the border of the frame."""
+_SIGNIFICANT = 8.0
+"""Least height of the peak, in standard deviations over all velocities: of noise alone, the highest reaches 5 to 6.5."""
+_STD_PER_MEDIAN = 1.4826
+"""Standard deviation of Gaussian numbers over the median of their magnitudes."""
+_STEADY = 0.8
+"""Contrast over its noise falls to 0.71 when windows double, if the photons of their halves do not fit together at all."""
+_LEAST_PX = 1.0
+"""What moves by less over the whole capture, in binned pixels, stands still."""
+
+Images = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundVelocity:
+    """A velocity that was found, and how certain it is.
+
+    Attributes:
+        velocity: of the image.
+        covariance: (3, 3) of the turn and the shift, from the scatter of the spans.
+        significance: height of the peak, in standard deviations over all velocities.
+        halves: the velocities that the first and second half of the capture show each by itself.
+    """
+
+    velocity: Velocity
+    covariance: FloatArray
+    significance: float
+    halves: tuple[Velocity, Velocity]
+
+    @property
+    def std_turn(self) -> float:
+        """Standard deviation of the turn, in radians per frame period."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def text(self) -> str:
+        """The velocity in words, with its standard deviation."""
+        turn, std = np.degrees([self.velocity.turn, self.std_turn])
+        if abs(turn) < 3 * std:
+            (x, y), (std_x, std_y) = self.velocity.shift, np.sqrt(np.diagonal(self.covariance)[1:])
+            return f"a shift by ({x:.4g} +- {std_x:.1g}, {y:.4g} +- {std_y:.1g}) px a frame"
+        x, y = self.velocity.centre
+        return f"a turn by {turn:.4g} +- {std:.1g} degrees a frame about ({x:.1f}, {y:.1f}) px"
+
+
+def find_velocity(source: Source, context: Context) -> FoundVelocity:
+    """Find the constant velocity of the image in all of a capture: a turn about any point, or a shift.
+
+    First, spans of a few frames are compared with the next ones, for all velocities. The best one is then refined over windows
+    that double until one holds the whole capture.
+
+    Raises:
+        LocationError: no velocity stands out, what stands out stands still, or the velocity changes.
+    """
+    varying, seen, n_frames = _residuals(source, context)
+    velocity, significance = _searched(_structure(_halved(varying), _halved(seen[None])[0]), context)
+    velocity *= [1, 2, 2]
+    images = _structure(varying, seen)
+    if significance < _SIGNIFICANT:
+        raise LocationError(
+            "motion.start: no constant velocity stands out from photon noise: the sharpest sum of photons is "
+            f"{significance:.2g} standard deviations above those along other velocities, and {_SIGNIFICANT:g} are needed; "
+            "the scene may stand still or change its speed, or the capture is too dark or too short"
+        )
+    whole = _Contrast(images, len(images))
+    if whole.moved_px(velocity) < _LEAST_PX:
+        raise LocationError(
+            "motion.start: what varies over time stays at its place in the frame, and so shows no motion; "
+            "if it is a lamp or a reflection, mask it (corrections: mask)"
+        )
+    size, before = min(4 * _LAGS, len(images)), -np.inf
+    while True:
+        contrast = _Contrast(images, size)
+        velocity = contrast.sharpest(velocity)
+        if (height := contrast.height(velocity)) < _STEADY * before:
+            raise LocationError(
+                f"motion.start: the image does not move at a constant velocity: photons of {size * n_frames} frames fit "
+                "together less well than those of half as many; take a shorter part of the capture (source: with: frames)"
+            )
+        if size == len(images):
+            break
+        size, before = min(2 * size, len(images)), height
+    half = len(images) // 2
+    halves = tuple(_Contrast(each, half).sharpest(velocity) for each in (images[:half], images[-half:]))
+    scale, factor = binning_of(source), 1 / n_frames
+
+    def of_frames(found: FloatArray) -> Velocity:
+        return Velocity(float(found[0]) * factor, found[1:] * scale * factor, (whole.middle + 0.5) * scale - 0.5)
+
+    units = factor * np.array([1, scale, scale])
+    covariance = whole.covariance(velocity) * units[:, None] * units
+    return FoundVelocity(of_frames(velocity), covariance, significance, (of_frames(halves[0]), of_frames(halves[1])))
+
+
+def _residuals(source: Source, context: Context) -> tuple[Images, Images, int]:
+    """Return what varies over time, in binned pixels: (S, h, w), which pixels are seen: (h, w), and the frames of a span.
+
+    What stands still, such as hot pixels and the light on the scene, is subtracted in proportion to the brightness of a span.
+
+    Raises:
+        LocationError: there are too few frames.
+    """
+    n_frames = -(-source.info.n_frames // _SPANS)
+    spans = [FrameSpan(start, start + n_frames) for start in range(0, source.info.n_frames - n_frames + 1, n_frames)]
+    if len(spans) < _FEWEST_SPANS:
+        raise LocationError(
+            f"motion.start: {len(spans)} frames are too few to find a constant velocity; at least {_FEWEST_SPANS} are needed"
+        )
+    means = np.stack(list(context.in_order(partial(binned_mean, source), spans)))
+    seen = np.isfinite(means[0]).astype(np.float32)
+    images = np.nan_to_num(means)
+    brightness = images.sum(axis=(1, 2))
+    still = np.tensordot(brightness, images, 1) / max(float(brightness @ brightness), 1e-12)
+    images -= brightness[:, None, None] * still
+    return images, seen, n_frames
+
+
+def _structure(images: Images, seen: Images) -> Images:
+    """Return the structure of images at the scales that fix a velocity: (S, h, w), with 0 where `seen`, (h, w), is 0."""
+    share = cv2.GaussianBlur(seen, (0, 0), _COARSE) + np.float32(1e-6)
+    found = [cv2.GaussianBlur(each, (0, 0), _FINE) - cv2.GaussianBlur(each, (0, 0), _COARSE) / share for each in images]
+    return np.asarray(np.stack(found) * seen, np.float32)
+
+
+def _halved(images: Images) -> Images:
+    """Return images at half the size."""
+    size = (images.shape[-1] // 2, images.shape[-2] // 2)
+    return np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in images])
+
+
+def _searched(images: Images, context: Context) -> tuple[FloatArray, float]:
+    """Return the velocity at which spans fit the next ones best, and by how many standard deviations of all velocities.
+
+    For each turn, the correlation of images that are turned back, as a function of the shift, is computed for all pairs of
+    spans of each distance at once: the motion between them is the same.
+
+    Args:
+        images: (S, h, w).
+        context: threads.
+
+    Returns:
+        (3,): the turn, and the shift in binned pixels, from one span to the next.
+    """
+    step = _STEP_PX / _LAGS
+    turn_step = step / (min(images.shape[1:]) / 2)
+    turns = turn_step * np.arange(-(_FASTEST // turn_step), _FASTEST // turn_step + 1)
+    shifts = np.arange(-_FASTEST_SHIFT, _FASTEST_SHIFT + step / 2, step)
+    velocities = np.stack(np.meshgrid(shifts, shifts), axis=-1).reshape(-1, 2)
+    shape = tuple(fft.next_fast_len(side + side // 2, real=True) for side in images.shape[1:])
+    spectra = fft.rfft2(images, shape)
+    found = list(context.in_order(partial(_fits, images, spectra, shape, velocities), turns.tolist()))
+    fits = np.stack(found)
+    best = np.unravel_index(int(fits.argmax()), fits.shape)
+    height = float(fits[best]) / max(_STD_PER_MEDIAN * float(np.median(np.abs(fits))), 1e-30)
+    return np.array([turns[best[0]], *velocities[best[1]]]), height
+
+
+def _fits(
+    images: Images, spectra: NDArray[np.complexfloating], shape: tuple[int, ...], velocities: FloatArray, turn: float
+) -> FloatArray:
+    """Return how well pairs of spans fit each other for one turn, and (N, 2) shifts: (N,)."""
+    height, width = images.shape[1:]
+    middle, fits = (np.array([width, height]) - 1) / 2, np.zeros(len(velocities))
+    for lag in range(1, min(_LAGS, len(images) - 1) + 1):
+        turned = np.stack([_warped(each, Velocity(turn, np.zeros(2), middle).after([lag])[0]) for each in images[lag:]])
+        products = np.zeros_like(spectra[0])
+        for later, earlier in zip(turned, spectra, strict=False):
+            products += fft.rfft2(later, shape) * earlier.conj()
+        surface = fft.irfft2(products, shape).astype(np.float32)
+        # An image that is turned back is shifted along the direction that the shift had when the turn began.
+        points = lag * mean_shift(velocities, -turn * lag)
+        # Beyond, less than half of the frames overlap, and the correlation wraps around.
+        inside = (np.abs(points) < middle).all(axis=1)
+        at = np.mod(points, [shape[1], shape[0]]).astype(np.float32)
+        sampled = cv2.remap(surface, at[:, 0], at[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        fits += np.where(inside, sampled.ravel(), 0)
+    return fits
+
+
+def _warped(image: Images, there: FloatArray) -> Images:
+    """Return an image at the points to which a rigid motion takes its pixels; 0 outside."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(image, there[:2], image.shape[::-1], flags=flags), np.float32)
+
+
+class _Contrast:
+    """The contrast of sums of spans along a velocity, without what each span adds by itself.
+
+    Args:
+        images: (S, h, w).
+        size: spans of a window; those of each window are summed.
+    """
+
+    def __init__(self, images: Images, size: int) -> None:
+        height, width = images.shape[1:]
+        self.middle: FloatArray = (np.array([width, height]) - 1) / 2
+        n_windows = len(images) // size
+        start = (len(images) - n_windows * size) // 2
+        self._images = images[start : start + n_windows * size]
+        self._size, self._corners = size, corners((height, width))
+        self._times = np.arange(size) - (size - 1) / 2
+
+    def of_spans(self, velocity: FloatArray) -> FloatArray:
+        """Return the products of each span with all others of its window: (S,). Their sum is the contrast."""
+        there = Velocity(float(velocity[0]), velocity[1:], self.middle).after(self._times)
+        products: list[float] = []
+        for start in range(0, len(self._images), self._size):
+            window = self._images[start : start + self._size]
+            warped = np.stack([_warped(*each) for each in zip(window, there, strict=True)]).reshape(self._size, -1)
+            products += (warped @ warped.sum(axis=0) - np.einsum("ij,ij->i", warped, warped)).tolist()
+        return np.array(products)
+
+    def height(self, velocity: FloatArray) -> float:
+        """Return the contrast in units of its noise, but for a factor that does not depend on the size of windows."""
+        return float(self.of_spans(velocity).sum()) / float(np.sqrt(len(self._images) * (self._size - 1)))
+
+    def moved_px(self, velocity: FloatArray) -> float:
+        """Return how far corners of the frame move within a window, at most, in binned pixels."""
+        there = Velocity(float(velocity[0]), velocity[1:], self.middle).after(self._times[[0, -1]])
+        return float(np.linalg.norm(apply(there[1], self._corners) - apply(there[0], self._corners), axis=-1).max())
+
+    @property
+    def steps(self) -> FloatArray:
+        """(3,) changes of the velocity by which the border of the frame moves by a binned pixel at the ends of a window."""
+        ahead = float(self._times[-1])
+        return np.array([1 / (float(self.middle.min()) * ahead), 1 / ahead, 1 / ahead])
+
+    def sharpest(self, velocity: FloatArray) -> FloatArray:
+        """Return the velocity of highest contrast near another one (Nelder and Mead 1965)."""
+        simplex = velocity + np.concatenate([np.zeros((1, 3)), np.diag(self.steps)])
+        scale = abs(float(self.of_spans(velocity).sum())) or 1.0
+
+        def lost(units: FloatArray) -> float:
+            return -float(self.of_spans(units * self.steps).sum()) / scale
+
+        found = optimize.minimize(
+            lost,
+            velocity / self.steps,
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex / self.steps, "xatol": 0.01, "fatol": 1e-5, "maxiter": 200},
+        )
+        return np.asarray(found.x * self.steps)
+
+    def covariance(self, velocity: FloatArray) -> FloatArray:
+        """Return the covariance of the sharpest velocity: (3, 3), by the infinitesimal jackknife over spans (Efron 1982).
+
+        It is inv(H) J inv(H): H are the second derivatives of the contrast, and J is the sum over spans of the squares of what
+        each adds to the first ones.
+        """
+        steps = self.steps / 2
+        centre = self.of_spans(velocity)
+        ahead, back = ([self.of_spans(velocity + sign * step) for step in np.diag(steps)] for sign in (1, -1))
+        # The contrast loses twice the products of a span with all others if that is left out.
+        slopes = np.stack([2 * (one - other) / 2 for one, other in zip(ahead, back, strict=True)], axis=-1)
+        curvature = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(i):
+                both = np.diag(steps)[i] + np.diag(steps)[j]
+                mixed = (
+                    self.of_spans(velocity + both) + self.of_spans(velocity - both) - ahead[i] - back[i] - ahead[j] - back[j]
+                )
+                curvature[i, j] = curvature[j, i] = float((mixed + 2 * centre).sum()) / 2
+            curvature[i, i] = float((ahead[i] + back[i] - 2 * centre).sum())
+        inverted = np.linalg.pinv(curvature)
+        return np.asarray(inverted @ (slopes.T @ slopes) @ inverted * steps[:, None] * steps)
