@@ -10,15 +10,16 @@ STEP := @printf '\n== %s\n'
 # The tests start Python hundreds of times: each must find its modules compiled, whatever the environment says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install test demo bench clean
+.PHONY: help install test demo docs bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo     simulate a small capture, make its panorama, and score it'
 	@echo 'make test     run all checks and tests'
+	@echo 'make docs     build the documentation as a site'
 	@echo 'make bench    run the benchmarks, which takes long'
 	@echo 'make install  make the virtual environment $(VENV), with all that tests and benchmarks need'
-	@echo 'make clean    remove the virtual environment, the demo and caches'
+	@echo 'make clean    remove the virtual environment, the demo, the site and caches'
 
 install: $(COMPLETE)
 
@@ -52,10 +53,15 @@ demo: $(RUNS)
 	@$(BIN)/photonpano evaluate demo/run --truth demo/capture.truth.npz
 	$(STEP) 'done; look at $(CURDIR)/demo/run/panorama.png and report.html beside it'
 
+docs: $(COMPLETE)
+	$(STEP) 'the site'
+	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -c docs/site -d site/pages . site/html
+	$(STEP) 'done; look at $(CURDIR)/site/html/index.html'
+
 bench: $(COMPLETE)
 	$(STEP) 'benchmarks'
 	@$(BIN)/pytest tests/benchmarks -s --timeout 0
 
 clean:
-	rm -rf $(VENV) demo dist .*_cache .benchmarks .hypothesis
+	rm -rf $(VENV) demo site dist .*_cache .benchmarks .hypothesis
 	find framework plugins tests -name __pycache__ -prune -exec rm -rf {} +

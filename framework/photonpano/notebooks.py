@@ -36,8 +36,9 @@ def in_notebook() -> bool:
 
 def facts(rows: Iterable[tuple[str, str]]) -> str:
     """Return a table of names and what they are, as HTML."""
+    left = "text-align:left"
     cells = "".join(
-        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
+        f'<tr><th style="{left};white-space:nowrap">{escape(name)}</th><td style="{left}">{escape(value)}</td></tr>'
         for name, value in rows
     )
     return f"<table>{cells}</table>"

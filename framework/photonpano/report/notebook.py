@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from html import escape
 from pathlib import Path
 
 from photonpano.notebooks import facts, picture_of_png
@@ -24,11 +23,7 @@ def run_html(folder: Path, record: RunRecord) -> str:
         record: the content of its run.json.
     """
     place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-    report = ""
-    if "report.html" in record["files"]:
-        href = escape((place / "report.html").as_posix())
-        report = f'<p><a href="{href}" target="_blank">report.html</a></p>'
-    return _picture(folder / "panorama.png") + facts(_rows(record, place)) + report
+    return _picture(folder / "panorama.png") + facts(_rows(record, place))
 
 
 def _picture(path: Path) -> str:
@@ -63,3 +58,5 @@ def _rows(record: RunRecord, place: Path) -> Iterator[tuple[str, str]]:
         yield "poses", f"of {poses['located']:,} of {frames}"
     yield "time", duration(record["seconds"])
     yield "run folder", str(place)
+    if "report.html" in record["files"]:
+        yield "report", str(place / "report.html")
