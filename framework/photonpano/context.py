@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import Any, Protocol, TypeVar
 
 from photonpano.execution import Executor, Here
 from photonpano.notebooks import NotebookBars, in_notebook
-from photonpano.threads import in_order
+from photonpano.threads import batched, in_order
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
@@ -134,5 +135,14 @@ class Context:
     executor: Executor = field(default_factory=Here)
 
     def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:
-        """Yield the results of `work` in the order of the items, each a task of the executor: see `threads.in_order`."""
-        return in_order(partial(self.executor.call, self.executor.share(work)), items, self.threads)
+        """Yield the results of `work` in the order of the items, in tasks of the executor: see `threads.in_order`."""
+        shared = self.executor.share(work)
+        at_once = self.executor.at_once(len(items)) if isinstance(items, Sequence) else 1
+        if at_once == 1:
+            return in_order(partial(self.executor.call, shared), items, self.threads)
+        results = in_order(partial(self.executor.call, _each, shared), batched(items, at_once), self.threads)
+        return chain.from_iterable(results)
+
+
+def _each(work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> list[ResultT]:
+    return [work(item) for item in items]

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from itertools import islice
 from typing import Any, Literal, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -64,6 +65,13 @@ def lagging(items: Iterable[ItemT], by: int) -> Iterator[ItemT]:
             yield held.popleft()
     while held:
         yield held.popleft()
+
+
+def batched(items: Iterable[ItemT], size: int) -> Iterator[tuple[ItemT, ...]]:
+    """Yield the items in tuples of a size; the last may be shorter. As `itertools.batched` of Python 3.12."""
+    left = iter(items)
+    while batch := tuple(islice(left, size)):
+        yield batch
 
 
 class Guard:

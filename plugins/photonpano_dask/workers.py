@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import dask
-from distributed import Client, Future, LocalCluster, wait
+from distributed import Client, Future, LocalCluster
 
 from photonpano import ExecutorContext, InputError
 from photonpano.execution import differences
@@ -17,7 +17,12 @@ _AHEAD = 2
 """Tasks under way for each thread of a worker: one is worked on while the next travels."""
 _PATIENCE_S = 10
 """How long a scheduler may take to answer."""
-_QUIET = {"distributed.worker.daemon": True, "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s"}
+_SETTINGS = {
+    "distributed.worker.daemon": True,
+    "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",
+    # It would look at the stack of each worker a hundred times a second.
+    "distributed.worker.profile.enabled": False,
+}
 
 
 def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
@@ -27,7 +32,7 @@ def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
         InputError: no scheduler answers, it has no workers, or they differ from this process.
     """
     cluster: LocalCluster | None = None
-    with dask.config.set(_QUIET):
+    with dask.config.set(_SETTINGS):
         if config.address is None:
             number = config.workers or context.threads
             cluster = LocalCluster(
@@ -76,13 +81,9 @@ class DaskWorkers:
         # Tasks are not pure: a key that is computed from large arguments takes time, and none is submitted twice.
         return self._client.submit(function, *given, pure=False)
 
-    def wait(self, pending: Future, seconds: float) -> bool:
-        """Wait for a task: see `Workers`."""
-        try:
-            wait([pending], timeout=seconds)
-        except TimeoutError:
-            return False
-        return True
+    def when_done(self, pending: Future, call: Callable[[], object]) -> None:
+        """Have a function called once a task has ended: see `Workers`."""
+        pending.add_done_callback(lambda _: call())
 
     def close(self) -> None:
         """Cancel what is under way, and end the processes that were started."""

@@ -21,6 +21,10 @@ class Executor(Protocol):
         """How many tasks are worth having under way at once."""
         ...
 
+    def at_once(self, number: int) -> int:
+        """Return how many of a number of items are best worked on in one task: more than one where tasks cost time to send."""
+        ...
+
     def share(self, value: ValueT) -> ValueT:
         """Return what stands for a value, which may be large, in tasks: it travels to each worker once."""
         ...

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import itemgetter
+from threading import Event
 from typing import Any, Protocol, TypeVar
 
 from photonpano.execution.packing import packed, unpacked
@@ -13,6 +14,10 @@ from photonpano.interrupts import interrupted
 
 _LOOK_S = 0.2
 """How often threads that wait look whether the program was interrupted."""
+_MOST_AT_ONCE = 8
+"""Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client."""
+_TASKS_UNDER_WAY = 4
+"""Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last."""
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
@@ -59,8 +64,8 @@ class Workers(Protocol):
         """How many tasks are worth having under way at once: more than there are workers, so that none waits for the next."""
         ...
 
-    def wait(self, pending: Pending, seconds: float) -> bool:
-        """Wait for a task; return whether it has ended after so many seconds."""
+    def when_done(self, pending: Pending, call: Callable[[], object]) -> None:
+        """Have a function called, in any thread, once a task has ended in whatever way."""
         ...
 
     def close(self) -> None:
@@ -82,6 +87,10 @@ class Remote:
     def under_way(self) -> int:
         """How many tasks are worth having under way at once."""
         return self._workers.under_way
+
+    def at_once(self, number: int) -> int:
+        """Return how many of a number of items are best worked on in one task; all workers have several tasks all the same."""
+        return min(_MOST_AT_ONCE, max(1, number // (_TASKS_UNDER_WAY * self.under_way)))
 
     def share(self, value: ValueT) -> ValueT:
         """Return what stands for a value in tasks: it travels to each worker once."""
@@ -107,7 +116,9 @@ class Remote:
 
     def _awaited(self, pending: Pending) -> Any:
         """Wait for a result. Once the program is interrupted, its threads do not wait any longer."""
-        while not self._workers.wait(pending, _LOOK_S):
+        done = Event()
+        self._workers.when_done(pending, done.set)
+        while not done.wait(_LOOK_S):
             if interrupted():
                 raise KeyboardInterrupt
         return pending.result()

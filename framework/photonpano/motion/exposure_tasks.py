@@ -1,7 +1,8 @@
-"""Tasks of the locate step, for any worker: merge an exposure and have it described, register a pair, compare a pair."""
+"""Tasks of the locate step, for any worker: merge exposures and have them described, register pairs, compare a pair."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -34,8 +35,25 @@ class Described:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Two exposures to register.
+
+    Attributes:
+        moving: number of the later exposure.
+        fixed: number of the earlier one.
+        expected: the motion known so far, if any.
+    """
+
+    moving: int
+    fixed: int
+    expected: FrameHomography | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ExposureTasks:
     """The tasks of a level. Each returns its seconds in each stage, too.
+
+    Exposures are given by their numbers, together with mappings in which their descriptions are.
 
     Attributes:
         exposures: of the level.
@@ -43,63 +61,82 @@ class ExposureTasks:
 
     exposures: VirtualExposures
 
-    def describe(self, index: int, locator: int, keep: bool) -> tuple[Described, tuple[Contrast, dict[str, float]]]:
-        """Merge an exposure, and have a locator describe it.
+    def describe(
+        self, indices: Sequence[int], locator: int, keep: bool
+    ) -> tuple[dict[int, Described], tuple[list[Contrast], dict[str, float]]]:
+        """Merge exposures, and have a locator describe them.
 
         Args:
-            index: the number of the exposure.
+            indices: the numbers of the exposures.
             locator: the number of the locator; a blank exposure is not described.
-            keep: whether the exposure itself is kept.
+            keep: whether the exposures themselves are kept.
 
         Returns:
-            What stays where the task was done, and what is known of the exposure.
+            What stays where the task was done, by exposure, and what is known of each exposure.
         """
-        clock = Stopwatch(1)
-        exposure = replace(self.exposures, clock=clock).merged(index)
-        with clock("locate"):
-            contrast = contrast_of(exposure)
-            features = None
-            if not contrast.blank:
-                named = self._locator(locator)
-                with self.exposures.level.attributing(named):
-                    features = named.component.describe(exposure)
-        return Described(features, exposure if keep else None), (contrast, clock.seconds)
+        clock, named = Stopwatch(1), self._locator(locator)
+        described: dict[int, Described] = {}
+        contrasts: list[Contrast] = []
+        for index in indices:
+            exposure = replace(self.exposures, clock=clock).merged(index)
+            with clock("locate"):
+                contrasts.append(contrast := contrast_of(exposure))
+                features = None
+                if not contrast.blank:
+                    with self.exposures.level.attributing(named):
+                        features = named.component.describe(exposure)
+            described[index] = Described(features, exposure if keep else None)
+        return described, (contrasts, clock.seconds)
 
-    def hypotheses(self, locator: int, moving: Described, fixed: Described) -> tuple[list[Homography], dict[str, float]]:
+    def hypotheses(
+        self, locator: int, moving: int, fixed: int, *described: Mapping[int, Described]
+    ) -> tuple[list[Homography], dict[str, float]]:
         """Return what a locator that keeps hypotheses makes of a pair, in pixels of frames."""
-        level, named, clock = self.exposures.level, self._locator(locator), Stopwatch(1)
+        level, named, clock, known = self.exposures.level, self._locator(locator), Stopwatch(1), _joined(described)
         component = named.component
         assert isinstance(component, KeepsHypotheses)
         with clock("locate"), level.attributing(named):
-            listed = list(islice(component.hypotheses(moving.features, fixed.features), MAX_HYPOTHESES))
+            listed = list(islice(component.hypotheses(known[moving].features, known[fixed].features), MAX_HYPOTHESES))
             found = [require_valid(Located(each)) for each in listed]
         return [level.in_frame_px(each).homography for each in found if isinstance(each, Located)], clock.seconds
 
     def register(
-        self, locator: int, moving: Described, fixed: Described, expected: FrameHomography | None
-    ) -> tuple[Located | NotLocated, dict[str, float]]:
-        """Return the motion of a pair in pixels of frames, as one locator finds it from where it is expected."""
-        level, shape, named, clock = self.exposures.level, self.exposures.frame_shape, self._locator(locator), Stopwatch(1)
-        initial = None if expected is None else level.in_exposure_px(expected)
+        self, locator: int, pairs: Sequence[Pair], *described: Mapping[int, Described]
+    ) -> tuple[list[Located | NotLocated], dict[str, float]]:
+        """Return the motion of each pair in pixels of frames, as one locator finds it from where it is expected."""
+        clock, known = Stopwatch(1), _joined(described)
         with clock("locate"):
-            with level.attributing(named):
-                motion = require_valid(named.component.register(moving.features, fixed.features, initial))
-                if isinstance(motion, Located):
-                    require_no_standstill(motion, expected, shape)
-            if isinstance(motion, Located):
-                motion = level.in_frame_px(motion)
-                if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
-                    motion = NotLocated(reason, motion.evidence)
-        return motion, clock.seconds
+            motions = [self._registered(self._locator(locator), pair, known) for pair in pairs]
+        return motions, clock.seconds
 
-    def similarity(self, moving: Described, fixed: Described, motion: FrameHomography) -> tuple[float, dict[str, float]]:
+    def _registered(self, named: NamedLocator, pair: Pair, known: Mapping[int, Described]) -> Located | NotLocated:
+        level, shape = self.exposures.level, self.exposures.frame_shape
+        initial = None if pair.expected is None else level.in_exposure_px(pair.expected)
+        with level.attributing(named):
+            motion = require_valid(named.component.register(known[pair.moving].features, known[pair.fixed].features, initial))
+            if isinstance(motion, Located):
+                require_no_standstill(motion, pair.expected, shape)
+        if isinstance(motion, Located):
+            motion = level.in_frame_px(motion)
+            if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
+                motion = NotLocated(reason, motion.evidence)
+        return motion
+
+    def similarity(
+        self, moving: int, fixed: int, motion: FrameHomography, *described: Mapping[int, Described]
+    ) -> tuple[float, dict[str, float]]:
         """Return the similarity of two exposures that were kept, along their motion."""
-        assert moving.exposure is not None
-        assert fixed.exposure is not None
-        clock = Stopwatch(1)
+        clock, known = Stopwatch(1), _joined(described)
+        one, other = known[moving].exposure, known[fixed].exposure
+        assert one is not None
+        assert other is not None
         with clock("locate"):
-            similarity = exposure_similarity(moving.exposure, fixed.exposure, motion)
+            similarity = exposure_similarity(one, other, motion)
         return similarity, clock.seconds
 
     def _locator(self, number: int) -> NamedLocator:
         return self.exposures.level.locators[number]
+
+
+def _joined(described: Iterable[Mapping[int, Described]]) -> Mapping[int, Described]:
+    return {index: each for mapping in described for index, each in mapping.items()}

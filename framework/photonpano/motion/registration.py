@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -13,14 +13,14 @@ from photonpano.context import Context, Log
 from photonpano.geometry import inverse, why_implausible
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.diagnosis import Contrast
-from photonpano.motion.exposure_tasks import Described, ExposureTasks
+from photonpano.motion.exposure_tasks import Described, ExposureTasks, Pair
 from photonpano.motion.level import FrameHomography
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of, shared_share
 from photonpano.motion.start import starting_motion
 from photonpano.motion.tracking import Place, Track
 from photonpano.protocols import KeepsHypotheses
-from photonpano.threads import in_order, lagging
+from photonpano.threads import batched, in_order, lagging
 from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated
 
 ResultT = TypeVar("ResultT")
@@ -36,11 +36,11 @@ class _Kept:
     """What is kept of an exposure until its last pair is registered.
 
     Attributes:
-        described: stands for what each locator made of it, by the locator's number.
+        described: what each locator made of it, by the locator's number: stands for a mapping that has it, among others.
         lock: held while a locator describes it, so that each does so once.
     """
 
-    described: dict[int, Described] = field(default_factory=dict)
+    described: dict[int, Mapping[int, Described]] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 
 
@@ -81,6 +81,7 @@ class Registrar:
             context: its executor merges, describes and registers.
         """
         self._executor, self._tasks = context.executor, context.executor.share(ExposureTasks(exposures))
+        self._at_once = context.executor.at_once(len(exposures.groups))
         self._exposures, self._level, self._clock = exposures, exposures.level, exposures.clock
         self._log = log
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
@@ -121,10 +122,8 @@ class Registrar:
         if known == len(partners):
             return
         # Pairs of several exposures are under way at once, so that no thread waits for the last pair of one.
-        for moving, jobs in lagging(self._submitted(needed, known, pool, threads), threads):
-            if moving < known:
-                continue
-            found = [edge for job in jobs for edge in job.result()]
+        for moving, job in lagging(self._submitted(needed, known, pool, threads), threads * self._at_once):
+            found = [edge for edge in job.result() if edge.moving == moving]
             if found and not any(isinstance(edge.motion, Located) for edge in found):
                 found += self._bridge(moving, partners[moving])
             self._log.add(self._registered(moving, tuple(found)))
@@ -153,7 +152,7 @@ class Registrar:
             if position < len(log.found):
                 continue
             missing = [index for index in (moving, fixed) if index not in self._kept]
-            for index, (kept, _) in zip(missing, pool.map(lambda each: self._describe(each, keep=True), missing), strict=True):
+            for index, [(kept, _)] in zip(missing, pool.map(lambda each: self._describe([each], True), missing), strict=True):
                 self._kept[index] = kept
             expected = FrameHomography(inverse(homographies[fixed]) @ homographies[moving])
             closure = self._similar(self._register(moving, fixed, expected))
@@ -180,26 +179,27 @@ class Registrar:
 
     def _submitted(
         self, partners: Mapping[int, Sequence[int]], known: int, pool: ThreadPoolExecutor, threads: int
-    ) -> Iterator[tuple[int, list[Future[list[Edge]]]]]:
-        """Describe one exposure after the other; yield each with its pairs, which are being registered.
+    ) -> Iterator[tuple[int, Future[list[Edge]]]]:
+        """Describe exposures in order; yield each new one with a job that registers its pairs, and maybe those of others.
 
         Args:
             partners: the exposures to describe, with the earlier ones that each is registered with.
             known: the number of exposures whose pairs are registered already.
             pool: waits for tasks.
-            threads: how many exposures are worked on ahead.
+            threads: how many tasks are worked on ahead.
         """
-        for moving, described in zip(partners, in_order(self._describe, partners, threads, pool), strict=True):
-            self._kept[moving], self.contrasts[moving] = described
-            if moving < known:
-                yield moving, []
-            elif self._track is not None:
-                yield moving, [pool.submit(self._register_along, self._track, moving, partners[moving])]
+        bundles = list(batched(partners, self._at_once))
+        for bundle, described in zip(bundles, in_order(self._describe, bundles, threads, pool), strict=True):
+            for index, (kept, contrast) in zip(bundle, described, strict=True):
+                self._kept[index], self.contrasts[index] = kept, contrast
+            new = [index for index in bundle if index >= known]
+            if self._track is not None:
+                for moving in new:
+                    yield moving, pool.submit(self._register_along, self._track, moving, partners[moving])
             else:
-                yield moving, [pool.submit(self._register_each, moving, [fixed]) for fixed in partners[moving]]
-
-    def _register_each(self, moving: int, partners: Sequence[int]) -> list[Edge]:
-        return [self._register(moving, fixed, self._expected(moving, fixed)) for fixed in partners]
+                pairs = [(moving, fixed) for moving in new for fixed in partners[moving]]
+                job = pool.submit(self._register_all, [Pair(*pair, self._expected(*pair)) for pair in pairs])
+                yield from ((moving, job) for moving in new)
 
     def _register_along(self, track: Track, moving: int, partners: Sequence[int]) -> list[Edge]:
         """Register an exposure of the first level with others; the nearest one tells where it lies in those further away."""
@@ -231,27 +231,34 @@ class Registrar:
         """Return a loop closure with its similarity, not located if that is too small."""
         if isinstance(closure.motion, NotLocated):
             return closure
-        pair = (self._described_by(0, each) for each in (closure.moving, closure.fixed))
-        similarity = self._timed(self._executor.call(ExposureTasks.similarity, self._tasks, *pair, closure.motion.homography))
+        pair = closure.moving, closure.fixed
+        task = ExposureTasks.similarity, self._tasks, *pair, closure.motion.homography
+        similarity = self._timed(self._executor.call(*task, *self._described_by(0, pair)))
         evidence = {**closure.motion.evidence, "closure_similarity": similarity}
         if similarity < MIN_SIMILARITY:
             reason = f"the similarity of the exposures of this loop closure is {similarity:.2f}, less than {MIN_SIMILARITY:g}"
             return Edge(closure.moving, closure.fixed, NotLocated(reason, evidence))
         return replace(closure, motion=replace(closure.motion, evidence=evidence))
 
-    def _describe(self, index: int, keep: bool = False) -> tuple[_Kept, Contrast]:
-        """Have the first locator describe an exposure."""
-        described, known = self._executor.keep(ExposureTasks.describe, self._tasks, index, 0, keep)
-        return _Kept({0: described}), self._timed(known)
+    def _describe(self, indices: Sequence[int], keep: bool = False) -> list[tuple[_Kept, Contrast]]:
+        """Have the first locator describe exposures."""
+        described, known = self._executor.keep(ExposureTasks.describe, self._tasks, indices, 0, keep)
+        return [(_Kept({0: described}), contrast) for contrast in self._timed(known)]
 
-    def _described_by(self, locator: int, index: int) -> Described:
-        """Return what stands for a locator's description of an exposure; for a fallback, it is merged again."""
-        kept = self._kept[index]
-        with kept.lock:
-            if locator not in kept.described:
-                kept.described[locator], known = self._executor.keep(ExposureTasks.describe, self._tasks, index, locator, False)
-                self._timed(known)
-            return kept.described[locator]
+    def _described_by(self, locator: int, indices: Iterable[int]) -> Iterable[Mapping[int, Described]]:
+        """Return what stands for a locator's descriptions of exposures; for a fallback, they are merged again."""
+        found: dict[int, Mapping[int, Described]] = {}
+        for index in indices:
+            kept = self._kept[index]
+            with kept.lock:
+                if locator not in kept.described:
+                    kept.described[locator], known = self._executor.keep(
+                        ExposureTasks.describe, self._tasks, [index], locator, False
+                    )
+                    self._timed(known)
+                described = kept.described[locator]
+            found[id(described)] = described
+        return found.values()
 
     def _timed(self, done: tuple[ResultT, dict[str, float]]) -> ResultT:
         """Return the result of a task, and add its time to that of the level."""
@@ -284,41 +291,64 @@ class Registrar:
             return []
         for number, locator in enumerate(self._level.locators):
             if isinstance(locator.component, KeepsHypotheses):
-                pair = (self._described_by(number, each) for each in (moving, fixed))
-                return self._timed(self._executor.call(ExposureTasks.hypotheses, self._tasks, number, *pair))
+                pair = moving, fixed
+                described = self._described_by(number, pair)
+                return self._timed(self._executor.call(ExposureTasks.hypotheses, self._tasks, number, *pair, *described))
         return []
 
     def _register(self, moving: int, fixed: int, expected: FrameHomography | None, guessed: bool = False) -> Edge:
-        """Pass a pair to one locator after the other, until one locates it.
+        """Register one pair: see `_register_all`."""
+        return self._register_all([Pair(moving, fixed, expected)], guessed)[0]
+
+    def _register_all(self, pairs: Sequence[Pair], guessed: bool = False) -> list[Edge]:
+        """Pass pairs to one locator after the other, until one locates them.
 
         Args:
-            moving: number of the later exposure.
-            fixed: number of the earlier one.
-            expected: the motion known so far.
+            pairs: with the motion known so far.
             guessed: whether that is a guess of the first level, which only locators that keep hypotheses start from.
         """
-        for index in (moving, fixed):
-            if blank := self.contrasts[index].blank:
-                return Edge(moving, fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
-        if expected is not None and (reason := why_implausible(expected, self._exposures.frame_shape)):
-            return Edge(moving, fixed, NotLocated(f"by the motion known so far, {reason}"))
-        failures: dict[str, NotLocated] = {}
+        found: dict[Pair, Edge] = {pair: edge for pair in pairs if (edge := self._refused(pair))}
+        failures: dict[Pair, dict[str, NotLocated]] = {pair: {} for pair in pairs}
         for number, locator in enumerate(self._level.locators):
             starts = not guessed or isinstance(locator.component, KeepsHypotheses)
-            motion = self._located_by(number, moving, fixed, expected if starts else None)
-            if isinstance(motion, Located):
-                return Edge(moving, fixed, motion, locator.name)
-            failures[locator.name] = motion
-        return Edge(moving, fixed, _joined(failures))
+            left = [pair for pair in pairs if pair not in found]
+            for pair, motion in zip(left, self._located_by(number, left, starts), strict=True):
+                if isinstance(motion, Located):
+                    found[pair] = Edge(pair.moving, pair.fixed, motion, locator.name)
+                else:
+                    failures[pair][locator.name] = motion
+        return [found.get(pair) or Edge(pair.moving, pair.fixed, _joined(failures[pair])) for pair in pairs]
 
-    def _located_by(self, locator: int, moving: int, fixed: int, expected: FrameHomography | None) -> Located | NotLocated:
-        """Return the motion of a pair as one locator finds it; photons that both share do not count."""
-        pair = (self._described_by(locator, each) for each in (moving, fixed))
-        motion = self._timed(self._executor.call(ExposureTasks.register, self._tasks, locator, *pair, expected))
+    def _refused(self, pair: Pair) -> Edge | None:
+        """Return a pair that no locator needs to see, with the reason; None for any other."""
+        for index in (pair.moving, pair.fixed):
+            if blank := self.contrasts[index].blank:
+                return Edge(pair.moving, pair.fixed, NotLocated(f"{self._exposures.groups[index]}: {blank}"))
+        if pair.expected is not None and (reason := why_implausible(pair.expected, self._exposures.frame_shape)):
+            return Edge(pair.moving, pair.fixed, NotLocated(f"by the motion known so far, {reason}"))
+        return None
+
+    def _located_by(self, locator: int, pairs: Sequence[Pair], starts: bool) -> list[Located | NotLocated]:
+        """Return the motions of pairs as one locator finds them; photons that both exposures share do not count.
+
+        Args:
+            locator: its number.
+            pairs: none of which is refused.
+            starts: whether the locator starts from the motion known so far.
+        """
+        if not pairs:
+            return []
+        described = self._described_by(locator, (index for pair in pairs for index in (pair.moving, pair.fixed)))
+        sent = pairs if starts else [replace(pair, expected=None) for pair in pairs]
+        motions = self._timed(self._executor.call(ExposureTasks.register, self._tasks, locator, sent, *described))
+        return [self._of_new_photons(pair, motion) for pair, motion in zip(pairs, motions, strict=True)]
+
+    def _of_new_photons(self, pair: Pair, motion: Located | NotLocated) -> Located | NotLocated:
+        """Return a motion whose information counts each photon once."""
         if isinstance(motion, NotLocated) or motion.information is None:
             return motion
         groups = self._exposures.groups
-        new = self._independent * max(1 - shared_share(groups[moving].span, groups[fixed].span), MIN_PAIR_WEIGHT)
+        new = self._independent * max(1 - shared_share(groups[pair.moving].span, groups[pair.fixed].span), MIN_PAIR_WEIGHT)
         return replace(motion, information=motion.information * new)
 
 

@@ -82,6 +82,9 @@ class Elsewhere:
     def __init__(self) -> None:
         self.capture: Source | None = None
 
+    def at_once(self, number: int) -> int:
+        return min(3, number)
+
     def copied(self, value: Any) -> Any:
         return unpacked(packed(value, self.capture), self.capture)
 
