@@ -11,6 +11,8 @@ from photonpano.errors import PhotonpanoError
 from photonpano.protocols import Arrived, Source
 
 _POLL_S = 0.02
+_TOLERATED_S = 1.0
+"""How long what is there may be no capture: a file may appear before the one before it is complete."""
 _MOST_MARKS = 4096
 """Times of arrival that are kept: if frames wait for minutes, they get coarser."""
 
@@ -91,15 +93,19 @@ class Arrivals:
         self._thread.join()
 
     def _watch(self) -> None:
-        before = began = changed = time.monotonic()
+        before = began = changed = well = time.monotonic()
         while not self._stopped.is_set():
             over = self._is_over is not None and self._is_over()  # asked first: what came before that is seen now
             now = time.monotonic()
             try:
                 arrived = self._look()
             except PhotonpanoError as error:
+                if now - well <= _TOLERATED_S and not over:
+                    self._stopped.wait(_POLL_S)
+                    continue
                 self._failure, self.ended = error, True
                 break
+            well = now
             self._source, self.promised = arrived.source, arrived.promised
             n_frames = 0 if arrived.source is None else arrived.source.info.n_frames
             if n_frames > self.n_frames:

@@ -9,7 +9,6 @@ import os
 import shlex
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -20,15 +19,14 @@ from photonpano.captures.fingerprint import capture_files
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Context, Progress
 from photonpano.contributions import PartOfCapture, SourceContribution
-from photonpano.errors import InputError, OutputError, PhotonpanoError
+from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.folders import lock_path
+from photonpano.interrupts import is_interrupt
 from photonpano.locks import locked
 from photonpano.pipeline.following.arrivals import Arrivals
-from photonpano.pipeline.following.delays import Delays
-from photonpano.pipeline.following.located import LocatedSoFar
+from photonpano.pipeline.following.live_run import Every, LiveRun
 from photonpano.pipeline.following.page import PAGE, LivePage
 from photonpano.pipeline.following.picture import PictureSoFar
-from photonpano.pipeline.following.reading import ArrivedFrames
 from photonpano.pipeline.following.rehearsal import rehearse
 from photonpano.pipeline.following.spool import Spool
 from photonpano.pipeline.run_folder import run_folder
@@ -45,12 +43,10 @@ SPOOL = "frames.raw"
 """The file of the frames of a pipe."""
 _REFRESH_S = 1.0
 _NOTE_S = 10.0
+_WINDOW_S = 0.2
+"""Least time from one window to the next: longer windows take less time a frame, since each begins with the end of the last."""
 _IDLE_S = 0.1
 """How long to wait for frames before the page is looked after."""
-_RATE_S = 3.0
-"""The rate of arrival is that of the last seconds."""
-_FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
-"""If frames wait for longer, so long after the first were located, they come faster than they are located."""
 
 
 @dataclass(slots=True)
@@ -99,10 +95,10 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
             plan = _from_file(plan, spooled)
         with run_folder(directory, overwrite=overwrite, inputs=capture_files(plan)):
             pass  # what forbids to write it is told now, and not when the capture is complete
-        page = LivePage(folder, directory)
         if isinstance(what, Piped):
             spool = Spool(_standard_input(), _free(spooled, plan, overwrite), what)
             stack.callback(spool.close)
+        page = LivePage(folder, directory)
         arrivals = Arrivals(partial(_arrived, look, plan), None if spool is None else lambda: spool.ended, end_after)
         stack.callback(arrivals.close)
         progress.note(f"following the capture; {folder / PAGE} shows the panorama so far")
@@ -122,8 +118,8 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
                 spool.close()
                 if spool.path.exists():
                     logger.warning(f"the frames that arrived are in {spool.path}; {_way_on(plan)}")
-            message = str(error) if isinstance(error, PhotonpanoError) else "interrupted"
-            page.end(message, arrivals.n_frames)
+            message = str(error) if isinstance(error, PhotonpanoError) else described(error)
+            page.end("interrupted" if is_interrupt(error) else message, arrivals.n_frames)
             raise
 
 
@@ -230,65 +226,31 @@ def _require_complete(plan: Plan, arrivals: Arrivals, end_after: float) -> None:
 def _located_so_far(plan: Plan, arrivals: Arrivals, page: LivePage, progress: Progress) -> LiveFigures:
     """Locate frames as they arrive, until no more come, and write the page each second."""
     context = Context(thread_count(plan.run.threads))
-    reading, located, picture, delays = ArrivedFrames(plan), LocatedSoFar(plan, context), PictureSoFar(), Delays()
-    rates: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
-    noted = time.monotonic()
-    written, first, changed, failed, warned = 0.0, math.inf, True, "", False
+    run, picture = LiveRun(plan, arrivals, context), PictureSoFar()
     page.write(LiveFigures())
     with one_thread_inside(), notify_on_first_compile(partial(progress.note, COMPILING)):
         arrivals.wait(_IDLE_S)
         if not arrivals.n_frames:
             rehearse(plan, context)
+        refresh, note, warn = Every(_REFRESH_S), Every(_NOTE_S, at_once=False), Every(math.inf)
         while True:
-            ended, arrived = arrivals.ended, arrivals.source()
-            window = None
-            if arrived is not None and not failed:
-                source = reading.of(arrived, arrivals.promised)
-                try:
-                    window = located.next_window(source, last=ended)
-                except PhotonpanoError as error:  # the frames still count: the run of the whole capture says more
-                    failed = f"frames are no longer located as they arrive: {error}"
-                    logger.warning(failed)
-            now = time.monotonic()
-            waited = arrivals.waited(located.n_frames, now)
-            if window is not None:
-                for n_frames, seconds in waited:
-                    delays.add(n_frames, seconds)
-                first = min(first, now)
+            begun, ended = time.monotonic(), arrivals.ended
+            if window := run.next_window(last=ended):
                 picture.add(window)
-                changed = True
-            behind_s = arrivals.oldest(now)
-            if ended or now - written >= _REFRESH_S:
-                rates.append((now, arrivals.n_frames))
-                while len(rates) > 2 and now - rates[1][0] > _RATE_S:
-                    rates.popleft()
-                rate = (rates[-1][1] - rates[0][1]) / max(now - rates[0][0], 1e-6)
-                figures = LiveFigures(
-                    "following" if arrivals.n_frames else "waiting",
-                    arrivals.n_frames,
-                    arrivals.promised,
-                    delays.n_frames,
-                    arrivals.n_frames - located.n_frames,
-                    behind_s,
-                    rate,
-                    delays.mean,
-                    delays.quantile(0.95),
-                    delays.longest,
-                    failed or located.problem,
-                )
-                page.write(figures, picture if changed else None)
-                written, changed = now, False
-            if behind_s > _FAR_BEHIND_S and now - first > _STARTED_S and not (warned or failed):
+            figures = run.figures()
+            if refresh.due() or ended:
+                page.write(figures, picture)
+            if note.due():
+                behind = f"{figures.behind_frames:,} are not located yet, the first for {duration(figures.behind_s)}"
+                progress.note(f"following: {counted(figures.frames, 'frame')} so far; {behind}")
+            if run.is_too_slow and warn.due():
                 logger.warning(
                     "frames come faster than they are located; none is lost, and the result is the same. Larger groups "
                     "(resample.with.group_size), or the first level at a smaller scale, take less time"
                 )
-                warned = True
-            if now - noted >= _NOTE_S:
-                behind = f"{figures.behind_frames:,} are not located yet, the first for {duration(behind_s)}"
-                progress.note(f"following: {counted(arrivals.n_frames, 'frame')} so far; {behind}")
-                noted = now
             if ended:
                 return figures
             if window is None:
                 arrivals.wait(_IDLE_S)
+            else:
+                time.sleep(max(0.0, begun + _WINDOW_S - time.monotonic()))

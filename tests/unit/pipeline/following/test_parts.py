@@ -72,11 +72,27 @@ class TestArrivals:
         def look() -> Arrived:
             raise InputError("broken")
 
-        arrivals = Arrivals(look, None, 60.0)
+        arrivals = Arrivals(look, lambda: True, 60.0)
+        arrivals.wait(5)
         arrivals.close()
         assert arrivals.ended
         with pytest.raises(InputError, match="broken"):
             arrivals.source()
+
+    def test_failure_that_passes_is_none(self) -> None:
+        looks = [0]
+
+        def look() -> Arrived:
+            looks[0] += 1
+            if looks[0] == 2:
+                raise InputError("the file before is not complete yet")
+            return Arrived(source_of(np.zeros((min(looks[0], 3), 4, 8), np.uint8)), 3)
+
+        arrivals = Arrivals(look, None, 60.0)
+        while not arrivals.ended:
+            arrivals.wait(5)
+        arrivals.close()
+        assert (arrivals.source() is not None, arrivals.n_frames) == (True, 3)
 
     def test_times_of_arrival_do_not_fill_the_memory(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("photonpano.pipeline.following.arrivals._MOST_MARKS", 10)

@@ -1,0 +1,112 @@
+"""What a run does with the frames that have arrived, and how far behind it is."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+
+from photonpano.context import Context
+from photonpano.errors import PhotonpanoError
+from photonpano.pipeline.following.arrivals import Arrivals
+from photonpano.pipeline.following.delays import Delays
+from photonpano.pipeline.following.located import LocatedSoFar, Window
+from photonpano.pipeline.following.reading import ArrivedFrames
+from photonpano.report import LiveFigures
+from photonpano.specs.plan import Plan
+
+logger = logging.getLogger(__name__)
+
+_RATE_S = 3.0
+"""The rate of arrival is that of the last seconds."""
+_FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
+"""If frames wait for longer, so long after the first were located, they come faster than they are located."""
+
+
+class LiveRun:
+    """Locates frames as they arrive."""
+
+    def __init__(self, plan: Plan, arrivals: Arrivals, context: Context) -> None:
+        self._arrivals, self._delays = arrivals, Delays()
+        self._reading, self._located = ArrivedFrames(plan), LocatedSoFar(plan, context)
+        self._first_located: float | None = None
+        self._failure = ""
+        self._rates: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
+
+    def next_window(self, *, last: bool) -> Window | None:
+        """Locate the next frames; None if too few have come, or they cannot be located.
+
+        What goes wrong while frames are located ends that with a warning, and not the run: the frames still come.
+
+        Args:
+            last: whether no more frames come.
+
+        Raises:
+            InputError: what arrives is no capture.
+            PluginError: the source broke its contract.
+            SpecError: a stage does not suit the capture.
+        """
+        arrived = self._arrivals.source()
+        if arrived is None or self._failure:
+            return None
+        source, window = self._reading.of(arrived, self._arrivals.promised), None
+        try:
+            window = self._located.next_window(source, last=last)
+        except PhotonpanoError as error:
+            self._failure = f"frames are no longer located as they arrive: {error}"
+            logger.warning(self._failure)
+        now = time.monotonic()
+        waited = self._arrivals.waited(self._located.n_frames, now)
+        if window is not None:
+            self._first_located = self._first_located or now
+            for n_frames, seconds in waited:
+                self._delays.add(n_frames, seconds)
+        return window
+
+    def figures(self) -> LiveFigures:
+        """Return how far the run is."""
+        now, n_frames, delays = time.monotonic(), self._arrivals.n_frames, self._delays
+        return LiveFigures(
+            state="following" if n_frames else "waiting",
+            frames=n_frames,
+            promised=self._arrivals.promised,
+            located=delays.n_frames,
+            behind_frames=n_frames - self._located.n_frames,
+            behind_s=self._arrivals.oldest(now),
+            frames_per_s=self._rate(now, n_frames),
+            delay_mean_s=delays.mean,
+            delay_95_s=delays.quantile(0.95),
+            delay_longest_s=delays.longest,
+            message=self._failure or self._located.problem,
+        )
+
+    @property
+    def is_too_slow(self) -> bool:
+        """Whether frames come faster than they are located."""
+        now = time.monotonic()
+        started = self._first_located is not None and now - self._first_located > _STARTED_S
+        return started and not self._failure and self._arrivals.oldest(now) > _FAR_BEHIND_S
+
+    def _rate(self, now: float, n_frames: int) -> float:
+        """Return the frames a second of the last seconds."""
+        if now - self._rates[-1][0] > _RATE_S / 10:
+            self._rates.append((now, n_frames))
+        while len(self._rates) > 2 and now - self._rates[1][0] > _RATE_S:
+            self._rates.popleft()
+        since, before = self._rates[0]
+        return (n_frames - before) / max(now - since, 1e-6)
+
+
+class Every:
+    """Says when something is due that is done every so many seconds."""
+
+    def __init__(self, seconds: float, *, at_once: bool = True) -> None:
+        self._seconds = seconds
+        self._next = time.monotonic() + (0.0 if at_once else seconds)
+
+    def due(self) -> bool:
+        """Return whether it is due now; then it is due again after that time."""
+        if (now := time.monotonic()) < self._next:
+            return False
+        self._next = now + self._seconds
+        return True
