@@ -187,7 +187,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         large = simulate(folder, (254, 496))
-        for rate in (1000, 3000, 0):
+        for rate in (1000, 3000, 5000, 0):
             lines.append(row("254x496", rate, follow(folder, large, rate, given.frames)))
             print(lines[-1], flush=True)
         lines += ["", compared(folder, large, SIMULATED)]
