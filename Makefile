@@ -55,7 +55,8 @@ demo: $(RUNS)
 
 docs: $(COMPLETE)
 	$(STEP) 'the site'
-	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -c docs/site -d site/pages . site/html
+	@# fresh, as a page that was read before is not read again, and its dead links are not found
+	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto --fresh-env -c docs/site -d site/pages . site/html
 	$(STEP) 'done; look at $(CURDIR)/site/html/index.html'
 
 bench: $(COMPLETE)

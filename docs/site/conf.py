@@ -27,7 +27,14 @@ version = release = photonpano.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 
 root_doc = "README"
-include_patterns = ["README.md", "docs/README.md", "docs/**/*.md", "docs/**/*.ipynb", "docs/site/*.rst", "examples/*/README.md"]
+include_patterns = [
+    "README.md",
+    "docs/README.md",
+    "docs/**/*.md",
+    "docs/**/*.ipynb",
+    "docs/site/*.rst",
+    "examples/**/README.md",
+]
 exclude_patterns = ["**/runs/**"]
 myst_heading_anchors = 4  # as a git host
 nb_execution_mode = "off"  # it is saved with its output
@@ -60,7 +67,7 @@ def sections() -> Iterator[tuple[str, list[str]]]:
 
 def contents() -> Iterator[str]:
     """Yield the tables of contents, which the home page does not show."""
-    examples = sorted(path.with_suffix("").relative_to(ROOT).as_posix() for path in ROOT.glob("examples/*/README.md"))
+    examples = sorted(path.with_suffix("").relative_to(ROOT).as_posix() for path in ROOT.glob("examples/**/README.md"))
     yield toctree("Overview", ["docs/README", "docs/site/gallery"])
     for caption, pages in sections():
         yield toctree(caption, pages)
@@ -96,7 +103,9 @@ def complete(app: Sphinx, name: str, text: list[str]) -> None:
 
 def as_text(app: Sphinx, kind: str, name: str, documented: object, options: object, lines: list[str]) -> None:
     """Make reStructuredText of a docstring: backticks mark code, and no other character has a meaning."""
-    del app, kind, name, documented, options
+    del app, name, documented, options
+    if kind == "property" and lines:
+        lines[0] = lines[0].replace(": ", " \N{EN DASH} ")  # what stands before a colon would become its type
     parts = FENCE.split("\n".join(lines))  # text, indent, language, code, text, ...
     blocks = (
         f"{indent}.. code-block:: {language}\n\n{textwrap.indent(code, '    ')}\n"
