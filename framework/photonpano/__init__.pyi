@@ -5,6 +5,8 @@ from .api.capture_info import info as info
 from .api.captures import WrittenCapture as WrittenCapture
 from .api.captures import convert as convert
 from .api.captures import simulate as simulate
+from .api.comparison import Comparison as Comparison
+from .api.comparison import compare as compare
 from .api.dark_counts import DarkMeasurement as DarkMeasurement
 from .api.dark_counts import dark as dark
 from .api.explanation import explain as explain

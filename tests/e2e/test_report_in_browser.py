@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from photonpano import compare
 from photonpano.pipeline.run import RunResult
 
 BRIGHTNESS = """(() => {
@@ -186,6 +188,24 @@ def test_page_without_script_shows_its_pictures(browser_page: Any, report: Path)
     assert page.run("document.querySelector('#viewer img').getBoundingClientRect().height") > 50
     assert page.run("document.querySelectorAll('canvas, #before-and-after, button').length") == 0
     assert page.run("document.querySelectorAll('svg').length") >= 6
+
+
+def test_panoramas_of_runs_blink(browser_page: Any, small_run: RunResult, tmp_path: Path) -> None:
+    shutil.copytree(small_run.directory, tmp_path / "again")
+    page, opened = compare([small_run.directory, tmp_path / "again"], tmp_path / "page.html").page, browser_page
+    opened.open(page, 400)
+    shown = "[...document.querySelectorAll('#blink figure')].map((each) => each.getBoundingClientRect().height > 0)"
+    assert opened.run(shown) == [True, False]
+    opened.run("document.querySelectorAll('.row button')[2].click()")
+    assert opened.run(shown) == [False, True]
+    opened.run("document.querySelectorAll('.row button')[0].click()")
+    opened.wait_for(f"{shown}[0]")
+    opened.wait_for(f"{shown}[1]")
+    assert opened.run("document.documentElement.scrollWidth") == 400
+    assert (opened.messages, opened.requests) == ([], [])
+    opened.open(page, script=False)
+    opened.call("Emulation.setScriptExecutionDisabled", value=False)
+    assert opened.run(shown) == [True, True]
 
 
 def test_links_lead_to_files(opened: Any, report: Path) -> None:

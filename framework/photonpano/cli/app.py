@@ -11,6 +11,7 @@ from photonpano.cli.check import check
 from photonpano.cli.check_run import check_run
 from photonpano.cli.clean import clean
 from photonpano.cli.command import Command
+from photonpano.cli.compare import compare
 from photonpano.cli.convert import convert
 from photonpano.cli.dark import dark
 from photonpano.cli.ending import end_on_signals, leave
@@ -52,7 +53,7 @@ app = typer.Typer(
 )
 _COMMANDS = (
     *(run, batch, check, check_run, verify, render, video, explain, info, preview),
-    *(convert, export, simulate, dark, evaluate, clean, schema, warm_up),
+    *(convert, export, simulate, dark, evaluate, compare, clean, schema, warm_up),
 )
 for command in _COMMANDS:
     app.command(cls=Command)(command)

@@ -1,4 +1,6 @@
 from .batch_page import render_batch as render_batch
+from .comparison_page import ComparedRun as ComparedRun
+from .comparison_page import render_comparison as render_comparison
 from .drawing import loading_figures as loading_figures
 from .failure_page import render_failure as render_failure
 from .live_page import LiveFigures as LiveFigures

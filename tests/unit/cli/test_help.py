@@ -57,6 +57,7 @@ def test_commands_are_complete() -> None:
         "simulate",
         "dark",
         "evaluate",
+        "compare",
         "clean",
         "schema",
         "warm-up",

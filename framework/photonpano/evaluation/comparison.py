@@ -1,0 +1,77 @@
+"""Compare runs of one capture: how far their motions differ, and their panoramas on one canvas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.evaluation.inputs import RunTrajectory
+from photonpano.evaluation.rotations import turned_alignment
+from photonpano.evaluation.trajectory import corner_errors
+from photonpano.geometry import Canvas, inverse, rescaling
+from photonpano.photometry import srgb_to_linear, tone_mapped
+from photonpano.values import FloatArray, Homography
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionDifference:
+    """How far a motion is from another one of the same frames.
+
+    Attributes:
+        corners_px: (T,) mean distance of the corners of a frame, in px of a frame; NaN where either motion has not located it.
+        alignment: (3, 3), pixels of the reference plane to pixels of that of the other motion.
+    """
+
+    corners_px: FloatArray
+    alignment: Homography
+
+
+def motion_difference(run: RunTrajectory, other: RunTrajectory) -> MotionDifference | None:
+    """Compare two motions after the best alignment of their planes; None if no frame is located in both.
+
+    Args:
+        run: the motion.
+        other: the one that it is compared with; of the same frames.
+    """
+    both = run.located & other.located
+    if not both.any():
+        return None
+    start = None
+    if run.turn is not None and other.turn is not None:
+        start = turned_alignment(run.turn, other.turn, other.homographies, both)
+    score = corner_errors(run.homographies, other.homographies, run.frame_shape, both, start)
+    return MotionDifference(np.where(both, score.errors_px, np.nan), score.alignment)
+
+
+def on_canvas(
+    picture: NDArray[np.uint8], canvas: Canvas, alignment: Homography, common: Canvas, whites: tuple[float, float] | None
+) -> NDArray[np.uint8]:
+    """Return a panorama's picture on the canvas of another one.
+
+    Args:
+        picture: (h, w) or (h, w, 3), the panorama, which may be smaller than its canvas.
+        canvas: of the panorama.
+        alignment: (3, 3), pixels of its reference plane to pixels of that of the common canvas.
+        common: the canvas.
+        whites: flux that is white in the picture, and in the result; None keeps the levels.
+    """
+    (p, s), (q, r) = common.columns(), common.rows()
+    rays = np.stack([np.outer(r, p), np.broadcast_to(q[:, None], common.shape), np.outer(r, s)], axis=-1)
+    to_rays = canvas.plane_to_rays @ inverse(alignment) @ np.linalg.inv(common.plane_to_rays)
+    places = canvas.pixels(rays @ to_rays.T).astype(np.float32)
+    reduction = np.array([canvas.width / picture.shape[1], canvas.height / picture.shape[0]], np.float32)
+    x, y = np.moveaxis((places + 0.5) / reduction - 0.5, -1, 0)
+    moved = cv2.remap(picture, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR)
+    if whites is None:
+        return np.asarray(moved, np.uint8)
+    return tone_mapped(srgb_to_linear(np.asarray(moved, np.float32) / 255) * np.float32(whites[0]), whites[1])
+
+
+def reduced(canvas: Canvas, longest: int) -> Canvas:
+    """Return a canvas whose longer side has at most this many pixels."""
+    factor = max(1.0, max(canvas.shape) / longest)
+    height, width = (max(1, round(side / factor)) for side in canvas.shape)
+    return replace(canvas, height=height, width=width, transform=rescaling(1 / factor) @ canvas.transform)
