@@ -8,11 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 import photonpano.report
+from photonpano import FrameSpan, Group, Panorama, StreamInfo, VirtualExposure
+from photonpano.geometry import Canvas, rescaling, translation
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.report import viewer
+from photonpano.testing import KnownMotion
 
 SCRIPT = Path(photonpano.report.__file__).parent / "templates" / "viewer.js"
 
@@ -93,6 +99,49 @@ def test_shared_instant_is_near_an_exposure_of_each_level(motion):
     assert viewer.shared_instant(motion, levels) == 9000 or viewer.shared_instant(motion, levels) == 1000
     levels[1].located.instants[2] = 5000.0
     assert viewer.shared_instant(motion, levels) == 5000
+
+
+def decoded_picture(uri: str) -> np.ndarray:
+    data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).astype(float)
+
+
+@pytest.mark.parametrize("instant", [10.0, 12.5])
+def test_views_of_an_instant_show_one_place(instant):
+    """A scene that moves by 3 px a frame; the exposure is at half the size of a frame, and of a nearby instant."""
+    scene = cv2.GaussianBlur(np.random.default_rng(0).random((80, 160)), (0, 0), 3).astype(np.float32)
+    scene = (scene - scene.min()) / np.ptp(scene)
+    shape, n_frames, here = (40, 64), 20, 11
+    homographies = np.array([translation(3.0 * k, k) for k in range(n_frames)])
+
+    def seen(place: float, scale: float) -> np.ndarray:
+        size = round(shape[1] * scale), round(shape[0] * scale)
+        to_scene = translation(3.0 * place, place) @ rescaling(1 / scale)
+        return cv2.warpPerspective(scene, to_scene, size, flags=cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR)
+
+    class Source:
+        info = StreamInfo(n_frames, *shape, None)
+        response = panorama_response()
+
+    flux = seen(instant, 0.5)
+    exposure = VirtualExposure(flux, np.ones_like(flux), Group(FrameSpan(0, 20), instant), 0.5, Source.response)
+    level = SimpleNamespace(
+        level=SimpleNamespace(number=1),
+        located=SimpleNamespace(instants=np.array([instant]), solution=SimpleNamespace(located=np.array([True]))),
+        exposures=SimpleNamespace(merged=lambda _: exposure),
+    )
+    located, trajectory = np.ones(n_frames, bool), KnownMotion(lambda k: translation(3.0 * k, k))
+    motion = FrameMotion(trajectory, FrameSpan(0, n_frames), homographies, located, np.zeros(n_frames), 0, shape)
+    canvas = Canvas(80, 160, np.eye(3))
+    whole = Panorama(scene, np.ones_like(scene), np.eye(3))
+    rendered = RenderedPanorama(canvas, whole, 1, np.zeros((80, 160), np.uint8), 1.0, 1.0, 0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(viewer, "still_exposure", lambda _, span: seen(span.start, 1.0))
+        views = viewer.views_of_instant(here, motion, rendered, Source, [level])
+    assert [view["name"] for view in views] == ["One frame", "Plain average", "Level 1", "Panorama"]
+    frame, _, level_view, panorama = (decoded_picture(view["uri"])[8:-8, 8:-8] for view in views)
+    assert np.corrcoef(frame.ravel(), panorama.ravel())[0, 1] > 0.97
+    assert np.corrcoef(level_view.ravel(), panorama.ravel())[0, 1] > 0.97
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
