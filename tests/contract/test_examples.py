@@ -25,6 +25,8 @@ SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "
 SMALL_STREET = SMALL | {"source.with.scene": "{kind: street, width: 1024, height: 682}"}
 GROUPS = {"resample.with.group_size": 50}
 UNREFINED = GROUPS | {"refine": "[]"}
+SHORT = UNREFINED | {"levels": 2}
+"""For specs that leave the number of levels to its default: 3 show no more than 2."""
 SMALL_NIGHT = {
     "source.with.n_frames": 600,
     "source.with.frame_shape": "[128, 160]",
@@ -45,31 +47,31 @@ CAPTURES = {
 """Specs to simulate, with overrides that make them small. The group size is checked, though it is not used."""
 RUNS: dict[str, dict[str, Any]] = {
     "scan": GROUPS,
-    "naive-average": UNREFINED,
-    "constant-groups": UNREFINED,
-    "sliding-window": UNREFINED,
-    "super-resolution": UNREFINED,
+    "naive-average": SHORT,
+    "constant-groups": SHORT,
+    "sliding-window": SHORT,
+    "super-resolution": SHORT,
     "gradual-super-resolution": UNREFINED,
     "coarse-to-fine": UNREFINED,
-    "keypoints": UNREFINED,
-    "orb": UNREFINED,
-    "ecc": UNREFINED,
+    "keypoints": SHORT,
+    "orb": SHORT,
+    "ecc": SHORT,
     "translation": UNREFINED,
     "smoothing-spline": GROUPS,
     "fallback": UNREFINED,
     "kornia": UNREFINED,
-    "chain": UNREFINED,
-    "colmap": UNREFINED,
+    "chain": SHORT,
+    "colmap": SHORT,
     "demo": GROUPS,
     "swissspad": UNREFINED | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
-    "sums": UNREFINED | {"resample.with.group_size": 25},
-    "visionsim": UNREFINED,
-    "zarr": UNREFINED | {"resample.with.group_size": 50},
-    "vanvleck": UNREFINED | {"resample.with.group_size": 50},
-    "cluster": UNREFINED | {"levels": 2},
-    "dark-scene": SMALL_STREET | {"source.with.flux": 0.2, "resample.with.group_size": 60},
-    "hot-pixels": SMALL_STREET | {"source.with.flux": 0.5, "resample.with.group_size": 60},
-    "colour": SMALL_STREET | UNREFINED | {"resample.with.group_size": 60},
+    "sums": SHORT | {"resample.with.group_size": 25},
+    "visionsim": SHORT,
+    "zarr": SHORT,
+    "vanvleck": SHORT,
+    "cluster": SHORT,
+    "dark-scene": SMALL_STREET | {"levels": 2, "source.with.flux": 0.2, "resample.with.group_size": 60},
+    "hot-pixels": SMALL_STREET | {"levels": 2, "source.with.flux": 0.5, "resample.with.group_size": 60},
+    "colour": SMALL_STREET | SHORT | {"resample.with.group_size": 60},
     "changing-light": SMALL_STREET
     | UNREFINED
     | {"source.with.n_frames": 400, "source.with.frame_shape": "[64, 96]", "source.with.frame_rate_hz": 5000, "levels": 2},
@@ -77,7 +79,7 @@ RUNS: dict[str, dict[str, Any]] = {
     | UNREFINED
     | {"source.with.frame_shape": "[64, 96]", "resample.with.group_size": 60, "levels": 2},
     "burst": SMALL_STREET | UNREFINED | {"source.with.frame_shape": "[64, 96]", "resample.with.group_size": 60, "levels": 2},
-    "splat": SMALL_STREET | UNREFINED | {"source.with.flux": 0.2, "resample.with.group_size": 60},
+    "splat": SMALL_STREET | SHORT | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}
     | {"source.with.flux": 0.5, "resample.with.group_size": 25, "graph.skips": "[1, 2]"},

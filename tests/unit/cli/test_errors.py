@@ -190,16 +190,20 @@ def test_defects_keep_their_traceback() -> None:
         _ = 1 / 0
 
 
-def heed_interrupts() -> None:
-    """Restore SIGINT, which shells disable in their background jobs."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def heed_signals() -> None:
+    """Restore what shells disable in their background jobs, and `nohup` in all."""
+    for each in SIGNALS:
+        signal.signal(each, signal.SIG_DFL)
+
+
+@pytest.mark.parametrize("sent", SIGNALS)
 def test_interrupted_command_leaves_no_file(folder: Path, program: list[str], sent: signal.Signals) -> None:
     command = [*program, "simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=100000"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, cwd=folder, text=True, preexec_fn=heed_interrupts, **pipes) as process:
+    with subprocess.Popen(command, cwd=folder, text=True, preexec_fn=heed_signals, **pipes) as process:
         while not list(folder.glob(".cube*")) and process.poll() is None:
             time.sleep(0.02)
         process.send_signal(sent)
