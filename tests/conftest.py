@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import signal
 import sys
@@ -212,6 +213,12 @@ def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
     monkeypatch.setattr("photonpano.pipeline.pose_run.render_pose_report", lambda *_: "<html></html>")
     monkeypatch.setattr("photonpano.pipeline.failed_run.render_failure", lambda *_: "<html></html>")
+
+
+def pytest_collection_finish() -> None:
+    """Leave the tests and all modules out of garbage collection, which would look through them each time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)
