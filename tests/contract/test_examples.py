@@ -263,11 +263,17 @@ def test_example_of_a_real_capture_runs(examples, tmp_path, without_report):
     assert np.polyfit(np.arange(8, 90), turned[8:90], 1)[0] == pytest.approx(3.71, abs=0.05)
 
 
-@pytest.mark.parametrize(("name", "pictures", "std"), [("poses", 16, 0.02), ("stratified-poses", 0, 0.005)])
-def test_example_of_poses_runs(examples, tmp_path, without_report, name, pictures, std):
+@pytest.mark.parametrize(
+    ("name", "n_frames", "small", "pictures", "std"),
+    [
+        ("poses", 480, {}, 16, 0.02),
+        ("stratified-poses", 240, {"source.with.n_frames": 240, "pose.with.group_size": 20}, 0, 0.01),
+    ],
+)
+def test_example_of_poses_runs(examples, tmp_path, without_report, name, n_frames, small, pictures, std):
     pytest.importorskip(NEEDS[name])
-    printed = photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run")
-    assert "located   480 of 480 frames" in printed
+    printed = photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **small)
+    assert f"located   {n_frames} of {n_frames} frames" in printed
     assert len(list((tmp_path / "run" / "images").glob("*.png"))) == pictures
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["poses"]["std_position"] < std
