@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -163,5 +164,5 @@ def _name(place: Location) -> str:
     else:
         whole = place.absolute()
         if place.is_dir():
-            return whole.name
+            return Path(os.path.normpath(whole)).name  # a folder that is given as `..` has a name as well
     return Path(whole.stem).stem if whole.suffix in _COMPRESSED else whole.stem

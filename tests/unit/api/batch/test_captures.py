@@ -59,6 +59,11 @@ def test_captures_are_named_after_their_files(find: Find, given: list[str], name
     assert list(find(*given)) == list(named)
 
 
+def test_folder_that_is_given_by_dots_has_a_name(find: Find) -> None:
+    Path("bins/frames").mkdir()
+    assert list(find("bins/frames/..")) == ["bins"]
+
+
 def test_file_whose_name_is_a_pattern_is_that_file(find: Find) -> None:
     Path("day/[ab].npy").touch()
     assert list(find("day/[ab].npy")) == ["[ab]"]
