@@ -42,7 +42,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     """Let runs have a result, or an error, without running."""
 
     def found(result: Any) -> None:
-        def run(plan: Any, **options: Any) -> Any:
+        def run(plan: Any, *_: Any, **options: Any) -> Any:
             if isinstance(result, Exception):
                 raise result
             return result
