@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft, optimize
 
 from photonpano.context import Context
-from photonpano.errors import LocationError
+from photonpano.errors import InputError, LocationError
 from photonpano.geometry import apply, corners
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.velocity import Velocity, mean_shift
@@ -87,6 +87,7 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
     that double until one holds the whole capture.
 
     Raises:
+        InputError: the capture has fewer than 8 frames.
         LocationError: no velocity stands out, what stands out stands still, or the velocity changes.
     """
     varying, seen, n_frames = _residuals(source, context)
@@ -135,12 +136,12 @@ def _residuals(source: Source, context: Context) -> tuple[Images, Images, int]:
     What stands still, such as hot pixels and the light on the scene, is subtracted in proportion to the brightness of a span.
 
     Raises:
-        LocationError: there are too few frames.
+        InputError: there are too few frames.
     """
     n_frames = -(-source.info.n_frames // _SPANS)
     spans = [FrameSpan(start, start + n_frames) for start in range(0, source.info.n_frames - n_frames + 1, n_frames)]
     if len(spans) < _FEWEST_SPANS:
-        raise LocationError(
+        raise InputError(
             f"motion.start: {len(spans)} frames are too few to find a constant velocity; at least {_FEWEST_SPANS} are needed"
         )
     means = np.stack(list(context.in_order(partial(binned_mean, source), spans)))

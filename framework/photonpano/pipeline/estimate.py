@@ -70,7 +70,7 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         context: threads, progress and checkpoints.
 
     Raises:
-        InputError: all frames are copies of the first one, or the camera of the spec has other frames.
+        InputError: all frames are copies of the first one, or too few for the start, or the camera has other frames.
         LocationError: the motion could not be estimated.
         CanvasTooLargeError: the panorama would be far larger than the memory.
         PluginError: a component failed in its own way, or broke its contract.
@@ -238,6 +238,7 @@ def start_of(
     """Return the motion with which the first level starts; None if nothing is known of it.
 
     Raises:
+        InputError: the capture has too few frames to find one.
         LocationError: the spec asks for a constant velocity, and none was found.
     """
     if plan.motion.start == "none":
