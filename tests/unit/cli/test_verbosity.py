@@ -108,7 +108,7 @@ def test_full_disk_ends_log_and_not_the_command(invoke: Callable[..., Any]) -> N
     ("words", "expected"),
     [
         ("photonpano check-", "check-run"),
-        ("photonpano info --source pack", "packed-npy"),
+        ("photonpano info --source packed-n", "packed-npy"),
         ("photonpano run --keep", "--keep-work"),
     ],
     ids=["command", "component", "option"],
