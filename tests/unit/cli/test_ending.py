@@ -18,6 +18,7 @@ import ctypes, hashlib, itertools, threading, time
 from pathlib import Path
 from photonpano.atomic import atomic_path
 from photonpano.cli.app import app, main
+from photonpano.cli.command import Command
 from photonpano.folders import staging_of
 from photonpano.threads import thread_pool
 
@@ -28,7 +29,7 @@ def swallow():
         except KeyboardInterrupt:
             pass
 
-@app.command()
+@app.command(cls=Command)
 def work():
     with atomic_path(Path("cube.npy")), staging_of(Path("run").absolute()) as folder:
         (folder / "run.json").write_text("{}")
