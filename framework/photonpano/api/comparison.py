@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano.atomic import atomic_path
 from photonpano.captures.writing import truth_path
-from photonpano.errors import InputError
+from photonpano.errors import InputError, OutputError
 from photonpano.evaluation import evaluate, load_run_trajectory, motion_difference, on_canvas, reduced
 from photonpano.evaluation.inputs import RunTrajectory
 from photonpano.record.contents import require_one_run
@@ -33,7 +33,7 @@ class Comparison:
         page: the page.
         runs: names of the runs, as the page has them.
         mean_difference_px: for each run, how far the corners of its frames are on average from where the first run has them, in
-            px of a frame, after the best alignment of the planes; None for the first run.
+            px of a frame, after the best alignment of the planes; 0 for the same motion, and None for the first run.
     """
 
     page: Path
@@ -48,15 +48,17 @@ def compare(runs: Sequence[Path | str], output: Path | str = "compare.html", tru
 
     Args:
         runs: at least two run folders.
-        output: the page; one that is there is replaced.
+        output: the page, whose name ends in .html; one that is there is replaced.
         truth: the `.truth.npz` of a simulated capture, for scores; by default the one beside the capture, if it is there.
 
     Raises:
         InputError: a folder is no run with a panorama, the runs are of different captures, or two of them located no frame in
             common; or the truth is that of another capture.
-        OutputError: the page cannot be written.
+        OutputError: the page cannot be written, or its name has another ending.
     """
-    folders = [Path(run) for run in runs]
+    folders, page = [Path(run) for run in runs], Path(output)
+    if page.suffix != ".html":  # so that no file of another kind is replaced by mistake
+        raise OutputError(f"cannot write {output}: the page is HTML; choose a name that ends in .html")
     if len({folder.absolute().resolve() for folder in folders}) < max(2, len(folders)):
         raise InputError("a comparison needs at least two different run folders")
     records = [_record(folder) for folder in folders]
@@ -64,7 +66,6 @@ def compare(runs: Sequence[Path | str], output: Path | str = "compare.html", tru
     for folder, record, motion in zip(folders[1:], records[1:], motions[1:], strict=True):
         _require_same_capture((folders[0], records[0], motions[0]), (folder, record, motion))
     names = _names(folders)
-    page = Path(output)
     compared = _compared(folders, records, motions, names, _truth(truth, records[0]))
     with atomic_path(page) as temporary:
         temporary.write_text(render_comparison(compared, page), encoding="utf-8")

@@ -34,8 +34,12 @@ def compare(
 
     found = compare_runs(runs, output, truth)
     rows = [
-        [name, "the motion to compare with" if mean is None else f"{mean:.3g} px from it on average"]
+        [name, "the motion to compare with" if mean is None else _difference(mean)]
         for name, mean in zip(found.runs, found.mean_difference_px, strict=True)
     ]
     typer.echo(columns(rows))
     typer.echo(f"page  {found.page.resolve()}")
+
+
+def _difference(mean_px: float) -> str:
+    return f"{mean_px:.3g} px from it on average" if mean_px else "the same motion"

@@ -15,13 +15,17 @@ from photonpano.geometry import Canvas, inverse, rescaling
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano.values import FloatArray, Homography
 
+_ROUNDING_PX = 1e-6
+"""Smaller differences come from rounding: motions that are the same differ by 1e-14 px."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionDifference:
     """How far a motion is from another one of the same frames.
 
     Attributes:
-        corners_px: (T,) mean distance of the corners of a frame, in px of a frame; NaN where either motion has not located it.
+        corners_px: (T,) mean distance of the corners of a frame, in px of a frame; 0 for the same motion, NaN where either
+            has not located it.
         alignment: (3, 3), pixels of the reference plane to pixels of that of the other motion.
     """
 
@@ -43,7 +47,8 @@ def motion_difference(run: RunTrajectory, other: RunTrajectory) -> MotionDiffere
     if run.turn is not None and other.turn is not None:
         start = turned_alignment(run.turn, other.turn, other.homographies, both)
     score = corner_errors(run.homographies, other.homographies, run.frame_shape, both, start)
-    return MotionDifference(np.where(both, score.errors_px, np.nan), score.alignment)
+    errors = np.where(score.errors_px < _ROUNDING_PX, 0.0, score.errors_px)
+    return MotionDifference(np.where(both, errors, np.nan), score.alignment)
 
 
 def on_canvas(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.record.schema import RunRecord
+from photonpano.registry.description import flow
 from photonpano.report.drawing import INK, SERIES, WIDTH_IN, Margins, add_axes, jpeg_uri, plain_figure, svg_of
 from photonpano.report.environment import environment_of
 from photonpano.report.figures import instants_of
@@ -77,7 +78,7 @@ def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
             rows=_rows(runs),
             settings=shown,
             more_settings=hidden,
-            differences=differences_over_time(runs),
+            differences=differences_over_time(runs) if any(run.mean_difference_px for run in runs) else None,
         )
     )
     return page
@@ -85,6 +86,8 @@ def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
 
 def differences_over_time(runs: Sequence[ComparedRun]) -> str:
     """Draw how far the motion of each run is from that of the first, frame by frame."""
+    from matplotlib.ticker import LogLocator
+
     others = [run for run in runs if run.difference_px is not None]
     with plain_figure(WIDTH_IN, 3.0) as figure:
         [axes] = add_axes(figure, Margins(right=0.3, top=0.4))
@@ -94,6 +97,8 @@ def differences_over_time(runs: Sequence[ComparedRun]) -> str:
             axes.plot(frames, run.difference_px[frames], color=colour, label=run.name)
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axes.yaxis.set_minor_formatter("{x:g}")
         axes.set_ylabel("difference (px)")
         axes.set_xlabel("frame")
         axes.xaxis.set_major_formatter("{x:,.0f}")
@@ -125,7 +130,7 @@ def _rows(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
         row("corner error (px)", lambda run: run.corner_error_px, pixels),
         row("PSNR (dB)", lambda run: run.psnr_db, "{:.2f}".format),
         row("SSIM", lambda run: run.ssim, "{:.4f}".format),
-        row("motion from that of the first run (px)", lambda run: run.mean_difference_px, pixels),
+        row("difference of the motion (px)", lambda run: run.mean_difference_px, pixels),
         row("verdict", part("verdict", "status"), str),
         row("expected error (px)", part("motion", "std_px"), pixels),
         row("scatter of short spans (noise = 1)", part("verdict", "residual_ratio"), pixels),
@@ -161,4 +166,4 @@ def _flattened(value: Any, path: str = "") -> list[tuple[str, str]]:
         return [pair for key, each in value.items() for pair in _flattened(each, f"{path}.{key}" if path else str(key))]
     if isinstance(value, list | tuple) and any(isinstance(each, Mapping) for each in value):
         return [pair for number, each in enumerate(value, 1) for pair in _flattened(each, f"{path}[{number}]")]
-    return [(path, str(value))]
+    return [(path, flow(value))]

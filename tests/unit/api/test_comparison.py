@@ -86,6 +86,25 @@ def test_page_that_cannot_be_written_is_an_error(small_run: RunResult, once: Pat
         compare([small_run.directory, once], tmp_path / "nowhere" / "page.html")
 
 
+def test_file_of_another_kind_is_not_replaced(small_run: RunResult, once: Path, tmp_path: Path) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("precious", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"notes\.txt: the page is HTML; choose a name that ends in \.html"):
+        compare([small_run.directory, once], notes)
+    assert notes.read_text(encoding="utf-8") == "precious"
+
+
+def test_same_motions_are_said_to_be_the_same(small_run: RunResult, tmp_path: Path) -> None:
+    record = small_run.record
+    spec = {**record["spec"], "output": {**record["spec"]["output"], "keep": "exposures"}}
+    copy = changed(small_run.directory, tmp_path / "copy", spec=spec)
+    found = compare([small_run.directory, copy], tmp_path / "page.html")
+    page = found.page.read_text(encoding="utf-8")
+    assert found.mean_difference_px == (None, 0.0)
+    assert "All runs have the same motion." in page
+    assert re.findall(r'<td data-name="(?:small|copy)">(null|exposures)</td>', page) == ["null", "exposures"]
+
+
 def motion_of(homographies: np.ndarray, located: np.ndarray) -> RunTrajectory:
     return RunTrajectory(homographies, np.eye(3), (40, 60), located, np.zeros(len(homographies)))
 
