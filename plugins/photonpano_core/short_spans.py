@@ -86,8 +86,8 @@ class ShortSpansRefiner:
         if not len(cycles):
             return ""
         if self._rate is None:
-            return f", mostly with periods of {', '.join(f'{1 / each:.0f}' for each in cycles)} frames"
-        return f", mostly at {', '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
+            return f", mostly with periods of {' and '.join(f'{1 / each:.0f}' for each in cycles)} frames"
+        return f", mostly at {' and '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
 
 
 def _variances(information: FloatArray) -> FloatArray:

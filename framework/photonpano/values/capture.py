@@ -69,7 +69,8 @@ class StreamInfo:
             InputError: the span reaches beyond the last frame.
         """
         if span.stop > self.n_frames:
-            raise InputError(f"{span} were requested, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")
+            were = "was" if len(span) == 1 else "were"
+            raise InputError(f"{span} {were} requested, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ class FrameSpan:
         return self.stop - self.start
 
     def __str__(self) -> str:
-        return f"frames {self.start} to {self.stop - 1}"
+        return f"frames {self.start} to {self.stop - 1}" if len(self) > 1 else f"frame {self.start}"
 
     def blocks(self, length: int) -> list[FrameSpan]:
         """Return the span in blocks of `length` frames, of which the last may be shorter."""

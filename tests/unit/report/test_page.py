@@ -266,14 +266,24 @@ def test_page_says_verdict_in_words(record, explained, panorama, no_figures):
     assert f"{words} as much as noise does. {expected}" in text_of(render_report(record, explained, panorama))
 
 
+def test_page_lists_a_folder_once(record, explained, panorama, no_figures):
+    names = [f"exposures/level-1-{k:04d}.png" for k in range(4000)] + ["colmap/0/images.txt"]
+    record["files"] = {name: {"bytes": 1024, "sha256": "0" * 64} for name in names}
+    page = render_report(record, explained, panorama)
+    links = [element.attrib["href"] for element in ElementTree.fromstring(page).iter("a")]
+    assert links == ["./exposures/", "./run.json", "./colmap/"]
+    assert "exposures/ 3.91 MiB 4,000 files: the exposures of each level, linear flux and pictures" in text_of(page)
+    assert "colmap/ 1 KiB 1 file" in text_of(page)
+
+
 def test_page_links_files_of_the_run(record, explained, panorama, no_figures):
-    names = ["strange #1?.txt", "panorama.tiff", "report.html", *(f"images/{k:02d}.png" for k in range(40))]
+    names = ["strange #1?.txt", "panorama.tiff", "report.html", *(f"image-{k:02d}.png" for k in range(40))]
     record["files"] = {name: {"bytes": 2048, "sha256": "0" * 64} for name in names}
     page = render_report(record, explained, panorama)
     check_self_contained(page)
     tree = ElementTree.fromstring(page)
     links = [element.attrib["href"] for element in tree.iter("a")]
-    assert links[:3] == ["./panorama.tiff", "./run.json", "./images/00.png"]
+    assert links[:3] == ["./panorama.tiff", "./run.json", "./image-00.png"]
     assert len(links) == 30
     assert "And 13 files more; run.json lists all." in text_of(page)
     record["files"] = {"strange #1?.txt": {"bytes": 5, "sha256": "0" * 64}}

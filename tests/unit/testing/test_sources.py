@@ -187,7 +187,7 @@ BROKEN = [
     (
         "test_source_passes_the_checks_of_a_run",
         CountsInFloat,
-        r"a run refuses the source: it broke its contract at frames 0 to 0: counts\(\) returns an array of whole numbers",
+        r"a run refuses the source: it broke its contract at frame 0: counts\(\) returns an array of whole numbers",
         {},
     ),
     ("test_source_passes_the_checks_of_a_run", CountsTooMuch, r"counts\(\) returns numbers from 0 to 1 for these frames", {}),
@@ -199,7 +199,7 @@ BROKEN = [
     (
         "test_counts_equal_sum_of_frames",
         CountsOneMore,
-        r"for frames 0 to 0, \d+ pixels differ, first the one at row 0",
+        r"for frame 0, \d+ pixels differ, first the one at row 0",
         {},
     ),
     (
