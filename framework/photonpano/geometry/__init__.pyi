@@ -6,6 +6,7 @@ from .canvas import Canvas as Canvas
 from .canvas import Extent as Extent
 from .canvas import canvas_of as canvas_of
 from .canvas import canvas_of_box as canvas_of_box
+from .canvas import depths as depths
 from .frame_trajectory import FrameTrajectory as FrameTrajectory
 from .homographies import apply as apply
 from .homographies import corner_displacements as corner_displacements

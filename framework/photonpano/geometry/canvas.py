@@ -117,6 +117,18 @@ class Canvas:
         return PROJECTIONS[self.projection]
 
 
+def depths(homographies: FloatArray, frame_shape: tuple[int, int], outline: FloatArray | None = None) -> FloatArray:
+    """Return how far points of frames lie before the reference plane, relative to its own frame: (N, P), 0 at its horizon.
+
+    Args:
+        homographies: (N, 3, 3), frame pixels to reference pixels.
+        frame_shape: (height, width) of a frame.
+        outline: (P, 2) points of a frame; by default its corners.
+    """
+    points = corners(frame_shape) if outline is None else outline
+    return np.asarray(homographies[:, 2, :2] @ points.T + homographies[:, 2:, 2])
+
+
 def canvas_of(
     homographies: FloatArray, frame_shape: tuple[int, int], scale: float, outline: FloatArray | None = None
 ) -> Canvas:
@@ -132,7 +144,7 @@ def canvas_of(
         ValueError: a frame reaches the horizon of the reference plane, so that no finite canvas holds it.
     """
     frame = corners(frame_shape) if outline is None else outline
-    depth = (homographies[:, 2:, :2] @ frame.T + homographies[:, 2:, 2:]).min(axis=(1, 2))
+    depth = depths(homographies, frame_shape, frame).min(axis=1)
     if depth.min() <= 0:
         index = int(np.argmin(depth))
         raise ValueError(f"homography {index} of {len(homographies)} sends part of its frame behind the reference plane")

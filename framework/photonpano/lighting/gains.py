@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by
+from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by, depths
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
 from photonpano.protocols import Source, Trajectory, camera_of_motion
@@ -24,6 +24,8 @@ _LARGEST_PX = 32
 _BLUR = 0.75
 """Standard deviation of the Gaussian that weights the pixels of a square, in sides: what it sees must not depend on the
 fraction of a pixel at which a frame lies."""
+_LEAST_DEPTH = 0.25
+"""Of frames before the reference plane, relative to its own frame: squares are at most four times as wide there."""
 _COVERED = 0.999
 """Squares that the border of a frame cuts are left out."""
 _MOST_CELLS = 16_000
@@ -109,11 +111,15 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     Args:
         source: the capture.
         trajectory: its motion, known to a few pixels.
-        spans: so short that the image hardly moves in them.
+        spans: so short that the image hardly moves in them; those that a plane can hardly show are left out.
         context: threads.
     """
     shape = source.info.frame_shape
     motions = trajectory.at([span.centre for span in spans])
+    if camera_of_motion(trajectory) is None:
+        # A first motion may be wrong somewhere. Frames far to the side of the plane would need a canvas without end.
+        near = depths(motions, shape).min(axis=1) > _LEAST_DEPTH
+        spans, motions = [span for span, is_near in zip(spans, near, strict=True) if is_near], motions[near]
     half = int(np.clip(min(shape) // _CELLS, 2, _LARGEST_PX)) // 2
     canvas = _canvas(trajectory, motions, shape, 1 / half)
     while canvas.height * canvas.width > 4 * _MOST_CELLS:

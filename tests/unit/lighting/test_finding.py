@@ -68,6 +68,18 @@ def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None)
         assert "Hz" in decision.reason
 
 
+def test_frames_that_a_wrong_motion_sends_behind_the_plane_do_not_count() -> None:
+    def at(frame: float) -> np.ndarray:
+        found = MOTION.at([frame])[0].copy()
+        if 200 <= frame < 230:
+            found[2, 0] = -0.5
+        return found
+
+    found = find_light(panned(DRIFT), KnownMotion(at), Context(1))
+    assert found is not None
+    assert float(np.sqrt(np.mean((found.gain - DRIFT / DRIFT.mean()) ** 2))) < 0.02
+
+
 def test_lamps_of_two_phases_are_told_apart() -> None:
     scene, rng, shape = Scene(3, (0.1, 0.6)), np.random.default_rng(3), (32, 96)
     motion = KnownMotion(lambda frame: translation(0.03 * float(frame), 0))
