@@ -9,6 +9,7 @@ from photonpano.cli.options import Overrides, Overwrite, SpecPath
 from photonpano.cli.verdict import Strict
 
 if TYPE_CHECKING:
+    from photonpano.pipeline.run import RunResult
     from photonpano.record.schema import PanoramaRecord, RefinementRecord
     from photonpano.report import LiveFigures
 
@@ -45,14 +46,15 @@ def run(
         ),
     ] = False,
     end_after: Annotated[
-        float,
+        float | None,
         typer.Option(
             "--end-after",
             metavar="SECONDS",
             min=0.1,
-            help="With --follow: a growing file is complete when nothing has come for so long.",
+            help="With --follow: a growing file is complete when nothing has come for so long; by default 5.",
+            show_default=False,
         ),
-    ] = 5.0,
+    ] = None,
     strict: Strict = False,
 ) -> None:
     """Make a panorama from a spec.
@@ -63,14 +65,12 @@ def run(
 
     Example: photonpano run scan.yaml --output runs/first --set render.scale=2
     """
-    from photonpano.cli.errors import WrongArgumentError, warn
+    from photonpano.cli.errors import WrongArgumentError
     from photonpano.cli.progress import progress_for_stderr
     from photonpano.cli.verbosity import log_decisions
-    from photonpano.cli.verdict import DoubtfulError, print_verdict, require_trust
-    from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
+    from photonpano.pipeline.run import END_AFTER_S
     from photonpano.pipeline.run import run as run_plan
     from photonpano.specs import load_spec
-    from photonpano.text import counted
 
     if resume and from_level is not None:
         raise WrongArgumentError("--resume and --from-level: give one of them")
@@ -79,6 +79,8 @@ def run(
             "--follow begins a new run, which --resume and --from-level do not; to go on with frames that have arrived, leave "
             "out --follow"
         )
+    if end_after is not None and not follow:
+        raise WrongArgumentError("--end-after says when a capture that is followed is complete; give --follow as well")
     plan = load_spec(spec, overrides or (), output, arriving=follow)
     result = run_plan(
         plan,
@@ -88,10 +90,23 @@ def run(
         from_level=from_level,
         keep_work=keep_work,
         follow=follow,
-        end_after=end_after,
+        end_after=END_AFTER_S if end_after is None else end_after,
     )
+    log_decisions(result.record)
+    _print_result(result)
+    if strict:
+        _require_trust(result)
+
+
+def _print_result(result: "RunResult") -> None:
+    """Print what a run has found, and where its files are."""
+    from photonpano.cli.errors import warn
+    from photonpano.cli.verdict import print_verdict
+    from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
+    from photonpano.pipeline.estimate import START
+    from photonpano.text import counted
+
     record, directory = result.record, result.directory.resolve()
-    log_decisions(record)
     if result.was_finished:
         typer.echo("finished  this run was finished before; nothing was left to do")
     if result.followed is not None:
@@ -101,7 +116,7 @@ def run(
     for warning in record["warnings"]:
         warn(warning)
     for decision in record["decisions"]:
-        if decision["what"] in (CUT, DARK_JUMP, REPEATED):
+        if decision["what"] in (START, CUT, DARK_JUMP, REPEATED):
             typer.echo(f"{decision['what']:<9} {decision['value']}: {decision['reason']}")
     for refinement in record["refinements"]:
         if refinement["rounds"]:
@@ -115,9 +130,19 @@ def run(
         typer.echo(f"panorama  {directory / 'panorama.png'}")
     if "report.html" in record["files"]:
         typer.echo(f"report    {directory / 'report.html'}")
-    if strict and result.verdict is not None:
+
+
+def _require_trust(result: "RunResult") -> None:
+    """Refuse a run that is doubtful.
+
+    Raises:
+        DoubtfulError: its verdict, or that on its poses, is doubtful.
+    """
+    from photonpano.cli.verdict import DoubtfulError, require_trust
+
+    if result.verdict is not None:
         require_trust(result.verdict, "all files of the run folder are written")
-    if strict and poses and poses["doubts"]:
+    if (poses := result.record.get("poses")) and poses["doubts"]:
         raise DoubtfulError("the poses are doubtful, and --strict accepts only trusted ones; all files of the run are written")
 
 

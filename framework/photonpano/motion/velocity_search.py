@@ -44,6 +44,7 @@ _STEADY = 0.8
 """Contrast over its noise falls to 0.71 when windows double, if the photons of their halves do not fit together at all."""
 _LEAST_PX = 1.0
 """What moves by less over the whole capture, in binned pixels, stands still."""
+_WITHOUT = "; if the velocity is not constant, leave out motion.start"
 
 Images = NDArray[np.float32]
 
@@ -98,13 +99,13 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
         raise LocationError(
             "motion.start: no constant velocity stands out from photon noise: the sharpest sum of photons is "
             f"{significance:.2g} standard deviations above those along other velocities, and {_SIGNIFICANT:g} are needed; "
-            "the scene may stand still or change its speed, or the capture is too dark or too short"
+            f"the scene may stand still or change its speed, or the capture is too dark or too short{_WITHOUT}"
         )
     whole = _Contrast(images, len(images))
     if whole.moved_px(velocity) < _LEAST_PX:
         raise LocationError(
             "motion.start: what varies over time stays at its place in the frame, and so shows no motion; "
-            "if it is a lamp or a reflection, mask it (corrections: mask)"
+            f"if it is a lamp or a reflection, mask it (corrections: mask){_WITHOUT}"
         )
     size, before = min(4 * _LAGS, len(images)), -np.inf
     while True:
@@ -113,7 +114,8 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
         if (height := contrast.height(velocity)) < _STEADY * before:
             raise LocationError(
                 f"motion.start: the image does not move at a constant velocity: photons of {size * n_frames} frames fit "
-                "together less well than those of half as many; take a shorter part of the capture (source: with: frames)"
+                "together less well than those of half as many; take a shorter part of the capture "
+                f"(source: with: frames){_WITHOUT}"
             )
         if size == len(images):
             break

@@ -33,6 +33,8 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
+START = "start"
+"""The decision on a motion that is known before the first level."""
 _EXPLAINED = 0.9
 """Light that lowers the misfit of the photons by this factor, or more, is there."""
 
@@ -249,7 +251,7 @@ def start_of(
         f"photons merged along it stand out by {found.significance:.2g} standard deviations; the halves of the capture alone "
         f"turn by {halves} degrees a frame"
     )
-    decisions.append(Decision("start", found.text, reason))
+    decisions.append(Decision(START, found.text, reason))
     return ConstantVelocity(found.velocity, reference)
 
 

@@ -31,6 +31,9 @@ from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 
+END_AFTER_S = 5.0
+"""Seconds without a new frame after which a capture that is followed is complete, by default."""
+
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
@@ -64,7 +67,7 @@ def run(
     from_level: int | None = None,
     keep_work: bool = False,
     follow: bool = False,
-    end_after: float = 5.0,
+    end_after: float = END_AFTER_S,
 ) -> RunResult:
     """Run a plan and write its run folder: panorama, coverage, trajectory, record and report; or poses, for a plan with `pose`.
 

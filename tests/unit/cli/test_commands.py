@@ -121,6 +121,22 @@ def test_run_prints_verdict_reasons_and_corrections(folder: Path, run_with: Call
     assert result.stderr == f"{SENTENCE}warning: a warning\n"
 
 
+def test_run_prints_the_motion_it_starts_with(run_with: Callable[..., Any]) -> None:
+    start = {"what": "start", "value": "a turn by 3 degrees a frame", "reason": "it stands out"}
+    size = {"what": "group_size", "value": 50, "reason": "chosen"}
+    result = run_with(Verdict("trusted", (), 1.0), decisions=[start, size])
+    assert "start     a turn by 3 degrees a frame: it stands out\n" in result.stdout
+    assert "chosen" not in result.stdout
+
+
+@pytest.mark.parametrize("arguments", [("--end-after", "3"), ("--follow", "--resume"), ("--resume", "--from-level", "2")])
+def test_options_that_exclude_each_other_are_refused(run_with: Callable[..., Any], arguments: tuple[str, ...]) -> None:
+    result = run_with(Verdict("trusted", (), 1.0), *arguments)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {arguments[0]}")
+    assert result.stdout == ""
+
+
 def test_strict_run_fails_if_and_only_if_doubtful(run_with: Callable[..., Any]) -> None:
     result = run_with(Verdict("doubtful", (TREMBLING,), 24.1), "--strict")
     assert result.exit_code == 1
