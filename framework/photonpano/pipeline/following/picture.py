@@ -53,15 +53,15 @@ class PictureSoFar:
     def add(self, window: Window) -> None:
         """Add the new frames of a window. If they do not join, or lie too askew or too far away, the picture begins anew."""
         shape, self._response = window.source.info.frame_shape, window.source.response
-        ends = window.trajectory.at([window.new.start, window.new.centre, window.new.stop - 1])
-        if not (window.joins and _upright(self._to_plane @ ends, shape) and self._grow(self._to_plane @ ends, shape)):
+        chunks = chunks_of(window.new, window.trajectory, shape, _TOLERANCE_PX)
+        places = np.array([chunk.homography for chunk in chunks])
+        if not (window.joins and _upright(self._to_plane @ places, shape) and self._grow(self._to_plane @ places, shape)):
             self.scale, self._sums, self._to_plane = 1.0, np.zeros((2, 0, 0), np.float32), np.eye(3)
-            self._grow(ends, shape)
-        low, high = self._box(self._to_plane @ ends, shape)
+            self._grow(places, shape)
+        low, high = self._box(self._to_plane @ places, shape)
         low, high = np.maximum(low, self._origin), np.minimum(high, self._origin + self._sums.shape[:0:-1])
         (left, top), (width, height) = (low - self._origin).tolist(), (high - low).tolist()
         canvas = Canvas(height, width, translation(*-low.astype(float)) @ rescaling(self.scale) @ self._to_plane)
-        chunks = chunks_of(window.new, window.trajectory, shape, _TOLERANCE_PX)
         added = accumulate(window.source, chunks, canvas, canvas.shape)
         self._sums[:, top : top + height, left : left + width] += added.counts, added.weight
         self._to_plane = normalised(self._to_plane @ window.to_next)

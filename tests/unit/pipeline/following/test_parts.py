@@ -199,6 +199,14 @@ class TestPicture:
         assert best.max() > 0.95
         assert np.abs(np.array(np.unravel_index(best.argmax(), best.shape)) - [2, 2]).max() <= 1
 
+    def test_tremor_within_a_window_is_not_cut_off(self) -> None:
+        still = self.window(60, 50, (0, 0), joins=False, n_frames=101)
+        trembling = KnownMotion(lambda frame: translation(10 * np.sin(2 * np.pi * frame / 50), 0))
+        picture = PictureSoFar()
+        picture.add(Window(still.source, still.new, trembling, False, np.eye(3)))
+        height, width = self.SHAPE
+        assert self.shown(picture).shape == (height, width + 20)
+
     def test_picture_begins_anew_where_windows_do_not_join(self) -> None:
         picture = PictureSoFar()
         picture.add(self.window(60, 50, (20, 0), joins=False))
