@@ -88,7 +88,7 @@ def main() -> None:
     prepare_streams()
     end_on_signals()
     try:
-        app()
+        app(prog_name="photonpano")  # with "python -m photonpano", completion would not work
     except SystemExit as error:
         leave(error.code if isinstance(error.code, int) else FAILED)
     except KeyboardInterrupt:  # before the command or after it

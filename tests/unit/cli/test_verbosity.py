@@ -115,6 +115,5 @@ def test_full_disk_ends_log_and_not_the_command(invoke: Callable[..., Any]) -> N
 )
 def test_shell_completes(program: list[str], words: str, expected: str) -> None:
     asked = {"_PHOTONPANO_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
-    script = [*program[:-1], f"import sys; sys.argv[0] = 'photonpano'; {program[-1]}"]
-    done = subprocess.run(script, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
+    done = subprocess.run(program, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
     assert done.stdout.split() == [expected]
