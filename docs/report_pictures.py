@@ -1,6 +1,6 @@
-"""The pictures of reports in docs/how-to/read-the-report.md, drawn by Chromium.
+"""The pictures of pages in docs/how-to/read-the-report.md and docs/how-to/compare-runs.md, drawn by Chromium.
 
-python docs/report_pictures.py RUN FAILED   of a run folder, and the page of a run that failed
+python docs/report_pictures.py RUN FAILED COMPARISON   of a run folder, the page of a run that failed, and that of a comparison
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ IMAGES = Path(__file__).parent / "images"
 WIDTH, PHONE = 1100, 400
 
 
-def main(run: Path, failed: Path) -> None:
+def main(run: Path, failed: Path, comparison: Path) -> None:
     """Open the pages, and write what is seen of them."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, browser(Path(folder)) as page:
         report = run / "report.html"
@@ -30,6 +30,10 @@ def main(run: Path, failed: Path) -> None:
         page.picture(IMAGES / "report-phone.png")
         page.open(failed, WIDTH, 1000)
         page.picture(IMAGES / "report-failed.png")
+        page.open(comparison, WIDTH, 1000)
+        motion = page.run("document.querySelectorAll('section')[1].getBoundingClientRect().bottom")
+        page.open(comparison, WIDTH, int(motion))
+        page.picture(IMAGES / "compare.png")
 
 
 def opened(page: Page, report: Path, width: int, height: int) -> None:
@@ -40,4 +44,4 @@ def opened(page: Page, report: Path, width: int, height: int) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(*map(Path, sys.argv[1:]))
