@@ -201,3 +201,34 @@ def test_run_divides_by_vignette(simulated: Callable[..., Path], tmp_path: Path)
     whole = json.loads((tmp_path / "divided" / "run" / "run.json").read_text())
     assert "vignette.npz" in whole["files"]
     assert again.record["files"] == {name: each for name, each in whole["files"].items() if name != "report.html"}
+
+
+def test_run_divides_by_flat_field(simulated: Callable[..., Path], tmp_path: Path) -> None:
+    """Rendered again, it divides by the same."""
+    spec = spec_of(simulated(n_frames=300, lens={"vignette": 0.6}), "flat-field") | {"levels": 1, "refine": []}
+    whole = run(parse_spec(spec, output=tmp_path / "run")).record
+    decision = next(each for each in whole["decisions"] if each["what"] == "flat_field")
+    with np.load(tmp_path / "run" / "vignette.npz") as arrays:
+        assert decision["value"] == pytest.approx(float(arrays["gain"].std()), abs=1e-3)
+        middle, corner = np.s_[48:80, 64:96], np.s_[:8, :8]
+        assert arrays["gain"][corner].mean() < 0.75 * arrays["gain"][middle].mean()
+        assert arrays["std"].max() < 0.3
+    again = photonpano.render(tmp_path / "run", tmp_path / "again")
+    assert again.record["files"] == {name: each for name, each in whole["files"].items() if name != "report.html"}
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        (
+            {"merge": {"use": "splat"}},
+            "flat-field divides sums of frames, and 'splat' merges single frames; choose another merger",
+        ),
+        ({"pose": "stratified-pose"}, "flat-field does not apply with `pose`: it is measured along a panorama; remove it"),
+    ],
+    ids=["splat", "pose"],
+)
+def test_flat_field_is_refused_where_nothing_is_divided_by_it(section: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        parse_spec({"version": 1, "source": {"use": "simulator"}, "corrections": ["flat-field"]} | section)
+    assert f"corrections.0: {message}" in str(caught.value)

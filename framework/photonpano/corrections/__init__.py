@@ -3,6 +3,7 @@
 from photonpano.corrections.colour_filter import ColourFilter
 from photonpano.corrections.colours import FilteredSource
 from photonpano.corrections.dark import DarkCounts, DarkFrames, measure_dark, read_dark, write_dark
+from photonpano.corrections.flat_field import FlatField
 from photonpano.corrections.geometry import (
     TURNS,
     ColourSwissSpad2,
@@ -24,7 +25,7 @@ _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
     *(Crop, SwapColumns, MissingRow),
     *TURNS,
-    *(Mask, HotPixels, StillPixels, DarkCounts, ColourFilter),
+    *(Mask, HotPixels, StillPixels, DarkCounts, FlatField, ColourFilter),
 )
 CORRECTIONS = {correction.name: correction for correction in _ALL}
 """All corrections by their names in specs."""
@@ -36,6 +37,7 @@ __all__ = [
     "DarkCounts",
     "DarkFrames",
     "FilteredSource",
+    "FlatField",
     "HotPixels",
     "StillPixels",
     "Vignette",

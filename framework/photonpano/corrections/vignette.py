@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.geometry import apply, corner_displacements, inverse
-from photonpano.protocols import LinearlyCorrectedSource, camera_of
+from photonpano.protocols import LinearlyCorrectedSource, WeightedSource, camera_of
 from photonpano.source_wrapper import (
     ColouredWrapper,
     LensedWrapper,
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 VIGNETTE_DECISION = "vignette_gain"
 """What a record names the decision to divide by a vignette."""
+FLAT_FIELD_DECISION = "flat_field"
+"""What a record names the decision to divide by a flat field."""
 _SPANS, _SPAN_FRAMES, _SPAN_PX = 48, 64, 8.0
 """48 spans all over the capture are summed, each of at most 64 frames, in which the image moves by about 8 px at most."""
 _CELL_PX = 8
@@ -50,19 +52,25 @@ class Vignette:
     """The relative sensitivity of the pixels.
 
     Attributes:
-        gain: (H, W) float32, 1 in the middle.
+        gain: (H, W) float32, 1 in the middle, or on average if it is a flat field.
         mean: (H, W) float32, mean count of a frame of each pixel, around which the division is linear.
         spans: the frames that it was estimated from.
+        std: (H, W) float32, standard deviation of the gain, relative to it; None if it is not known.
     """
 
     gain: FluxImage
     mean: FluxImage
     spans: tuple[FrameSpan, ...]
+    std: FluxImage | None = None
 
     @property
     def decision(self) -> Decision:
         """What was found, for the record."""
         corner, n_frames = float(self.gain[0, 0]), sum(map(len, self.spans))
+        if self.std is not None:
+            known = f"known to {np.median(self.std):.2g} in half of the frame, and to {self.std.max():.2g} everywhere"
+            reason = f"root mean square of the differences in gain, from {n_frames} frames, {known}; the flux is divided by it"
+            return Decision(FLAT_FIELD_DECISION, round(float(self.gain.std()), 3), reason)
         reason = f"light that reaches the corners, relative to the middle, from {n_frames} frames; the flux is divided by it"
         return Decision(VIGNETTE_DECISION, round(corner, 3), reason)
 
@@ -103,9 +111,17 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
 
 
 def divided_by(source: Source, vignette: Vignette) -> FlatSource:
-    """Return a source whose corrected sums are those of a lens without vignette."""
-    known = PackedWrapper, WeightedWrapper, ColouredWrapper, LensedWrapper
-    return with_capabilities(FlatSource, [each for each in capabilities_of(source) if each in known])(source, vignette)
+    """Return a source whose corrected sums are those of a lens without vignette.
+
+    It is a `WeightedSource` for a flat field, whose pixels may differ so far in gain that faint ones, which are multiplied
+    most, would add more noise than light.
+    """
+    weighted = WeightedWrapper if vignette.std is None else _WeightedByGain
+    known: tuple[type[SourceWrapper], ...] = (PackedWrapper, ColouredWrapper, LensedWrapper)
+    capabilities = [each for each in capabilities_of(source) if each in known]
+    if vignette.std is not None or isinstance(source, WeightedSource):
+        capabilities.append(weighted)
+    return with_capabilities(FlatSource, capabilities)(source, vignette)
 
 
 class FlatSource(SourceWrapper):
@@ -117,7 +133,7 @@ class FlatSource(SourceWrapper):
 
     def __init__(self, source: Source, vignette: Vignette) -> None:
         super().__init__(source)
-        self._vignette = vignette
+        self.vignette = vignette
         power = 1 / vignette.gain
         dark = np.maximum(1 - vignette.mean, np.float32(1e-3))
         self._slope = np.asarray(power * dark ** (power - 1), np.float32)
@@ -125,12 +141,23 @@ class FlatSource(SourceWrapper):
 
     def around(self, source: Source) -> FlatSource:
         """See `SourceWrapper`."""
-        return divided_by(source, self._vignette)
+        return divided_by(source, self.vignette)
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
         """Take everything but the flux out of a sum of frames: see `LinearlyCorrectedSource`."""
         summed = self.wrapped.corrected(counts, n_frames) if isinstance(self.wrapped, LinearlyCorrectedSource) else counts
         return np.asarray(summed * self._slope + np.float32(n_frames) * self._offset, np.float32)
+
+
+class _WeightedByGain(SourceWrapper):
+    """What a source offers that is divided by a flat field."""
+
+    vignette: Vignette
+
+    def weights(self) -> FluxImage:
+        """Return what a frame of each pixel is worth: the photons that it counts, of those of a pixel of gain 1."""
+        own = self.wrapped.weights() if isinstance(self.wrapped, WeightedSource) else np.float32(1)
+        return np.asarray(own * self.vignette.gain, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,10 @@ VIGNETTE_FILE = "vignette.npz"
 
 def write_vignette(folder: Path, vignette: Vignette) -> None:
     """Write vignette.npz into a folder."""
-    np.savez(folder / VIGNETTE_FILE, gain=vignette.gain, mean=vignette.mean)
+    arrays = {"gain": vignette.gain, "mean": vignette.mean}
+    if vignette.std is not None:
+        arrays["std"] = vignette.std
+    np.savez(folder / VIGNETTE_FILE, allow_pickle=False, **arrays)
 
 
 def read_vignette(folder: Path, source: Source) -> Vignette | None:
@@ -42,4 +45,4 @@ def read_vignette(folder: Path, source: Source) -> Vignette | None:
         if image is None or image.dtype != np.float32 or image.shape != shape:
             held = "missing" if image is None else f"{image.dtype} of shape {image.shape}"
             raise InputError(f"{path}: {name} must be float32 of shape {shape}, as the frames, and is {held}; run again")
-    return Vignette(arrays["gain"], arrays["mean"], ())
+    return Vignette(arrays["gain"], arrays["mean"], (), arrays.get("std"))

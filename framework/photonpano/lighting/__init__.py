@@ -2,17 +2,20 @@
 
 from photonpano.lighting.files import LIGHT_FILE, in_light_of, write_light
 from photonpano.lighting.finding import LIGHT_DECISION, corrected_light, decision_of, find_light, measure_light
+from photonpano.lighting.flat_field import PixelGain, measure_pixel_gain
 from photonpano.lighting.source import InLight, in_light
 
 __all__ = [
     "LIGHT_DECISION",
     "LIGHT_FILE",
     "InLight",
+    "PixelGain",
     "corrected_light",
     "decision_of",
     "find_light",
     "in_light",
     "in_light_of",
     "measure_light",
+    "measure_pixel_gain",
     "write_light",
 ]

@@ -38,7 +38,7 @@ def find_light(source: Source, trajectory: Trajectory, context: Context) -> Ligh
         context: threads.
     """
     n_frames = source.info.n_frames
-    longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(_speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
+    longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
     gains = _gains(source, trajectory, _spread(n_frames, longest), context)
     return measure_light(source, trajectory, context) if changes(gains) or lamp_frequency(gains) else None
 
@@ -128,7 +128,7 @@ def _spread(n_frames: int, length: int) -> list[FrameSpan]:
     return [FrameSpan(start, start + length) for start in np.unique(starts).tolist()]
 
 
-def _speed_px(source: Source, trajectory: Trajectory) -> float:
+def speed_px(source: Source, trajectory: Trajectory) -> float:
     """Return the usual speed of the image, in px per frame."""
     instants = np.linspace(0, source.info.n_frames - 1, 65)
     steps = inverse(trajectory.at(instants[:-1])) @ trajectory.at(instants[1:])

@@ -26,6 +26,8 @@ _BLUR = 0.75
 fraction of a pixel at which a frame lies."""
 _LEAST_DEPTH = 0.25
 """Of frames before the reference plane, relative to its own frame: squares are at most four times as wide there."""
+SMOOTHING = 2 * _BLUR * np.sqrt(np.pi)
+"""Factor by which this lowers the noise of a square; neighbours share photons instead, and their errors are correlated."""
 _COVERED = 0.999
 """Squares that the border of a frame cuts are left out."""
 _MOST_CELLS = 16_000
@@ -126,9 +128,7 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         half *= 2
         canvas = _canvas(trajectory, motions, shape, 1 / half)
     n_rows, n_columns = canvas.height // 2, canvas.width // 2
-    # Masked pixels, and those of faint colours, cover less everywhere.
-    weights = weights_of(source)
-    covered = _COVERED if weights is None else _COVERED * float(weights.mean())
+    covered = _COVERED * _least_weight(source, 2 * half)
 
     seen = partial(_seen, source, canvas, half, covered)
     parts = list(context.in_order(seen, list(zip(spans, motions, strict=True))))
@@ -143,6 +143,21 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         (n_rows, n_columns),
         np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform if canvas.planar else None,
     )
+
+
+def _least_weight(source: Source, side: int) -> float:
+    """Return what the faintest square of the sensor is worth: masked pixels, and those of faint colours, cover less everywhere.
+
+    Args:
+        source: the capture.
+        side: of a square, px.
+    """
+    weights = weights_of(source)
+    if weights is None:
+        return 1.0
+    worth, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
+    inside = valid >= min(0.5, float(valid.max()))
+    return float((worth[inside] / valid[inside]).min() * source.valid.mean())
 
 
 def _seen(
@@ -206,7 +221,7 @@ def solve_gains(seen: SeenCells) -> Gains:
         left *= np.sqrt(weight / np.maximum(robust, 1e-9))
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
         # Smoothed squares share photons: their residuals are small, and correlated.
-        noise = scale * np.sqrt(np.pi) * 2 * _BLUR
+        noise = scale * SMOOTHING
         robust = 1 / np.maximum(1, np.abs(left) / (_OUTLIER * scale))
     difference = light[:, None] - light
     covariance *= noise**2

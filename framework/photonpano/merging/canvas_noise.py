@@ -12,7 +12,7 @@ from photonpano.geometry import Camera, Canvas, rescaling
 from photonpano.merging.averaging import Averaging
 from photonpano.merging.bent import BentGrid, laid
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
-from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory, camera_of
+from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory, WeightedSource, camera_of
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
 _INSTANTS = 64
@@ -74,6 +74,10 @@ class CanvasNoise:
         offset = np.asarray(source.corrected(none, 1), np.float32)
         slope = np.asarray(source.corrected(none + 1, 1) - offset, np.float32)
         valid = source.valid
+        if isinstance(source, WeightedSource):
+            # A count of weight w adds w to the weight and w^2 times its variance: in frames of weight 1, w times its variance.
+            worth = source.weights()
+            slope, offset = slope * worth, offset * worth
         means = float(slope[valid].mean()), float(offset[valid].mean())
         if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
             return cls(source.response, *means)

@@ -12,9 +12,9 @@ import numpy as np
 from photonpano.captures.repeats import timeline_of
 from photonpano.context import Context
 from photonpano.contributions import MergerContribution
-from photonpano.corrections import Vignette, divided_by, estimate_vignette
+from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light
+from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light, measure_pixel_gain
 from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
@@ -93,7 +93,8 @@ def estimate(plan: Plan, source: Source, decisions: list[Decision], context: Con
         )
     first, later = results, levels[1:]
     known = first[0].trajectory
-    if vignette := vignette_of(plan, _in_view(plan, source, first, context)[0], known):
+    in_view = _in_view(plan, source, first, context)[0]
+    if vignette := _flat_field(plan, in_view, known, context) or vignette_of(plan, in_view, known):
         decisions.append(vignette.decision)
         source, context = divided_by(source, vignette), replace(context, checkpoints=context.checkpoints.within(vignette))
         if not later:
@@ -200,6 +201,19 @@ def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette 
     if not plan.corrects_itself or source.info.kind != "binary" or not accepted:
         return None
     return estimate_vignette(source, trajectory)
+
+
+def _flat_field(plan: Plan, source: Source, trajectory: Trajectory, context: Context) -> Vignette | None:
+    """Measure the flat field of a capture; None if its spec does not ask for it.
+
+    Raises:
+        InputError: the motion cannot tell it from the scene, or the camera turns too far.
+    """
+    if not any(isinstance(each, FlatField) for each in plan.corrections):
+        return None
+    measured = measure_pixel_gain(source, trajectory, context)
+    counts = np.sum([source.counts(span) for span in measured.spans], axis=0) / sum(map(len, measured.spans))
+    return Vignette(measured.gain, counts.astype(np.float32), measured.spans, measured.std)
 
 
 def _look(plan: Plan, source: Source, results: Sequence[LevelResult], reference: int, context: Context) -> Look:

@@ -116,7 +116,9 @@ class WeightedSource(Source, Protocol):
     """A source whose pixels carry different amounts of information, as those behind filters of different colours do."""
 
     def weights(self) -> FluxImage:
-        """Return how many frames of the best pixel a frame of each pixel is worth: (H, W) float32, from 0 to 1.
+        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32, not negative.
+
+        Ordinary is the best pixel behind a filter, and a pixel of gain 1 of a sensor whose pixels differ in gain.
 
         Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
         """

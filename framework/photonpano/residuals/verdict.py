@@ -199,7 +199,7 @@ def _sensor(residuals: Residuals) -> Reason | None:
         change,
         MAX_GAIN,
         f"most at pixel ({worst[1] * BLOCK_PX + BLOCK_PX // 2}, {worst[0] * BLOCK_PX + BLOCK_PX // 2}) of the frame",
-        "mask these pixels (corrections: mask), or divide by a flat field",
+        "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
     )
 
 

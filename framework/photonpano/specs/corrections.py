@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from photonpano.corrections import CORRECTIONS
+from photonpano.contributions import MergerContribution
+from photonpano.corrections import CORRECTIONS, FlatField
 from photonpano.reading import missing_file
 from photonpano.specs.validation import validate
 from photonpano.specs.written import WrittenSpec, given
@@ -14,6 +15,7 @@ from photonpano.text import suggestion
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from photonpano.contributions import Contribution
     from photonpano.corrections import Correction
 
 AUTO = "auto"
@@ -37,6 +39,28 @@ def resolved_corrections(data: Any, spec: WrittenSpec) -> tuple[Correction, ...]
         return ()
     found = (_resolved(item, f"corrections.{index}", spec) for index, item in enumerate(data))
     return tuple(correction for correction in found if correction is not None)
+
+
+def check_flat_field(
+    corrections: Iterable[Correction], mergers: Iterable[Contribution], posed: bool, spec: WrittenSpec
+) -> None:
+    """Refuse a flat field where nothing can be divided by it.
+
+    Args:
+        corrections: of the spec.
+        mergers: of all levels.
+        posed: the run finds poses.
+        spec: problems are added here.
+    """
+    index = next((place for place, each in enumerate(corrections) if isinstance(each, FlatField)), None)
+    if index is None:
+        return
+    refusing = [each.name for each in mergers if isinstance(each, MergerContribution) and not each.accepts_corrected_sums]
+    if posed:
+        spec.wrong(f"corrections.{index}", "flat-field does not apply with `pose`: it is measured along a panorama; remove it")
+    elif refusing:
+        message = f"flat-field divides sums of frames, and {refusing[0]!r} merges single frames; choose another merger"
+        spec.wrong(f"corrections.{index}", message)
 
 
 def written_corrections(corrections: Iterable[Correction]) -> list[Any]:

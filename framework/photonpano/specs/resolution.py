@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from photonpano.errors import SpecError
 from photonpano.specs.checks import STAGES, complaints
 from photonpano.specs.components import CHOICE, DEFAULT_REFINER, DEFAULTS, KIND_OF, ComponentResolver, Stage, written_formats
-from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
+from photonpano.specs.corrections import AUTO, check_flat_field, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.pose import check_posed_camera, document_of_poses, without_panorama
 from photonpano.specs.settings import (
@@ -110,6 +110,8 @@ class _Resolver:
         pose = self.components.item(KIND_OF["pose"], {} if root["pose"] is None else root["pose"], "pose") if posed else None
         self.spell_out_light(root)
         settings = self.settings(root, posed)
+        mergers = [level.merge.contribution for level in levels if level]
+        check_flat_field(corrections or (), mergers, posed, spec)
         if source is None or renderer is None or (posed and pose is None) or spec.problems:
             return None
         until_converged = root.get("levels") == UNTIL_CONVERGED
