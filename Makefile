@@ -10,13 +10,14 @@ STEP := @printf '\n== %s\n'
 # The tests start Python hundreds of times: each must find its modules compiled, whatever the environment says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install test demo docs bench clean
+.PHONY: help install test demo docs paper bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo     simulate a small capture, make its panorama, and score it'
 	@echo 'make test     run all checks and tests'
 	@echo 'make docs     build the documentation as a site'
+	@echo 'make paper    make the figures of the paper, which takes about half an hour'
 	@echo 'make bench    run the benchmarks, which takes long'
 	@echo 'make install  make the virtual environment $(VENV), with all that tests and benchmarks need'
 	@echo 'make clean    remove the virtual environment, the demo, the site and caches'
@@ -58,6 +59,11 @@ docs: $(COMPLETE)
 	@# fresh, as a page that was read before is not read again, and its dead links are not found
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto --fresh-env -c docs/site -d site/pages . site/html
 	$(STEP) 'done; look at $(CURDIR)/site/html/index.html'
+
+paper: $(COMPLETE)
+	$(STEP) 'the figures of the paper, from simulated captures'
+	@$(BIN)/python docs/make_paper.py
+	$(STEP) 'done; look at docs/paper/README.md'
 
 bench: $(COMPLETE)
 	$(STEP) 'benchmarks'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from scipy.interpolate import UnivariateSpline
@@ -102,8 +103,10 @@ def _left_over(instants: FloatArray, series: FloatArray, slow: FloatArray, frequ
     return float(((series - columns @ np.linalg.lstsq(columns, series)[0]) ** 2).sum())
 
 
-def _smooth(instants: FloatArray, values: FloatArray, std: FloatArray) -> UnivariateSpline:
-    """Return the smoothest cubic curve that fits values within their noise."""
+def _smooth(instants: FloatArray, values: FloatArray, std: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the smoothest cubic curve that fits values within their noise; of fewer than four values, lines between them."""
+    if len(values) < 4:
+        return lambda at: np.interp(at, instants, values)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a closer fit was not found in its limit of steps
         return UnivariateSpline(instants, values, w=1 / np.maximum(std, 1e-4), k=3, s=len(values))

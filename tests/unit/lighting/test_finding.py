@@ -9,7 +9,7 @@ from photonpano import FrameSpan
 from photonpano.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.lighting import decision_of, find_light
-from photonpano.lighting.series import flicker_frequency
+from photonpano.lighting.series import flicker_frequency, gain_of_frames
 from photonpano.merging.light import gain_image
 from photonpano.testing import KnownMotion, MemorySource, Scene
 
@@ -124,3 +124,12 @@ def test_drift_is_measured_along_a_turn_by_200_degrees() -> None:
 def test_frequency_of_noise_is_none() -> None:
     noise = np.random.default_rng(0).normal(1, 0.05, 400)
     assert flicker_frequency(np.arange(400.0), noise) == 0
+
+
+@pytest.mark.parametrize("spans", [1, 2, 3, 4])
+def test_gain_is_measured_in_few_spans(spans: int) -> None:
+    """Of a short video of a dozen frames, of which few are located."""
+    instants, gain = np.arange(spans) + 0.5, 1 + 0.1 * np.arange(spans)
+    frames, std, frequency = gain_of_frames(instants, gain, np.full(spans, 1e-3), np.ones(spans), spans + 2)
+    assert (frequency, std.shape) == (0, (spans + 2,))
+    np.testing.assert_allclose(frames[[0, -1]], gain[[0, -1]], atol=0.01)
