@@ -98,6 +98,12 @@ def described(error: BaseException) -> str:
     return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 
+def public_name(error: BaseException) -> str:
+    """Return the name of the class of an exception; of errors of photonpano, that of the class in this module."""
+    classes = (each for each in type(error).__mro__ if each.__module__ == __name__)
+    return next(classes, type(error)).__name__
+
+
 class SpecError(PhotonpanoError):
     """A spec is wrong; carries every problem that was found, not only the first."""
 

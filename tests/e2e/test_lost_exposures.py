@@ -113,7 +113,9 @@ def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Calla
         pair("50 to 99", "0 to 49"),
         pair("100 to 149", "0 to 49"),
     ]
-    assert lines[-1] == (
+    start = "If the image turns or shifts at a constant velocity, write motion: {start: constant-velocity}."
+    assert lines[-1] == start
+    assert lines[-2] == (
         "In these exposures of 50 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
         "(try larger groups, such as resample.with.group_size=100), or the scene has no texture there."
     )
@@ -126,6 +128,7 @@ def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Calla
         "In these exposures of 100 frames the scene varies # times as much as a pixel's photon noise: either motion blurs them "
         "(try smaller groups, such as resample.with.group_size=50), or they are too dark for what texture there is (try larger "
         "ones, such as resample.with.group_size=200).",
+        start,
     ]
 
 

@@ -84,7 +84,9 @@ def test_observers_see_failed_run(run: Callable[..., Result]) -> None:
     assert result.exit_code == 1
     first, *_, last = lines("scan")
     assert (first["event"], last["event"]) == ("started", "failed")
-    assert f"LocationError: {result.stderr.removeprefix('error: ')}" == f"{last['error']}\n"
+    message, _, report = result.stderr.removeprefix("error: ").rpartition("\nreport ")
+    assert report.strip().endswith("scan.failed.html")
+    assert last["error"] == f"LocationError: {message}"
     assert not Path("runs/scan").exists()
 
 

@@ -1,7 +1,6 @@
 """Scores of trajectories and panoramas against the truth of simulated captures."""
 
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
-from photonpano.evaluation.comparison import MotionDifference, motion_difference, on_canvas, reduced
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.pose_inputs import RunPoses, has_poses, load_run_poses, load_true_poses
@@ -13,7 +12,6 @@ from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 __all__ = [
     "Evaluation",
     "ImageScore",
-    "MotionDifference",
     "PoseScore",
     "Renderer",
     "RotationScore",
@@ -35,11 +33,8 @@ __all__ = [
     "load_run_trajectory",
     "load_true_poses",
     "load_truth",
-    "motion_difference",
-    "on_canvas",
     "pair_bound_px",
     "pose_errors",
-    "reduced",
     "rotation_errors",
     "true_panorama",
     "white_flux",

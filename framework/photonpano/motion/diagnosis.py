@@ -125,9 +125,10 @@ def require_tied(
         if isinstance(edge.motion, NotLocated)
     ]
     more = [f"  ... and {len(reasons) - _SHOWN} more"] if len(reasons) > _SHOWN else []
-    lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts), *([] if started else [_START])]
+    lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts)]
     if tied.sum() < 2:
-        lines.insert(0, f"level {level}: none of the {len(edges)} pairs of exposures could be located")
+        none = f"level {level}: none of the {len(edges)} pairs of exposures could be located"
+        lines = [none, *lines, *([] if started else [_START])]
     else:
         lost = [_frames(run) for run in runs[:_SHOWN]] + ([f"{len(runs) - _SHOWN} more spans"] if len(runs) > _SHOWN else [])
         lines = [

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from photonpano.errors import described
+from photonpano.errors import described, public_name
 from photonpano.geometry import Canvas
 from photonpano.interrupts import is_interrupt
 from photonpano.motion.loop import LevelResult
@@ -42,7 +42,7 @@ class Observers:
         try:
             yield records.append
         except BaseException as error:  # an interrupt ends a run as well
-            message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            message = f"{public_name(error)}: {error}" if str(error) else public_name(error)
             self._call("photonpano_run_finished", record=None, error=message)
             raise
         self._call("photonpano_run_finished", record=frozen(records[-1]), error=None)

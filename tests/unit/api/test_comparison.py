@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from photonpano import InputError, OutputError, compare, parse_spec, run
-from photonpano.evaluation import RunTrajectory, motion_difference, on_canvas
+from photonpano.evaluation import RunTrajectory
+from photonpano.evaluation.comparison import motion_difference, on_canvas
 from photonpano.geometry import Canvas, translation
 from photonpano.pipeline.run import RunResult
 
