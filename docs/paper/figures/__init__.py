@@ -18,6 +18,7 @@ FIGURES = {
     "fig11": others.POSES,
     "s1": others.BURSTS,
     "s2": levels.S2,
+    "group-size": costs.SIZES_FIGURE,
     "run-time": costs.RUN_TIME,
 }
 """Figures of the paper by name, in its order."""
