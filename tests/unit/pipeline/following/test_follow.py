@@ -170,9 +170,10 @@ def test_interrupted_run_keeps_its_frames_and_says_how_to_go_on(moving_frames: n
     (tmp_path / "pipe.yaml").write_text(json.dumps(PIPED))
     live, kept = tmp_path / "run.live" / "live.json", tmp_path / "run.live" / "frames.raw"
     command = [sys.executable, "-m", "photonpano", "run", "pipe.yaml", "--follow", "--output", "run"]
-    with subprocess.Popen(
-        command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as program:
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    # Where the tests themselves run in the background of a shell, they ignore Ctrl-C, and so would what they start.
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    with subprocess.Popen(command, cwd=tmp_path, **pipes, **heed) as program:
         assert program.stdin is not None
         program.stdin.write(moving_frames[:110].tobytes() + b"part of a frame")
         program.stdin.flush()
