@@ -1,0 +1,432 @@
+"""Measure the tasks of runs, and predict runs of many workers: the tables and the plot of docs/explanation/scale.md.
+
+    python tests/benchmarks/scale.py docs/explanation/scale.md [--frames 10000 40000]
+
+Runs captures of several lengths in one thread, with an executor that packs what each task is given and returns, as for another
+process. It notes the processor time and the bytes of each task, and the processor time of the client beside them. A simulation
+of the scheduler then works on the tasks of longer captures with many workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from heapq import heappop, heappush
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import psutil
+from distributed import Client
+from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulate
+
+import photonpano.pipeline.run as run_module
+from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
+from photonpano.context import Quiet
+from photonpano.execution import CaptureElsewhere, Here
+from photonpano.execution.packing import packed
+from photonpano.geometry import FrameTrajectory
+from photonpano.merging import chunks_of
+from photonpano.pipeline.executors import as_read
+from photonpano_dask.configs import DaskConfig
+
+DASK = discover().find("executor", "dask").contribution
+FRAME_BYTES = SHAPE[0] * SHAPE[1] // 8
+LONG = 60_000_000
+"""Ten minutes at 100,000 frames per second."""
+WORKERS = 1, 8, 64, 512
+STORAGE_BYTES_S = 5e9
+"""What a shared storage reads for all workers together: an assumption."""
+LINK_BYTES_S = 1.25e9
+"""What the client, and each worker, sends and receives: an assumption, ten gigabits per second."""
+EMPTY_TASKS = 2000
+PATH_FRAMES = 400_000
+WINDOW = 4
+"""Tasks under way for each worker."""
+READING = "panorama", "residuals"
+"""Stages beside the levels that read the whole capture."""
+AT_ONCE = 8
+"""Items of a task, where there are many: as `photonpano.execution.Remote` has it."""
+
+
+@dataclass
+class Kind:
+    """Tasks of one kind in one stage: sums over the run."""
+
+    tasks: int = 0
+    seconds: float = 0.0
+    to_worker: int = 0
+    from_worker: int = 0
+
+
+class Measuring(Here):
+    """Works on each task here, and notes what it takes and what would travel."""
+
+    def __init__(self, capture: Source, stage: Callable[[], str]) -> None:
+        super().__init__(1)
+        self.kinds: dict[tuple[str, str], Kind] = defaultdict(Kind)
+        self.packing_seconds = 0.0
+        self._capture, self._stage = capture, stage
+        self._stay: dict[int, Any] = {}
+
+    def share(self, value: Any) -> Any:
+        """Note a value that travels to each worker once."""
+        kind = self.kinds[self._stage(), f"shared: {name_of(value)}"]
+        kind.tasks += 1
+        kind.to_worker += self._size(value)
+        self._stay[id(value)] = value
+        return value
+
+    def call(self, work: Callable[..., Any], *given: Any) -> Any:
+        """Note a task."""
+        return self._measured(work, given, lambda result: result)
+
+    def keep(self, work: Callable[..., Any], *given: Any) -> Any:
+        """Note a task whose first result stays, and that result by itself: it travels at most to the worker of a pair."""
+        kept, known = self._measured(work, given, lambda both: both[1])
+        self._stay[id(kept)] = kept
+        kind = self.kinds[self._stage(), "kept: features"]
+        kind.tasks += 1
+        kind.to_worker += self._size(kept)
+        return kept, known
+
+    def _measured(self, work: Callable[..., Any], given: tuple[Any, ...], returned: Callable[[Any], Any]) -> Any:
+        kind = self.kinds[self._stage(), name_of(work)]
+        kind.tasks += 1
+        kind.to_worker += sum(self._size(each) for each in (work, *given) if id(each) not in self._stay)
+        begin = time.thread_time()
+        result = work(*given)
+        kind.seconds += time.thread_time() - begin
+        kind.from_worker += self._size(returned(result))
+        return result
+
+    def _size(self, value: Any) -> int:
+        begin = time.thread_time()
+        size = len(packed(value, self._capture))
+        self.packing_seconds += time.thread_time() - begin
+        return size
+
+
+def name_of(work: Any) -> str:
+    """Return the name of a task."""
+    work = work.func if isinstance(work, partial) else work
+    return str(getattr(work, "__name__", type(work).__name__)).lstrip("_")
+
+
+class Stages(Quiet):
+    """Knows which stage is under way."""
+
+    title = "before"
+
+    @contextmanager
+    def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+        del total, unit
+        self.title = title
+        yield lambda _: None
+        self.title = f"after {title}"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One run.
+
+    Attributes:
+        n_frames: of the capture.
+        kinds: tasks by stage and name.
+        client_s: processor time beside the tasks.
+    """
+
+    n_frames: int
+    kinds: dict[tuple[str, str], Kind]
+    client_s: float
+
+    def scaled(self, shorter: Measured, n_frames: int) -> Measured:
+        """Predict a longer capture from this one and a shorter one: tasks and time of the client grow along a line."""
+        grown = (n_frames - self.n_frames) / (self.n_frames - shorter.n_frames)
+        kinds = {}
+        for key, kind in self.kinds.items():
+            before = shorter.kinds.get(key, Kind())
+            # What is shared once a stage grows with the capture, what is done by the task grows in number.
+            tasks = kind.tasks if key[1].startswith("shared") else round(kind.tasks + grown * (kind.tasks - before.tasks))
+            each = (
+                kind.to_worker + grown * (kind.to_worker - before.to_worker)
+                if key[1].startswith("shared")
+                else kind.to_worker * tasks / kind.tasks
+            )
+            share = tasks / kind.tasks
+            kinds[key] = Kind(tasks, kind.seconds * share, round(each), round(kind.from_worker * share))
+        return Measured(n_frames, kinds, self.client_s + grown * (self.client_s - shorter.client_s))
+
+
+def measured(cube: Path, n_frames: int) -> Measured:
+    """Run a capture with the executor that measures."""
+    stages, executors = Stages(), list[Measuring]()
+
+    @contextmanager
+    def executor_of(_: Any, source: Source) -> Iterator[Measuring]:
+        executors.append(Measuring(as_read(source), lambda: stages.title))
+        yield executors[0]
+
+    spec = {
+        "version": 1,
+        "source": {"use": "packed-npy", "with": {"path": str(cube)}},
+        "resample": {"with": {"group_size": GROUP_SIZE}},
+        "run": {"threads": 1},
+    }
+    real = run_module.executor_of
+    run_module.executor_of = executor_of
+    begin = time.process_time()
+    try:
+        run(parse_spec(spec, output=cube.with_suffix(".run")), stages)
+    finally:
+        run_module.executor_of = real
+    whole = time.process_time() - begin
+    executor = executors[0]
+    tasks = sum(kind.seconds for kind in executor.kinds.values())
+    return Measured(n_frames, dict(executor.kinds), whole - tasks - executor.packing_seconds)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Processor seconds beside the work of tasks.
+
+    Attributes:
+        client_s: of a task, in the process of the run.
+        scheduler_s: of a task, in the scheduler.
+        start_s: of a frame, when a worker begins a level along a motion: it divides the capture into chunks.
+    """
+
+    client_s: float
+    scheduler_s: float
+    start_s: float
+
+
+def measured_costs() -> Costs:
+    """Have a cluster of this machine work on empty tasks, and divide a long path into chunks."""
+    with cluster() as (address, scheduler):
+        context = ExecutorContext(THREADS, CaptureElsewhere(None, dict), here={}, elsewhere=dict)
+        executor = DASK.build(DaskConfig(address=address), context)
+        with ThreadPoolExecutor(executor.under_way) as pool:
+            list(pool.map(partial(executor.call, len), [[each] for each in range(200)]))
+            before = time.process_time(), sum(scheduler.cpu_times()[:2])
+            list(pool.map(partial(executor.call, len), [[each] for each in range(EMPTY_TASKS)]))
+            client, handed = time.process_time() - before[0], sum(scheduler.cpu_times()[:2]) - before[1]
+        executor.close()
+    path = np.tile(np.eye(3), (PATH_FRAMES, 1, 1))
+    path[:, 0, 2] = PX_A_FRAME * np.arange(PATH_FRAMES)
+    trajectory, begin = FrameTrajectory(path), time.process_time()
+    chunks_of(FrameSpan(0, PATH_FRAMES), trajectory, SHAPE, 0.5)
+    return Costs(client / EMPTY_TASKS, handed / EMPTY_TASKS, (time.process_time() - begin) / PATH_FRAMES)
+
+
+@contextmanager
+def cluster() -> Iterator[tuple[str, psutil.Process]]:
+    """Start a scheduler and two workers in processes of their own."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        file = Path(folder) / "scheduler.json"
+
+        def started(*words: str) -> subprocess.Popen[bytes]:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dask", *words, "--scheduler-file", str(file)], stderr=subprocess.DEVNULL
+            )
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+            return process
+
+        scheduler = started("scheduler", "--port", "0", "--dashboard-address", ":0")
+        while not file.exists():
+            time.sleep(0.1)
+        started("worker", "--nworkers", "2", "--nthreads", "1", "--no-dashboard")
+        address = json.loads(file.read_text())["address"]
+        with Client(address) as client:
+            client.wait_for_workers(2)
+        yield address, psutil.Process(scheduler.pid)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Bundles of work that are worked on in order, as far as there are workers.
+
+    Attributes:
+        bundles: their number.
+        first: seconds of the first task of a bundle, and how many tasks of the scheduler it is.
+        second: the same of the task that follows it, and needs the first task of the bundle before, too.
+        shared: bytes that travel from the client to each worker.
+        returned: bytes that travel to the client.
+        read: bytes of the capture.
+        begun_s: what each worker takes before its first task.
+    """
+
+    bundles: int
+    first: tuple[float, float]
+    second: tuple[float, float]
+    shared: int
+    returned: int
+    read: float
+    begun_s: float
+
+    def limits(self, costs: Costs, workers: int) -> dict[str, float]:
+        """Return the seconds that each resource alone would take."""
+        handed = self.bundles * (self.first[1] + self.second[1])
+        return {
+            "work of the workers": self.bundles * (self.first[0] + self.second[0]) / workers,
+            "handing tasks on": handed * max(costs.client_s, costs.scheduler_s),
+            "bytes to and from the client": (self.shared * workers + self.returned) / LINK_BYTES_S,
+            "reading the capture": self.read / STORAGE_BYTES_S,
+            "start of each worker": self.begun_s,
+        }
+
+    def seconds(self, costs: Costs, workers: int) -> float:
+        """Simulate the stage: each task goes in order to the first worker that is free, with four under way for each worker."""
+        handing_s = max(costs.client_s, costs.scheduler_s, self.returned / self.bundles / LINK_BYTES_S)
+        read_s = self.read / self.bundles / (STORAGE_BYTES_S / workers)
+        begin = self.begun_s + self.shared * workers / LINK_BYTES_S
+        free, handed, described = [begin] * workers, begin, begin
+        done: list[float] = [begin]
+        for index in range(self.bundles):
+            if index >= WINDOW * workers:
+                handed = max(handed, done[index - WINDOW * workers])
+            handed += handing_s * self.first[1]
+            before, described = described, max(heappop(free), handed) + self.first[0] + read_s
+            heappush(free, described)
+            end = described
+            if self.second[0]:
+                handed += handing_s * self.second[1]
+                end = max(heappop(free), handed, before, described) + self.second[0]
+                heappush(free, end)
+            done.append(max(done[-1], end))
+        return done[-1]
+
+
+def stages_of(run: Measured, costs: Costs) -> list[Stage]:
+    """Return the stages of a run, as bundles of its tasks."""
+    by_stage: dict[str, dict[str, Kind]] = defaultdict(dict)
+    for (stage, name), kind in run.kinds.items():
+        by_stage[stage][name] = kind
+    found, shared = list[Stage](), 0
+    for stage, kinds in by_stage.items():
+        shared += sum(kind.to_worker for name, kind in kinds.items() if name.startswith("shared"))
+        tasks = {name: kind for name, kind in kinds.items() if not name.startswith(("shared", "kept"))}
+        if not tasks:
+            continue
+        returned = sum(kind.from_worker for kind in tasks.values())
+        read = run.n_frames * FRAME_BYTES
+        if "describe" in tasks:
+            first = stage.startswith("level 1")
+            bundles = -(-tasks["describe"].tasks // AT_ONCE)
+            moved_s = kinds["kept: features"].to_worker / bundles / LINK_BYTES_S
+            pairs = tasks["register"].tasks / bundles if first else 1.0
+            describe = tasks["describe"].seconds / bundles, 3.0
+            register = tasks["register"].seconds / bundles + moved_s, pairs
+            found.append(
+                Stage(bundles, describe, register, shared, returned, read, 0.0 if first else costs.start_s * run.n_frames)
+            )
+        else:
+            bundles = -(-max(kind.tasks for kind in tasks.values()) // AT_ONCE)
+            work = sum(kind.seconds for kind in tasks.values()) / bundles
+            found.append(Stage(bundles, (work, 1.0), (0.0, 0.0), shared, returned, read if stage in READING else 0.0, 0.0))
+        shared = 0
+    return found
+
+
+def prediction(run: Measured, costs: Costs, workers: int) -> tuple[float, dict[str, float]]:
+    """Return the seconds of a run with so many workers, and what each resource alone would take."""
+    stages = stages_of(run, costs)
+    limits: dict[str, float] = defaultdict(float)
+    for stage in stages:
+        for name, seconds in stage.limits(costs, workers).items():
+            limits[name] += seconds
+    limits["work of the client"] = run.client_s
+    return run.client_s + sum(stage.seconds(costs, workers) for stage in stages), dict(limits)
+
+
+def table_of_tasks(run: Measured) -> list[str]:
+    """Return the rows of the table of tasks."""
+    rows = ["| Stage | Task | Tasks | Time of one | To the worker | Back |", "| --- | --- | --- | --- | --- | --- |"]
+    for (stage, name), kind in run.kinds.items():
+        if stage.startswith("after") or not kind.tasks:
+            continue
+        time_ms = "" if name.startswith(("shared", "kept")) else f"{1e3 * kind.seconds / kind.tasks:.1f} ms"
+        to, back = (f"{size / kind.tasks / 1e3:,.1f} kB" if size else "" for size in (kind.to_worker, kind.from_worker))
+        rows.append(f"| {stage} | {name} | {kind.tasks:,} | {time_ms} | {to} | {back} |")
+    return rows
+
+
+def table_of_predictions(run: Measured, costs: Costs) -> tuple[list[str], dict[int, dict[str, float]]]:
+    """Return the rows of the table of predictions, and the limits for the plot."""
+    rows = ["| Workers | Predicted | Speed-up | What limits | Its share |", "| --- | --- | --- | --- | --- |"]
+    limits, alone = dict[int, dict[str, float]](), 0.0
+    for workers in WORKERS:
+        seconds, limits[workers] = prediction(run, costs, workers)
+        alone = alone or seconds
+        name, most = max(limits[workers].items(), key=itemgetter(1))
+        rows.append(f"| {workers} | {clock(seconds)} | {alone / seconds:.1f} | {name} | {clock(most)} |")
+        limits[workers]["all"] = seconds
+    return rows, limits
+
+
+def clock(seconds: float) -> str:
+    """Return a duration for people."""
+    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
+def plot(limits: dict[int, dict[str, float]], file: Path) -> None:
+    """Draw what each resource takes, for each number of workers."""
+    figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    for name in limits[WORKERS[0]]:
+        seconds = [limits[workers][name] for workers in WORKERS]
+        style = {"color": "black", "linewidth": 2.5} if name == "all" else {"marker": "o", "markersize": 3}
+        axes.loglog(WORKERS, np.maximum(seconds, 1), label="the run" if name == "all" else name, **style)
+    axes.set_xticks(WORKERS, [str(each) for each in WORKERS])
+    axes.set_xlabel("workers")
+    axes.set_ylabel("seconds, ten minutes of capture")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+    figure.savefig(file, dpi=110)
+
+
+def main() -> None:
+    """Measure, predict, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", type=Path, help="the page whose tables are replaced")
+    parser.add_argument(
+        "--frames", type=int, nargs=2, default=[10_000, 40_000], help="lengths of the captures, the shorter first"
+    )
+    arguments = parser.parse_args()
+    page: Path = arguments.page
+    costs = measured_costs()
+    with tempfile.TemporaryDirectory() as folder:
+        cubes = [simulate(Path(folder), number) for number in arguments.frames]
+        # What is imported and loaded once does not count.
+        measured(cubes[0], arguments.frames[0])
+        shorter, longer = (measured(cube, number) for cube, number in zip(cubes, arguments.frames, strict=True))
+    rows, limits = table_of_predictions(longer.scaled(shorter, LONG), costs)
+    client_s = (longer.client_s - shorter.client_s) / (longer.n_frames - shorter.n_frames)
+    costs_rows = [
+        f"A task costs {costs.client_s * 1e3:.1f} ms of processor time in the client, and {costs.scheduler_s * 1e3:.1f} ms in "
+        f"the scheduler. Beside the tasks, the client takes {1e6 * client_s:.0f} s for a million frames. A worker divides a "
+        f"million frames into chunks in {1e6 * costs.start_s:.1f} s."
+    ]
+    text = page.read_text(encoding="utf-8")
+    for name, written in (("tasks", table_of_tasks(longer)), ("costs", costs_rows), ("predictions", rows)):
+        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+        before, rest = text.split(begin)
+        text = "\n".join([f"{before}{begin}", *written, end]) + rest.split(end)[1]
+    page.write_text(text, encoding="utf-8")
+    plot(limits, page.parent.parent / "images" / "scale.png")
+
+
+if __name__ == "__main__":
+    main()
