@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import photonpano
@@ -42,6 +44,19 @@ def test_every_dependency_is_pinned_to_a_version_that_it_allows() -> None:
             assert requirement.extras <= set(project["optional-dependencies"])
             continue
         assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)]), line
+
+
+def test_every_pinned_version_runs_on_the_oldest_python_that_is_supported() -> None:
+    oldest = PROJECT["project"]["requires-python"].removeprefix(">=") + ".0"
+    pinned = pins()
+    refused = {
+        package.name: needed
+        for package in metadata.distributions()
+        if canonicalize_name(package.name) in pinned
+        and (needed := package.metadata.get("Requires-Python"))
+        and not SpecifierSet(needed).contains(oldest)
+    }
+    assert not refused, "constraints.txt: pin versions that run on Python " + oldest
 
 
 def test_every_extra_is_what_a_component_asks_for() -> None:
