@@ -94,13 +94,20 @@ def test_atomic_path_leaves_no_file_after_a_short_write(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_atomic_path_reports_a_full_disk(tmp_path: Path) -> None:
+def test_atomic_path_reports_a_full_disk_and_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is found to be full when the whole file is flushed, as some file systems do."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
     final = tmp_path / "result.bin"
-    with pytest.raises(OutputError) as caught, atomic_path(final), Path("/dev/full").open("wb", buffering=0) as full:
-        full.write(b"x")
+    final.write_bytes(b"old")
+    monkeypatch.setattr("photonpano.atomic.os.fsync", full)
+    with pytest.raises(OutputError) as caught, atomic_path(final) as temporary:
+        temporary.write_bytes(b"new")
     assert str(caught.value) == (f"cannot write {final}: No space left on device; free some space or choose another folder")
-    assert list(tmp_path.iterdir()) == []
+    assert final.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [final]
 
 
 @pytest.mark.parametrize("lend", [atomic_path, atomic_folder])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import logging
 import os
 import re
@@ -94,14 +96,23 @@ def test_wrong_option_exits_2_before_anything_is_done(
     assert sorted(path.name for path in folder.iterdir()) == ["capture.yaml"]
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
-@pytest.mark.usefixtures("folder")
-def test_full_disk_ends_log_and_not_the_command(invoke: Callable[..., Any]) -> None:
-    result = invoke(*SIMULATE, "--log", "/dev/full")
-    assert (result.exit_code, result.stderr) == (
-        0,
-        "warning: the log /dev/full ends here: OSError: [Errno 28] No space left on device\n",
-    )
+class FullDisk(io.RawIOBase):
+    """A file on a disk without room."""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, _: Any) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_full_disk_ends_log_and_not_the_command(
+    folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.FileHandler, "_open", lambda _: io.TextIOWrapper(io.BufferedWriter(FullDisk()), "utf-8"))
+    result = invoke(*SIMULATE, "--log", "night.log")
+    reason = f"OSError: [Errno {errno.ENOSPC}] No space left on device"
+    assert (result.exit_code, result.stderr) == (0, f"warning: the log {folder / 'night.log'} ends here: {reason}\n")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
@@ -137,19 +138,31 @@ class TestSpool:
             Spool(0, tmp_path / "a.raw", Piped(0, 4))
         assert (tmp_path / "a.raw").read_text() == "mine"
 
-    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-    def test_full_disk_is_told(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        full = os.open("/dev/full", os.O_WRONLY)
-        monkeypatch.setattr("photonpano.pipeline.following.spool.os.open", lambda *_: full)
+    def test_full_disk_is_told_and_whole_frames_are_kept(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A disk with room for ten bytes of twelve."""
+        write, room = os.write, [10]
+
+        def filling(descriptor: int, data: bytes) -> int:
+            if not room[0]:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            done = write(descriptor, data[: room[0]])
+            room[0] -= done
+            return done
+
         reading, writing = os.pipe()
-        spool = Spool(reading, tmp_path / "a.raw", Piped(0, 4))
-        monkeypatch.undo()
-        os.write(writing, b"01234567")
+        write(writing, b"0123456789ab")
+        monkeypatch.setattr("photonpano.pipeline.following.spool.os.write", filling)
+        path = tmp_path / "a.raw"
+        spool = Spool(reading, path, Piped(0, 4))
         while not spool.ended:
             time.sleep(0.01)
         spool.close()
-        with pytest.raises(OutputError, match=r"a\.raw: No space left on device.*; make room"):
+        with pytest.raises(OutputError) as caught:
             spool.require_whole()
+        assert str(caught.value) == (
+            f"cannot write {path}: No space left on device; the 2 whole frames are in {path}; make room"
+        )
+        assert path.read_bytes() == b"01234567"
         os.close(writing)
         os.close(reading)
 
