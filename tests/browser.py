@@ -111,7 +111,7 @@ class Page:
         last = time.monotonic() + LONGEST_S
         while not done():
             if time.monotonic() > last:
-                raise TimeoutError("the browser does not answer")
+                raise TimeoutError(f"what was waited for did not come; messages of the page: {self.messages}")
             if not select.select([self._read], [], [], 0.1)[0]:
                 continue
             self._buffer += os.read(self._read, 2**16)
