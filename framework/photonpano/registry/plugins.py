@@ -10,7 +10,7 @@ import pluggy
 from photonpano import hookspecs
 from photonpano.contributions import API_VERSION, Contribution
 from photonpano.errors import PluginError, described
-from photonpano.hookspecs import components, observation
+from photonpano.hookspecs import observation
 from photonpano.interrupts import is_interrupt
 from photonpano.registry.kinds import KINDS, Kind
 from photonpano.text import listed
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from photonpano.contributions import Contribution
 
 PREFIX = f"{hookspecs.PROJECT}_"
-HOOKS = tuple(name for module in (components, observation) for name in vars(module) if name.startswith(PREFIX))
-"""All hooks, in the order in which they are specified."""
-OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
+OBSERVATION_HOOKS = tuple(name for name in vars(observation) if name.startswith(PREFIX))
 """The hooks that offer nothing: a run calls them, so that a plugin can watch it."""
+HOOKS = (*(kind.hook for kind in KINDS.values()), *OBSERVATION_HOOKS)
+"""All hooks: those that offer components, in the order in which a run needs these, and those that watch."""
 MAX_OFFERED = 1000
 """Most components that a hook may offer."""
 
