@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from pages import require_places, write_tables
 
 from photonpano import PhotonpanoError, evaluate, parse_spec, run
 from photonpano.evaluation import exposure_bound_px, load_truth
@@ -36,7 +37,6 @@ CAPTURE: dict[str, Any] = {
     "n_frames": 2400,
     "frame_shape": [254, 496],
 }
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 Results: TypeAlias = dict[tuple[float, str, str, str], tuple[float, float, float] | str]
 """Mean error, largest error and loss of PSNR by flux, locator, graph and resampler; or why the run failed."""
 HEADER = ("Flux", "Locator", "Graph", "Groups", "Mean", "Worst frame", "Below the oracle")
@@ -81,7 +81,7 @@ def bound_px(cube: Path) -> float:
     return float(np.mean([exposure_bound_px(view, BinaryResponse(), GROUP_SIZE) for view in views]))
 
 
-def table(results: Results, bounds: dict[float, float]) -> str:
+def table(results: Results, bounds: dict[float, float]) -> list[str]:
     """Return the rows in Markdown."""
     lines = [f"| {' | '.join(HEADER)} |", "| --- " * len(HEADER) + "|"]
     for flux in bounds:
@@ -90,7 +90,7 @@ def table(results: Results, bounds: dict[float, float]) -> str:
                 figures = found if isinstance(found, str) else "{:.3f} px | {:.2f} px | {:.2f} dB".format(*found)
                 lines.append(f"| {flux:g} | {' | '.join(names)} | {figures} |")
         lines.append(f"| {flux:g} | *Cramer-Rao bound* | | | {bounds[flux]:.3f} px | | |")
-    return "\n".join(lines)
+    return lines
 
 
 def plot(results: Results, bounds: dict[float, float], file: Path) -> None:
@@ -121,8 +121,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path, help="the page whose table is replaced")
     page = parser.parse_args().page
-    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    _, after = rest.split(END)
+    require_places(page, ["table"])
     results: Results = {}
     bounds: dict[float, float] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -136,7 +135,7 @@ def main() -> None:
                     results[(flux, *names)] = f"failed: {str(error).splitlines()[0]} | | "
                 print(flux, *names, results[(flux, *names)], file=sys.stderr, flush=True)
             cube.unlink()
-    page.write_text(f"{before}{BEGIN}\n{table(results, bounds)}\n{END}{after}", encoding="utf-8")
+    write_tables(page, {"table": table(results, bounds)})
     plot(results, bounds, page.parent.parent / "images" / "ablation.png")
 
 

@@ -26,6 +26,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from pages import write_tables
 
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext, parse_spec, run
 from photonpano.geometry import FrameTrajectory, apply, inverse
@@ -232,10 +233,7 @@ def main() -> None:
         lines += rows(title, np.array(found))
         print(*lines[-len(MERGERS) :], sep="\n", flush=True)
     if arguments.page:
-        before, rest = arguments.page.read_text(encoding="utf-8").split("<!-- dense: begin -->")
-        after = rest.split("<!-- dense: end -->")[1]
-        table = "\n".join(["<!-- dense: begin -->", *lines, "<!-- dense: end -->"])
-        arguments.page.write_text(before + table + after, encoding="utf-8")
+        write_tables(arguments.page, {"dense": lines})
 
 
 if __name__ == "__main__":

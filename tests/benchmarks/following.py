@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pages import write_tables
 
 PROGRAM = [sys.executable, "-m", "photonpano"]
 SIMULATED = 10_000
@@ -199,10 +200,7 @@ def main() -> None:
             lines += ["", "| Frames of 64x96 so far | memory of the process |", "| --- | --- |"]
             lines += [f"| {measured.memory[index, 0]:,.0f} | {measured.memory[index, 1]:.0f} MiB |" for index in at]
             print("\n".join(lines[-4:]), row("64x96", 6000, measured), flush=True)
-    text = given.page.read_text(encoding="utf-8")
-    table = "\n".join(lines)
-    block = re.compile(r"(?<=<!-- delays: begin -->\n).*?(?=<!-- delays: end -->)", re.DOTALL)
-    given.page.write_text(block.sub(lambda _: f"{table}\n", text), encoding="utf-8")
+    write_tables(given.page, {"delays": lines})
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from pages import require_places, write_tables
 from pydantic import ValidationError
 
 from photonpano import (
@@ -44,7 +45,6 @@ SHAPE = (254, 496)
 GROUP_SIZE = 250
 GROUPS = 6
 WRONG_PX = 2.0
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 
 
 class Views(NamedTuple):
@@ -175,11 +175,9 @@ def main() -> None:
     parser.add_argument("--fluxes", type=float, nargs="+", default=[0.5, 0.1, 0.02], help="photons per pixel per frame")
     arguments = parser.parse_args()
     page: Path = arguments.page
-    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    _, after = rest.split(END)
+    require_places(page, ["table"])
     cv2.setNumThreads(1)
-    rows = "\n".join(table(arguments.fluxes, arguments.scenes))
-    page.write_text(f"{before}{BEGIN}\n{rows}\n{END}{after}", encoding="utf-8")
+    write_tables(page, {"table": table(arguments.fluxes, arguments.scenes)})
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pages import write_tables
 
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext
 from photonpano.geometry import FrameTrajectory, translation
@@ -123,12 +124,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         tables = {"psnr": psnrs(Path(folder)), "times": times(Path(folder))}
-    text = page.read_text(encoding="utf-8")
-    for name, rows in tables.items():
-        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-        before, rest = text.split(begin)
-        text = "\n".join([f"{before}{begin}", *rows, end]) + rest.split(end)[1]
-    page.write_text(text, encoding="utf-8")
+    write_tables(page, tables)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from pages import write_tables
 
 from photonpano import CameraGuess, evaluate_poses
 from photonpano.evaluation.pose_inputs import load_true_poses
@@ -167,10 +168,7 @@ def main() -> None:
             costs = [f"{name}: {of['seconds']:.0f} s, {of['mib']:.0f} MiB" for name, of in figures.items() if "seconds" in of]
             print(lines[-1], *costs, sep="\n  ", flush=True)
     if arguments.page:
-        text = arguments.page.read_text(encoding="utf-8")
-        before, rest = text.split("<!-- poses: begin -->")
-        page = "\n".join([f"{before}<!-- poses: begin -->", *HEADER, *lines, "<!-- poses: end -->"])
-        arguments.page.write_text(page + rest.split("<!-- poses: end -->")[1], encoding="utf-8")
+        write_tables(arguments.page, {"poses": [*HEADER, *lines]})
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import psutil
 from distributed import Client
+from pages import write_tables
 from scheduling import Costs, Kind, Measured, prediction
 from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulate
 
@@ -253,12 +254,7 @@ def main() -> None:
         f"the scheduler. Beside the tasks, the client takes {1e6 * client_s:.0f} s for a million frames. A worker divides a "
         f"million frames into chunks in {1e6 * costs.start_s:.1f} s."
     ]
-    text = page.read_text(encoding="utf-8")
-    for name, written in (("tasks", table_of_tasks(longer)), ("costs", costs_rows), ("predictions", rows)):
-        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-        before, rest = text.split(begin)
-        text = "\n".join([f"{before}{begin}", *written, end]) + rest.split(end)[1]
-    page.write_text(text, encoding="utf-8")
+    write_tables(page, {"tasks": table_of_tasks(longer), "costs": costs_rows, "predictions": rows})
     plot(limits, page.parent.parent / "images" / "scale.png")
 
 

@@ -25,6 +25,7 @@ from typing import Any
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from pages import write_tables
 
 from photonpano import FrameSpan, SourceContext
 from photonpano.evaluation import load_truth
@@ -261,12 +262,7 @@ def main() -> None:
             print(n_frames, f"{records[n_frames]['seconds']:.0f} s", file=sys.stderr, flush=True)
             cube.unlink()
     tables["runs"] = runs(records, rate)
-    text = page.read_text(encoding="utf-8")
-    for name, rows in tables.items():
-        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-        before, rest = text.split(begin)
-        text = "\n".join([f"{before}{begin}", *rows, end]) + rest.split(end)[1]
-    page.write_text(text, encoding="utf-8")
+    write_tables(page, tables)
     plot(records, page.parent.parent / "images" / "speed.png")
 
 
