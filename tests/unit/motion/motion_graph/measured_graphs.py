@@ -1,0 +1,40 @@
+"""Graphs whose true motion is known, measured with and without noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from photonpano import Located
+from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, parameters
+from photonpano.values import Edge
+
+SHAPE = (254, 496)
+NOISE_PX = 0.1
+
+
+def true_motion(n_nodes: int, seed: int = 0) -> np.ndarray:
+    """A camera that wanders by about 20 px from exposure to exposure, and turns."""
+    steps = np.random.default_rng(seed).normal(size=(n_nodes, 8)) * [2e-3, 2e-3, 2e-3, 2e-3, 20, 5, 2e-6, 2e-6]
+    return from_parameters(np.cumsum(steps, axis=0))
+
+
+def edge(true: np.ndarray, moving: int, fixed: int, rng: np.random.Generator | None = None, std_px: float = NOISE_PX) -> Edge:
+    """Measure a pair; with a generator, corners have errors of `std_px` along each axis, as the information predicts."""
+    homography = normalised(inverse(true[fixed]) @ true[moving])
+    to_corners = jacobian(homography, corners(SHAPE)).reshape(8, 8)
+    information = to_corners.T @ to_corners / std_px**2
+    if rng is not None:
+        change = np.linalg.solve(to_corners, rng.normal(scale=std_px, size=8))
+        homography = from_parameters(parameters(homography) + change)
+    return Edge(moving, fixed, Located(homography, information))
+
+
+def measured(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator | None = None) -> list[Edge]:
+    return [edge(true, moving, moving - skip, rng) for moving in range(len(true)) for skip in skips if skip <= moving]
+
+
+def confident(edges: list[Edge], times: float) -> list[Edge]:
+    """Scale the information of edges as if their errors were `times` smaller."""
+    return [replace(each, motion=replace(each.motion, information=each.motion.information * times**2)) for each in edges]
