@@ -12,9 +12,16 @@ from picture_parts import beside, labelled, picture
 from photonpano import FrameSpan, load_spec, open_source, run
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from picture_parts import Picture
 
-SPEC = Path(__file__).parents[1] / "examples" / "pipelines" / "mandrill.yaml"
+SPEC = Path(__file__).parents[2] / "examples" / "pipelines" / "mandrill.yaml"
+
+
+def pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
+    """Yield each picture with its name."""
+    yield "mandrill.png", mandrill(folder / "mandrill")
 
 
 def mandrill(folder: Path) -> Picture:

@@ -16,9 +16,11 @@ from photonpano.evaluation.poses import align_positions
 from photonpano.poses import centres
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from picture_parts import Picture
 
-CAPTURE = Path(__file__).parents[1] / "examples" / "pipelines" / "room-capture.yaml"
+CAPTURE = Path(__file__).parents[2] / "examples" / "pipelines" / "room-capture.yaml"
 GROUP_SIZE, FOCAL_PX, FIRST = 30, 160, 300
 """Frames of an average, the focal length of the capture, and the first frame of the exposures that are shown."""
 ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -27,6 +29,11 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Pose estimators, with the colours of their lines and their keys."""
 MAGNIFIED = 1.7
+
+
+def pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
+    """Yield each picture with its name."""
+    yield "room.png", room(folder / "room")
 
 
 def room(folder: Path) -> Picture:
