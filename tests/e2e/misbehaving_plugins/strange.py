@@ -97,6 +97,11 @@ def holed(image: np.ndarray, value: float) -> np.ndarray:
     return image
 
 
+def cases_of(kinds: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> Mapping[str, tuple[Any, ...]]:
+    """Return the cases of all kinds by an id, each with its kind before it."""
+    return {f"{kind}: {name}": (kind, *case) for kind, cases in kinds.items() for name, case in cases.items()}
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What the command `run` ends with: its exit code, what it prints, and the files that it leaves."""

@@ -13,7 +13,7 @@ import pytest
 from photonpano import FrameSpan, Group, Located, NotLocated
 from photonpano.geometry import translation
 
-from .strange import Around, Outcome, around, holed, instead, require_named
+from .strange import Around, Outcome, around, cases_of, holed, instead, require_named
 
 AT_LEVEL = "broke its contract at level 1: "
 NO_HOMOGRAPHY = AT_LEVEL + "a homography is a finite (3, 3) matrix with h33 = 1, got "
@@ -250,16 +250,14 @@ INTERPOLATORS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
         AT_LEVEL + "a homography is finite with h33 = 1, ",
     ),
 }
-CASES = {
-    f"{kind}: {name}": (kind, *case)
-    for kind, cases in {
+CASES = cases_of(
+    {
         "resampler": RESAMPLERS,
         "merger": MERGERS,
         "locator": LOCATORS,
         "interpolator": INTERPOLATORS,
-    }.items()
-    for name, case in cases.items()
-}
+    }
+)
 
 
 @pytest.mark.parametrize(("kind", "change", "message"), CASES.values(), ids=CASES)

@@ -13,7 +13,7 @@ from photonpano import FrameSpan, Refined
 from photonpano.geometry import translation
 from photonpano.testing import MemorySource
 
-from .strange import FRAMES, SHAPE, Around, Outcome, around, holed, instead, require_named
+from .strange import FRAMES, SHAPE, Around, Outcome, around, cases_of, holed, instead, require_named
 
 AT_OPENING = "broke its contract at opening: "
 AT_READING = "broke its contract at frames 0 to 159: "
@@ -279,16 +279,14 @@ POSE_ESTIMATORS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
     ),
 }
 """What pose estimators return."""
-CASES = {
-    f"{kind}: {name}": (kind, *case)
-    for kind, cases in {
+CASES = cases_of(
+    {
         "source": SOURCES,
         "refiner": REFINERS,
         "renderer": RENDERERS,
         "pose-estimator": POSE_ESTIMATORS,
-    }.items()
-    for name, case in cases.items()
-}
+    }
+)
 
 
 @pytest.mark.parametrize(("kind", "change", "message"), CASES.values(), ids=CASES)
