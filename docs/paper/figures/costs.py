@@ -30,6 +30,8 @@ QUICK = {
     "source.with.n_frames": 3000,
 }
 QUICK_SIZES, QUICK_LENGTHS_PX, QUICK_FLUXES = (60, 250), (40, 100), (0.3,)
+QUICK_TIME = {**QUICK, "source.with.path.length_px": 100, "source.with.flux": 0.3, "resample.with.group_size": 200}
+QUICK_WINDOWS = {**QUICK_TIME, "resample.with.step_frames": 50}
 LENGTHS = (10_000, 30_000, 100_000)
 """Frames of the captures whose exposures are counted."""
 SPEED = Path(__file__).parents[2] / "explanation" / "speed.md"
@@ -98,7 +100,8 @@ def sizes_claims(numbers: Numbers) -> list[Claim]:
 
 def run_time(study: Study) -> tuple[None, Numbers]:
     """Count the exposures and the frames that they take, and measure the error against that of sliding windows."""
-    specs = {name: study.spec(name, {}, QUICK) for name in ("group-size", "sliding-window")}
+    quick = {"group-size": QUICK_TIME, "sliding-window": QUICK_WINDOWS}
+    specs = {name: study.spec(name, {}, changes) for name, changes in quick.items()}
     capture = study.capture("group-size", specs["group-size"])
     numbers: Numbers = {"n_frames": specs["group-size"]["source"]["with"]["n_frames"]}
     for name, spec in specs.items():
