@@ -157,9 +157,12 @@ class Timeline:
 
     def times(self, instants: ArrayLike) -> FloatArray:
         """Return when N instants, in frames, were taken, in frame periods: (N,). Beyond the capture, time goes on."""
-        at = np.asarray(instants, dtype=np.float64)
-        last = len(self.taken) - 1
-        return np.asarray(np.interp(at, np.arange(last + 1), self.taken) + np.minimum(at, 0) + np.maximum(at - last, 0))
+        at, last = np.asarray(instants, dtype=np.float64), len(self.taken) - 1
+        inside = np.clip(at, 0, last)
+        # Not by np.interp, which would look at all frames at each call, to check that their numbers are in order.
+        before = np.minimum(inside.astype(np.intp), max(last - 1, 0))
+        start, stop = self.taken[before], self.taken[np.minimum(before + 1, last)]
+        return np.asarray((stop - start) * (inside - before) + start + np.minimum(at, 0) + np.maximum(at - last, 0))
 
     def _divided(self, span: FrameSpan) -> list[FrameSpan]:
         bounds = {bound for cut in self.cuts for bound in cut.bounds if span.start < bound < span.stop}
