@@ -26,6 +26,7 @@ from .phase import correlation_peaks as correlation_peaks
 from .phase import correlation_surface as correlation_surface
 from .phase import shift_between as shift_between
 from .phase import shift_by_phase as shift_by_phase
+from .phase import shift_of_spectra as shift_of_spectra
 from .point_locator import PointLocator as PointLocator
 from .points import Matches as Matches
 from .points import consensus_of as consensus_of

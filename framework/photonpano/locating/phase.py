@@ -47,8 +47,26 @@ def shift_by_phase(
         peak_px: standard deviation of the peak, in px.
         gaussian_peak: whether the peak is located by a Gaussian through three values, and not by a parabola.
     """
-    spectra = [fft.rfft2(image) for image in (moving, fixed)]
-    surface = correlation_surface(spectra[1] * spectra[0].conj(), moving.shape, peak_px)
+    return shift_of_spectra(fft.rfft2(moving), fft.rfft2(fixed), moving.shape, peak_px, gaussian_peak)
+
+
+def shift_of_spectra(
+    moving: NDArray[np.complexfloating],
+    fixed: NDArray[np.complexfloating],
+    shape: tuple[int, ...],
+    peak_px: float,
+    gaussian_peak: bool = True,
+) -> FloatArray | None:
+    """Return the shift (x, y) in px between two images from their spectra: see `shift_by_phase`.
+
+    Args:
+        moving: (H, W // 2 + 1) spectrum of the image.
+        fixed: (H, W // 2 + 1) of the other one.
+        shape: (height, width) of the images.
+        peak_px: standard deviation of the peak, in px.
+        gaussian_peak: whether the peak is located by a Gaussian through three values, and not by a parabola.
+    """
+    surface = correlation_surface(fixed * moving.conj(), shape, peak_px)
     if surface is None:
         return None
     row, column = np.unravel_index(int(surface.argmax()), surface.shape)

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
 
 from photonpano.context import Context
 from photonpano.geometry import corner_displacements, inverse
-from photonpano.locating import shift_by_phase
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
-from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.residuals.refinement import Look
+from photonpano.residuals.sum_track import DARK, SumTrack, sum_image, track_sums
 from photonpano.residuals.unexplained import standing_out
-from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
 
 _MARGIN = 20
@@ -28,16 +25,12 @@ _TRACK_NOISE_PX, _TRACK_RATIO = 0.25, 10.0
 panorama, which has less noise than a sum."""
 _SHORTEST, _LONGEST, _MOTION_PX = 4, 64, 4.0
 """Fewest and most frames of a sum, and how far the image may move in it."""
-_PEAK_PX = 1.5
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
 _SMALLEST_PX, _OUTLIER = 1.0, 4.5
 """A shift is an outlier beyond this size, and this many times the median of the others around it."""
 _LOCAL = 24
 """Sums on either side whose shifts it is compared with."""
 _FEWEST = 6
-"""Fewer sums are not tracked."""
-_DARK = 0.2
-"""Sums, and frames, with less than this share of the usual light show nothing."""
+"""Fewer shifts around it do not tell what is usual."""
 _SIDE = 4
 """Further sums before and after a jump, which make the template with which the frames between are compared."""
 _BLUR_PX = 0.7
@@ -50,33 +43,6 @@ _SURE = 4.0
 """Standard deviations by which a jump must be likelier than motions of 8 frames and more. One of 4 must not be likelier."""
 _NOISE_FLOOR = 1e-4
 """Least variance of a binned pixel."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Track:
-    """Sums of successive frames with light, and the shifts of the image between them.
-
-    Attributes:
-        spans: (N,) of the sums, in order.
-        images: (N,) mean counts, binned.
-        next_px: (N - 1, 2) shifts from each to the next, in binned px.
-        second_px: (N - 2, 2) shifts from each to the second next.
-    """
-
-    spans: Sequence[FrameSpan]
-    images: Sequence[FluxImage]
-    next_px: FloatArray
-    second_px: FloatArray
-
-    @property
-    def centres(self) -> FloatArray:
-        """(N,) instants, in frames."""
-        return np.array([span.centre for span in self.spans])
-
-    def velocity(self, first: int, last: int) -> FloatArray:
-        """Return the mean velocity of the image from one sum to another: (2,) in binned px per frame."""
-        frames = self.spans[last].centre - self.spans[first].centre
-        return np.asarray(self.next_px[first:last].sum(axis=0) / frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +81,7 @@ def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
     found: list[Cut] = []
     with context.progress.stage("cuts", sum(map(len, suspect)), "frames") as advance:
         for span in suspect:
-            found += _cuts_in(source, span, size, context.threads)
+            found += _cuts_in(source, span, size, context)
             advance(len(span))
     return tuple(found)
 
@@ -137,10 +103,10 @@ def _size_of_sums(look: Look) -> int:
     return int(np.clip(np.ceil(wanted), _SHORTEST, _LONGEST))
 
 
-def _cuts_in(source: Source, span: FrameSpan, size: int, threads: int) -> Iterator[Cut]:
+def _cuts_in(source: Source, span: FrameSpan, size: int, context: Context) -> Iterator[Cut]:
     """Yield the cuts in some frames, tracked by sums of `size` frames."""
     sums = [each for each in span.blocks(size) if len(each) == size]
-    track = _tracked(sums, list(in_order(partial(binned_mean, source), sums, threads)))
+    track = track_sums(source, sums, context)
     if track is None:
         return
     for outlier in _outliers(track, size, _SMALLEST_PX / binning_of(source)):
@@ -153,28 +119,7 @@ def _cuts_in(source: Source, span: FrameSpan, size: int, threads: int) -> Iterat
             yield cut
 
 
-def _tracked(spans: Sequence[FrameSpan], images: Sequence[FluxImage]) -> _Track | None:
-    """Track the sums that show something; None if they are too few."""
-    light = np.array([float(np.nanmean(image)) for image in images])
-    lit = [index for index, each in enumerate(light) if each > _DARK * np.median(light)]
-    if len(lit) < _FEWEST:
-        return None
-    spans, images = [spans[index] for index in lit], [np.nan_to_num(images[index], nan=light[index]) for index in lit]
-    window = tapered(images[0].shape)
-    flat = [window * (image - image.mean()) for image in images]
-
-    def shifts(skip: int) -> FloatArray:
-        # An image without texture does not shift.
-        found = [
-            shift_by_phase(before, after, _PEAK_PX, gaussian_peak=False)
-            for before, after in zip(flat[:-skip], flat[skip:], strict=True)
-        ]
-        return np.array([np.zeros(2) if shift is None else shift for shift in found])
-
-    return _Track(spans, images, shifts(1), shifts(2))
-
-
-def _outliers(track: _Track, size: int, smallest: float) -> list[_Outlier]:
+def _outliers(track: SumTrack, size: int, smallest: float) -> list[_Outlier]:
     """Return the shifts that are outliers, each the largest around it.
 
     The frame of a jump lies in some sum, so that the shift from the sum before to that after is compared with the motion before
@@ -216,21 +161,21 @@ def _dark_frames(source: Source, span: FrameSpan) -> FrameSpan | None:
     light = np.array(
         [float(np.nanmean(binned_mean(source, FrameSpan(frame, frame + 1)))) for frame in range(span.start, span.stop)]
     )
-    runs = true_spans(light <= _DARK * np.quantile(light, 0.9))
+    runs = true_spans(light <= DARK * np.quantile(light, 0.9))
     if not runs:
         return None
     longest = max(runs, key=len)
     return FrameSpan(span.start + longest.start, span.start + longest.stop)
 
 
-def _located(source: Source, track: _Track, outlier: _Outlier) -> Cut | None:
+def _located(source: Source, track: SumTrack, outlier: _Outlier) -> Cut | None:
     """Find the first frame after a jump; None if a fast motion explains the frames as well.
 
     The log likelihood of each frame is that of its residual from a template, seen from the path before the jump, from that
     after, and from positions between. A jump takes the image from the one to the other at once, a fast motion in some frames.
     """
     path = _Path.of(track, outlier)
-    template = _template(track, outlier, path)
+    template = _template(source, track, outlier, path)
     frames = range(track.spans[outlier.before].start, track.spans[outlier.after].stop)
     likelihood = np.empty((len(frames), _STEPS + 1))
     for row, frame in enumerate(frames):
@@ -262,7 +207,7 @@ class _Path:
     jump: FloatArray
 
     @classmethod
-    def of(cls, track: _Track, outlier: _Outlier) -> _Path:
+    def of(cls, track: SumTrack, outlier: _Outlier) -> _Path:
         """Fit the path to the sums on both sides of an outlier."""
         before, after = outlier.before, outlier.after
         across = track.next_px[before] if after == before + 1 else track.second_px[before]
@@ -287,16 +232,16 @@ def _powers(times: FloatArray) -> FloatArray:
     return np.asarray(times[:, None] ** np.arange(4))
 
 
-def _beside(track: _Track, outlier: _Outlier) -> list[int]:
+def _beside(track: SumTrack, outlier: _Outlier) -> list[int]:
     """Return the numbers of the sums before and after an outlier."""
     first, last = max(0, outlier.before - _SIDE), min(len(track.spans), outlier.after + _SIDE + 1)
     return [*range(first, outlier.before + 1), *range(outlier.after, last)]
 
 
-def _template(track: _Track, outlier: _Outlier, path: _Path) -> FluxImage:
+def _template(source: Source, track: SumTrack, outlier: _Outlier, path: _Path) -> FluxImage:
     """Average the sums on both sides of an outlier, taken back along the path: (h, w); NaN beyond their borders."""
     moved = [
-        _moved(track.images[number], -path.at(track.spans[number].centre, float(number >= outlier.after)))
+        _moved(sum_image(source, track.spans[number]), -path.at(track.spans[number].centre, float(number >= outlier.after)))
         for number in _beside(track, outlier)
         if number not in (outlier.before, outlier.after)
     ]

@@ -1,0 +1,98 @@
+"""Track short sums of frames by phase correlation, from frames alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy import fft
+
+from photonpano.context import Context
+from photonpano.locating import shift_of_spectra
+from photonpano.merging import binned_mean
+from photonpano.photometry import tapered
+from photonpano.protocols import Source
+from photonpano.values import FloatArray, FluxImage, FrameSpan
+
+_PEAK_PX = 1.5
+"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_FEWEST = 6
+"""Fewer sums are not tracked."""
+DARK = 0.2
+"""Sums, and frames, with less than this share of the usual light show nothing."""
+_BLOCK = 32
+"""Sums that are tracked in one task."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SumTrack:
+    """Sums of successive frames with light, and the shifts of the image between them.
+
+    Attributes:
+        spans: (N,) of the sums, in order.
+        next_px: (N - 1, 2) shifts from each to the next, in binned px.
+        second_px: (N - 2, 2) shifts from each to the second next.
+    """
+
+    spans: Sequence[FrameSpan]
+    next_px: FloatArray
+    second_px: FloatArray
+
+    @property
+    def centres(self) -> FloatArray:
+        """(N,) instants, in frames."""
+        return np.array([span.centre for span in self.spans])
+
+    def velocity(self, first: int, last: int) -> FloatArray:
+        """Return the mean velocity of the image from one sum to another: (2,) in binned px per frame."""
+        frames = self.spans[last].centre - self.spans[first].centre
+        return np.asarray(self.next_px[first:last].sum(axis=0) / frames)
+
+
+def track_sums(source: Source, spans: Sequence[FrameSpan], context: Context) -> SumTrack | None:
+    """Track the sums that show something; None if they are too few.
+
+    Args:
+        source: the capture.
+        spans: of the sums, in order.
+        context: works on blocks of sums in tasks.
+    """
+    light, track = _tracked(source, spans, context)
+    lit = light > DARK * np.median(light) if len(light) else light
+    if np.count_nonzero(lit) < _FEWEST:
+        return None
+    # Those without light are left out, and so are the shifts to them: once more, as few captures have any.
+    return track if lit.all() else _tracked(source, [spans[index] for index in np.flatnonzero(lit).tolist()], context)[1]
+
+
+def sum_image(source: Source, span: FrameSpan) -> FluxImage:
+    """Return the mean counts of a sum, binned: (h, w); where no pixel is valid, the mean of the others."""
+    image = binned_mean(source, span)
+    return np.nan_to_num(image, nan=float(np.nanmean(image)))
+
+
+def _tracked(source: Source, spans: Sequence[FrameSpan], context: Context) -> tuple[FloatArray, SumTrack]:
+    """Return the light of each sum, (N,), and the track of all of them."""
+    blocks = [tuple(spans[first : first + _BLOCK + 2]) for first in range(0, len(spans), _BLOCK)]
+    parts = list(context.in_order(partial(_tracked_block, source), blocks))
+    light, next_px, second_px = (np.concatenate([part[number] for part in parts] or [np.empty(0)]) for number in range(3))
+    return light, SumTrack(spans, next_px, second_px)
+
+
+def _tracked_block(source: Source, spans: Sequence[FrameSpan]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the light of the first 32 sums, and their shifts to the next and the second next; two further sums follow them."""
+    images = [sum_image(source, span) for span in spans]
+    window = tapered(images[0].shape)
+    spectra = [fft.rfft2(window * (image - image.mean())) for image in images]
+
+    def shifts(skip: int) -> FloatArray:
+        # An image without texture does not shift.
+        found = [
+            shift_of_spectra(before, after, images[0].shape, _PEAK_PX, gaussian_peak=False)
+            for before, after in zip(spectra[:_BLOCK], spectra[skip:], strict=False)
+        ]
+        return np.array([np.zeros(2) if shift is None else shift for shift in found]).reshape(-1, 2)
+
+    return np.array([float(np.mean(image)) for image in images[:_BLOCK]]), shifts(1), shifts(2)
