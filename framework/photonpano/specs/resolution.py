@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import SpecError
@@ -90,10 +91,7 @@ class _Resolver:
         refiners = self.components.items(KIND_OF["refine"], root.get("refine"), "refine", DEFAULT_REFINER)
         spec.sections_of = self.sections_of(root, refiners)
         spec.check_keys(root, "", SECTIONS)
-        if "version" not in root:
-            spec.wrong_key("version", f"required: {VERSION}, the version of the format")
-        elif type(root["version"]) is not int or root["version"] != VERSION:
-            spec.wrong("version", f"expected {VERSION}, the version of the format, got {given(root['version'])}")
+        self.check_version(root)
         source = self.components.stage("source", root.get("source"), "source").choice
         for complaint in complaints(source) if source and not spec.arriving else ():
             spec.wrong_key("source", complaint)
@@ -114,26 +112,7 @@ class _Resolver:
         check_flat_field(corrections or (), mergers, posed, spec)
         if source is None or renderer is None or (posed and pose is None) or spec.problems:
             return None
-        until_converged = root.get("levels") == UNTIL_CONVERGED
-        chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
-        document = {
-            "version": VERSION,
-            "source": _component(source),
-            "corrections": AUTO if corrections is None else written_corrections(corrections),
-            **chosen,
-            "refine": [_component(refiner) for refiner in refine if refiner],
-            "levels": UNTIL_CONVERGED if until_converged else [_level(level, chosen) for level in levels if level],
-            **({} if pose is None else {"pose": _component(pose)}),
-            **{name: section.model_dump(mode="json") for name, section in settings.items()},
-        }
-        document["render"] = _component(renderer) | document["render"]
-        document["run"] |= {} if executor is None else {"executor": _component(executor)}
-        document["output"] |= {"formats": [_component(each) for each in formats]}
-        if posed:
-            document = document_of_poses(document)
-        else:
-            del document["output"]["exposures"]
-        return Plan(
+        plan = Plan(
             source,
             corrections or (),
             () if posed else tuple(filter(None, levels)),
@@ -141,9 +120,9 @@ class _Resolver:
             renderer,
             formats,
             executor,
-            until_converged,
+            root.get("levels") == UNTIL_CONVERGED,
             **settings,
-            document=document,
+            document={},
             places=spec.places,
             file=spec.place("").file,
             observers=spec.catalog.observers,
@@ -151,6 +130,14 @@ class _Resolver:
             corrects_itself=corrections is None,
             pose=pose,
         )
+        return replace(plan, document=_document(plan, stages))
+
+    def check_version(self, root: dict[str, Any]) -> None:
+        """Refuse a spec of another format."""
+        if "version" not in root:
+            self.spec.wrong_key("version", f"required: {VERSION}, the version of the format")
+        elif type(root["version"]) is not int or root["version"] != VERSION:
+            self.spec.wrong("version", f"expected {VERSION}, the version of the format, got {given(root['version'])}")
 
     def settings(self, root: dict[str, Any], posed: bool) -> dict[str, Any]:
         """Validate the framework's own sections, and what they say together; None for a section with problems."""
@@ -252,6 +239,28 @@ class _Resolver:
         if settings is None or None in choices.values():
             return None
         return LevelPlan(**choices, fallbacks=selected["locate"].fallbacks, scale=settings.scale)
+
+
+def _document(plan: Plan, stages: dict[str, Stage]) -> dict[str, Any]:
+    """Write a plan down as a spec, defaults filled in; `stages` are those that levels do not override."""
+    chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
+    document = {
+        "version": VERSION,
+        "source": _component(plan.source),
+        "corrections": AUTO if plan.corrects_itself else written_corrections(plan.corrections),
+        **chosen,
+        "refine": [_component(refiner) for refiner in plan.refine],
+        "levels": UNTIL_CONVERGED if plan.until_converged else [_level(level, chosen) for level in plan.levels],
+        **({} if plan.pose is None else {"pose": _component(plan.pose)}),
+        **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
+    }
+    document["render"] = _component(plan.renderer) | document["render"]
+    document["run"] |= {} if plan.executor is None else {"executor": _component(plan.executor)}
+    document["output"] |= {"formats": [_component(each) for each in plan.formats]}
+    if plan.pose is not None:
+        return document_of_poses(document)
+    del document["output"]["exposures"]
+    return document
 
 
 def _settings(name: str, data: Any) -> Any:
