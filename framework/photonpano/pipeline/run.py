@@ -102,6 +102,11 @@ def run(
         keeps_work = keep_work or from_level is not None
         poses, was_finished = run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keeps_work)
         return RunResult(plan.output.directory, poses, None, was_finished)
+    return _panorama(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite)
+
+
+def _panorama(plan: Plan, progress: Progress, how: Continuation, *, overwrite: bool) -> RunResult:
+    """Run a plan for a panorama: estimate the motion in levels, refine and judge it, render, and write the results."""
     observers = Observers(plan.observers, plan.output.directory)
     finished: list[LevelResult] = []
 
@@ -109,17 +114,16 @@ def run(
         finished.append(result)
         observers.level_finished(result)
 
-    context = Context(progress=usual(progress), on_level=on_level)
-    with begun_run(plan, observers, context.progress, overwrite=overwrite) as begun, ExitStack() as stack:
+    context = Context(progress=progress, on_level=on_level)
+    with begun_run(plan, observers, progress, overwrite=overwrite) as begun, ExitStack() as stack:
         source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
         depends_on = run_fingerprint(plan, source)
-        if resume and (done := finished_run(plan, depends_on["capture"])) is not None:
+        if how.resume and (done := finished_run(plan, depends_on["capture"])) is not None:
             assert done["verdict"] is not None
             begun.finished(done)
             return RunResult(plan.output.directory, done, verdict_of(done["verdict"]), was_finished=True)
         decisions = first_decisions(plan, source)
-        how = Continuation(resume, from_level, keep_work)
-        work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, context.progress))
+        work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, progress))
         stack.enter_context(reporting_failure(plan, begun, decisions, finished, depends_on["capture"]))
         executor = stack.enter_context(executor_of(plan, source))
         context = replace(context, threads=executor.under_way, checkpoints=work.checkpoints, executor=executor)
