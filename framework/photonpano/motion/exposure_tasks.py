@@ -15,7 +15,7 @@ from photonpano.motion.level import FrameHomography, NamedLocator
 from photonpano.motion.merge import VirtualExposures
 from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import Stopwatch
-from photonpano.values import Homography, Located, NotLocated, VirtualExposure
+from photonpano.values import Decision, Homography, Located, NotLocated, VirtualExposure
 
 MAX_HYPOTHESES = 100
 """Most hypotheses of a pair that are used."""
@@ -49,9 +49,22 @@ class Pair:
     expected: FrameHomography | None
 
 
+@dataclass(frozen=True, slots=True)
+class Notes:
+    """What a task brings home beside its result.
+
+    Attributes:
+        seconds: in each stage.
+        decisions: of components, where it was worked on in another process.
+    """
+
+    seconds: dict[str, float]
+    decisions: tuple[Decision, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ExposureTasks:
-    """The tasks of a level. Each returns its seconds in each stage, too.
+    """The tasks of a level. Each returns notes, too.
 
     Exposures are given by their numbers, together with mappings in which their descriptions are.
 
@@ -63,7 +76,7 @@ class ExposureTasks:
 
     def describe(
         self, indices: Sequence[int], locator: int, keep: bool
-    ) -> tuple[dict[int, Described], tuple[list[Contrast], dict[str, float]]]:
+    ) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
         """Merge exposures, and have a locator describe them.
 
         Args:
@@ -86,11 +99,11 @@ class ExposureTasks:
                     with self.exposures.level.attributing(named):
                         features = named.component.describe(exposure)
             described[index] = Described(features, exposure if keep else None)
-        return described, (contrasts, clock.seconds)
+        return described, (contrasts, self._notes(clock))
 
     def hypotheses(
         self, locator: int, moving: int, fixed: int, *described: Mapping[int, Described]
-    ) -> tuple[list[Homography], dict[str, float]]:
+    ) -> tuple[list[Homography], Notes]:
         """Return what a locator that keeps hypotheses makes of a pair, in pixels of frames."""
         level, named, clock, known = self.exposures.level, self._locator(locator), Stopwatch(1), _joined(described)
         component = named.component
@@ -98,16 +111,16 @@ class ExposureTasks:
         with clock("locate"), level.attributing(named):
             listed = list(islice(component.hypotheses(known[moving].features, known[fixed].features), MAX_HYPOTHESES))
             found = [require_valid(Located(each)) for each in listed]
-        return [level.in_frame_px(each).homography for each in found if isinstance(each, Located)], clock.seconds
+        return [level.in_frame_px(each).homography for each in found if isinstance(each, Located)], self._notes(clock)
 
     def register(
         self, locator: int, pairs: Sequence[Pair], *described: Mapping[int, Described]
-    ) -> tuple[list[Located | NotLocated], dict[str, float]]:
+    ) -> tuple[list[Located | NotLocated], Notes]:
         """Return the motion of each pair in pixels of frames, as one locator finds it from where it is expected."""
         clock, known = Stopwatch(1), _joined(described)
         with clock("locate"):
             motions = [self._registered(self._locator(locator), pair, known) for pair in pairs]
-        return motions, clock.seconds
+        return motions, self._notes(clock)
 
     def _registered(self, named: NamedLocator, pair: Pair, known: Mapping[int, Described]) -> Located | NotLocated:
         level, shape = self.exposures.level, self.exposures.frame_shape
@@ -124,7 +137,7 @@ class ExposureTasks:
 
     def similarity(
         self, moving: int, fixed: int, motion: FrameHomography, *described: Mapping[int, Described]
-    ) -> tuple[float, dict[str, float]]:
+    ) -> tuple[float, Notes]:
         """Return the similarity of two exposures that were kept, along their motion."""
         clock, known = Stopwatch(1), _joined(described)
         one, other = known[moving].exposure, known[fixed].exposure
@@ -132,7 +145,10 @@ class ExposureTasks:
         assert other is not None
         with clock("locate"):
             similarity = exposure_similarity(one, other, motion)
-        return similarity, clock.seconds
+        return similarity, self._notes(clock)
+
+    def _notes(self, clock: Stopwatch) -> Notes:
+        return Notes(clock.seconds, self.exposures.level.recorder.taken())
 
     def _locator(self, number: int) -> NamedLocator:
         return self.exposures.level.locators[number]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NewType
 
 import numpy as np
 
 from photonpano.geometry import Camera, rescaled
 from photonpano.motion.attribution import attributing
+from photonpano.motion.recorder import Recorder
 from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler
 from photonpano.values import FloatArray, Located
 
@@ -44,6 +45,7 @@ class Level:
         scale: pixels of the level's exposures per pixel of a frame.
         locators: at least one; a pair that one of them does not locate is passed to the next.
         origins: who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0".
+        recorder: records what they decide.
     """
 
     number: int
@@ -53,10 +55,11 @@ class Level:
     locators: tuple[NamedLocator, ...]
     interpolator: Interpolator
     origins: Mapping[str, str]
+    recorder: Recorder = field(default_factory=Recorder)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel with what merges and locates; groups are chosen, and motions interpolated, where the loop runs."""
-        return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins)
+        return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins, self.recorder)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
         """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator.
@@ -96,7 +99,12 @@ class Level:
 
 
 def _for_tasks(
-    number: int, scale: float, merger: Merger, locators: tuple[NamedLocator, ...], origins: Mapping[str, str]
+    number: int,
+    scale: float,
+    merger: Merger,
+    locators: tuple[NamedLocator, ...],
+    origins: Mapping[str, str],
+    recorder: Recorder,
 ) -> Level:
     nothing: Any = None
-    return Level(number, scale, nothing, merger, locators, nothing, origins)
+    return Level(number, scale, nothing, merger, locators, nothing, origins, recorder)

@@ -13,7 +13,7 @@ from photonpano.context import Context, Log
 from photonpano.geometry import inverse, why_implausible
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.diagnosis import Contrast
-from photonpano.motion.exposure_tasks import Described, ExposureTasks, Pair
+from photonpano.motion.exposure_tasks import Described, ExposureTasks, Notes, Pair
 from photonpano.motion.level import FrameHomography
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of, shared_share
@@ -21,7 +21,7 @@ from photonpano.motion.start import starting_motion
 from photonpano.motion.tracking import Place, Track
 from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import batched, in_order, lagging
-from photonpano.values import Edge, FloatArray, Homography, Located, NotLocated
+from photonpano.values import Decision, Edge, FloatArray, Homography, Located, NotLocated
 
 ResultT = TypeVar("ResultT")
 
@@ -91,6 +91,7 @@ class Registrar:
         self._independent = independent_share(exposures.groups)
         self._kept: dict[int, _Kept] = {}
         self.contrasts: dict[int, Contrast] = {}
+        self._decided, self._lock = set[Decision](), Lock()
 
     @property
     def alternatives_px(self) -> Mapping[tuple[int, int], float]:
@@ -233,7 +234,7 @@ class Registrar:
             return closure
         pair = closure.moving, closure.fixed
         task = ExposureTasks.similarity, self._tasks, *pair, closure.motion.homography
-        similarity = self._timed(self._executor.call(*task, *self._described_by(0, pair)))
+        similarity = self._noted(self._executor.call(*task, *self._described_by(0, pair)))
         evidence = {**closure.motion.evidence, "closure_similarity": similarity}
         if similarity < MIN_SIMILARITY:
             reason = f"the similarity of the exposures of this loop closure is {similarity:.2f}, less than {MIN_SIMILARITY:g}"
@@ -243,7 +244,7 @@ class Registrar:
     def _describe(self, indices: Sequence[int], keep: bool = False) -> list[tuple[_Kept, Contrast]]:
         """Have the first locator describe exposures."""
         described, known = self._executor.keep(ExposureTasks.describe, self._tasks, indices, 0, keep)
-        return [(_Kept({0: described}), contrast) for contrast in self._timed(known)]
+        return [(_Kept({0: described}), contrast) for contrast in self._noted(known)]
 
     def _described_by(self, locator: int, indices: Iterable[int]) -> Iterable[Mapping[int, Described]]:
         """Return what stands for a locator's descriptions of exposures; for a fallback, they are merged again."""
@@ -255,15 +256,20 @@ class Registrar:
                     kept.described[locator], known = self._executor.keep(
                         ExposureTasks.describe, self._tasks, [index], locator, False
                     )
-                    self._timed(known)
+                    self._noted(known)
                 described = kept.described[locator]
             found[id(described)] = described
         return found.values()
 
-    def _timed(self, done: tuple[ResultT, dict[str, float]]) -> ResultT:
-        """Return the result of a task, and add its time to that of the level."""
-        result, seconds = done
-        self._clock.add(seconds)
+    def _noted(self, done: tuple[ResultT, Notes]) -> ResultT:
+        """Return the result of a task, and take note of its time and of decisions, which workers take alike, once."""
+        result, notes = done
+        self._clock.add(notes.seconds)
+        with self._lock:
+            for decision in notes.decisions:
+                if decision not in self._decided:
+                    self._decided.add(decision)
+                    self._level.recorder.add(decision)
         return result
 
     def _expected(self, moving: int, fixed: int) -> FrameHomography | None:
@@ -293,7 +299,7 @@ class Registrar:
             if isinstance(locator.component, KeepsHypotheses):
                 pair = moving, fixed
                 described = self._described_by(number, pair)
-                return self._timed(self._executor.call(ExposureTasks.hypotheses, self._tasks, number, *pair, *described))
+                return self._noted(self._executor.call(ExposureTasks.hypotheses, self._tasks, number, *pair, *described))
         return []
 
     def _register(self, moving: int, fixed: int, expected: FrameHomography | None, guessed: bool = False) -> Edge:
@@ -340,7 +346,7 @@ class Registrar:
             return []
         described = self._described_by(locator, (index for pair in pairs for index in (pair.moving, pair.fixed)))
         sent = pairs if starts else [replace(pair, expected=None) for pair in pairs]
-        motions = self._timed(self._executor.call(ExposureTasks.register, self._tasks, locator, sent, *described))
+        motions = self._noted(self._executor.call(ExposureTasks.register, self._tasks, locator, sent, *described))
         return [self._of_new_photons(pair, motion) for pair, motion in zip(pairs, motions, strict=True)]
 
     def _of_new_photons(self, pair: Pair, motion: Located | NotLocated) -> Located | NotLocated:

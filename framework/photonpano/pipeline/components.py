@@ -28,13 +28,14 @@ from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import attributing, shown
 from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
+from photonpano.motion.recorder import Recorder
 from photonpano.protocols import ColouredSource, PoseEstimator, Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
 from photonpano.threads import InOrder, in_order, thread_count
-from photonpano.values import CaptureSummary, Decision, DecisionValue, FrameSpan, Group, StreamInfo
+from photonpano.values import CaptureSummary, Decision, FrameSpan, Group, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.pipeline.exports import AttributedExporter
@@ -148,7 +149,8 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
     capture = _Once(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
-    context = _stage_context(plan, source, decisions, capture)
+    recorder = Recorder(decisions)
+    context = _stage_context(plan, source, recorder, capture)
     made: list[tuple[Choice, Any]] = []
 
     def component(choice: Choice) -> Any:
@@ -170,6 +172,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
             ),
             component(level.interpolate),
             {choice.contribution.kind: choice.label for choice in (level.resample, level.merge, level.interpolate)},
+            recorder,
         )
         for number, level in enumerate(plan.levels, start=1)
     )
@@ -185,7 +188,7 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
     """
     from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
 
-    context = _stage_context(plan, source, decisions)
+    context = _stage_context(plan, source, Recorder(decisions))
     return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
 
 
@@ -203,7 +206,7 @@ def build_renderer(
     from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
 
     choice, contribution = plan.renderer, plan.renderer.contribution
-    context = _stage_context(plan, source, decisions)
+    context = _stage_context(plan, source, Recorder(decisions))
     if in_order is not None:
         context = replace(context, in_order=in_order)
     assert isinstance(contribution, RendererContribution)
@@ -226,7 +229,7 @@ def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tu
     """
     from photonpano.pipeline.exports import AttributedExporter  # imports tifffile, which is not needed to check a spec
 
-    context = _stage_context(plan, source, decisions)
+    context = _stage_context(plan, source, Recorder(decisions))
     exporters = []
     for choice in plan.formats:
         assert isinstance(choice.contribution, ExporterContribution)
@@ -246,7 +249,7 @@ def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) 
 
     assert plan.pose is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
-    estimator: PoseEstimator = built(plan.pose, _stage_context(plan, source, decisions, capture))
+    estimator: PoseEstimator = built(plan.pose, _stage_context(plan, source, Recorder(decisions), capture))
     return estimator
 
 
@@ -290,43 +293,27 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
     """
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
-    resampler: Resampler = built(choice, _stage_context(plan, source, decisions, lambda: capture))
+    resampler: Resampler = built(choice, _stage_context(plan, source, Recorder(decisions), lambda: capture))
     with attributing(choice.label, "level 1"):
         require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
     return decisions
 
 
 def _stage_context(
-    plan: Plan, source: Source, decisions: list[Decision], capture: Callable[[], CaptureSummary] | None = None
+    plan: Plan, source: Source, recorder: Recorder, capture: Callable[[], CaptureSummary] | None = None
 ) -> StageContext:
     """Return the run for which components are built.
 
     Args:
         plan: has seed and threads.
         source: the capture.
-        decisions: receives the decisions that components take.
+        recorder: records the decisions that components take.
         capture: returns the flux and the speed of the capture; None for components that cannot ask for them.
     """
     threads = thread_count(plan.run.threads)
     at_once = partial(in_order, threads=threads)
-    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=_Recorder(decisions), in_order=at_once)
+    context = StageContext(source.info, source.response, plan.run.seed, threads, decide=recorder, in_order=at_once)
     return context if capture is None else replace(context, capture=capture)
-
-
-class _Recorder:
-    """Records decisions; where a component travels to, none."""
-
-    def __init__(self, decisions: list[Decision]) -> None:
-        self._decisions = decisions
-
-    def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
-        """Record a decision."""
-        if not isinstance(value, bool | int | float | str):
-            raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
-        self._decisions.append(Decision(what, value, reason))
-
-    def __reduce__(self) -> tuple[type[_Recorder], tuple[list[Decision]]]:
-        return _Recorder, ([],)
 
 
 class _Once:

@@ -68,14 +68,16 @@ def spec(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("default")
-def test_same_bytes_as_on_threads_though_workers_are_killed(spec: dict[str, Any], tmp_path: Path) -> None:
-    run(parse_spec(spec, output=tmp_path / "threads"))
+def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: dict[str, Any], tmp_path: Path) -> None:
+    here = run(parse_spec(spec, output=tmp_path / "threads"))
     elsewhere = {"run": {"executor": {"use": "dask", "with": {"workers": 2}}}}
     killing = Killing("level 2: merge and locate", "panorama")
-    run(parse_spec(spec | elsewhere, output=tmp_path / "dask"), killing)
+    there = run(parse_spec(spec | elsewhere, output=tmp_path / "dask"), killing)
     assert len(killing.killed) == 2
     for name in FILES:
         assert (tmp_path / "dask" / name).read_bytes() == (tmp_path / "threads" / name).read_bytes()
+    assert there.record["decisions"] == here.record["decisions"]
+    assert [each["what"] for each in here.record["decisions"]].count("chunk_frames") == 1
     assert not [each for each in psutil.Process().children(recursive=True) if "spawn_main" in str(each.cmdline())]
 
 
