@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import itemgetter
 from threading import Event
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 from photonpano.execution.packing import packed, unpacked
 from photonpano.interrupts import interrupted
@@ -94,8 +94,7 @@ class Remote:
 
     def share(self, value: ValueT) -> ValueT:
         """Return what stands for a value in tasks: it travels to each worker once."""
-        stand_in: ValueT = self._stand_in(self._workers.submit(_Shared, packed(value, self._capture), self._opener))
-        return stand_in
+        return cast("ValueT", _StandIn(self._workers.submit(_Shared, packed(value, self._capture), self._opener)))
 
     def call(self, work: Callable[..., ResultT], *given: Any) -> ResultT:
         """Work on a task, and return its result."""
@@ -105,14 +104,11 @@ class Remote:
     def keep(self, work: Callable[..., tuple[ValueT, ResultT]], *given: Any) -> tuple[ValueT, ResultT]:
         """Work on a task with two results; the first stays where it was made."""
         both = self._submitted(work, *given)
-        return self._stand_in(self._workers.submit(_first, both)), self._awaited(self._workers.submit(_second, both))
+        return cast("ValueT", _StandIn(both, of_two=True)), self._awaited(self._workers.submit(_second, both))
 
     def close(self) -> None:
         """End the processes that were started."""
         self._workers.close()
-
-    def _stand_in(self, pending: Pending) -> Any:
-        return _StandIn(pending)
 
     def _awaited(self, pending: Pending) -> Any:
         """Wait for a result. Once the program is interrupted, its threads do not wait any longer."""
@@ -128,17 +124,18 @@ class Remote:
             each.pending if isinstance(each, _StandIn) else _Sent(packed(each, self._capture), self._opener)
             for each in (work, *given)
         ]
-        return self._workers.submit(_work, *parts)
+        of_two = [isinstance(each, _StandIn) and each.of_two for each in (work, *given)]
+        return self._workers.submit(_work, of_two, *parts)
 
 
-_first, _second = itemgetter(0), itemgetter(1)
+_second = itemgetter(1)
 
 
 class _StandIn:
-    """Stands for a value that workers have."""
+    """Stands for a value that workers have, or for the first of two that a task has returned."""
 
-    def __init__(self, pending: Pending) -> None:
-        self.pending = pending
+    def __init__(self, pending: Pending, of_two: bool = False) -> None:
+        self.pending, self.of_two = pending, of_two
 
 
 class _Sent:
@@ -180,7 +177,13 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {there[name]} (here {here[name]})" for name in here if there[name] != here[name])
 
 
-def _work(*given: Any) -> Any:
-    """Work on a task, in the process of a worker."""
-    work, *values = (each.value() if isinstance(each, _Sent) else each for each in given)
+def _work(of_two: Sequence[bool], *given: Any) -> Any:
+    """Work on a task, in the process of a worker.
+
+    Args:
+        of_two: which of the things that are given are results of two values, the first of which is meant.
+        given: the function, and its arguments.
+    """
+    meant = (each[0] if first else each for first, each in zip(of_two, given, strict=True))
+    work, *values = (each.value() if isinstance(each, _Sent) else each for each in meant)
     return work(*values)
