@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
 from photonpano.filtering import SIGNIFICANT, SLOW, SYSTEMATIC_PX, WINDOW, Filtered, exceeding_noise
-from photonpano.geometry import apply, corners, inverse, normalised, step_motions
+from photonpano.geometry import BLOCK_FRAMES, apply, corners, inverse, normalised, step_motions
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.uneven_noise import separated
 
@@ -58,19 +58,31 @@ class ShortSpansRefiner:
         shift_px = float(np.sqrt(sum(np.mean(mode.signal**2) for mode in modes)))
         if shift_px < self._config.smallest_px:
             return None
-        frames = np.arange(len(std_px))
-        at = np.clip(frames, instants[0], instants[-1])
-        corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1))(at) / to_px
-        motions = trajectory.at(frames)
-        reference = int(np.abs(motions - np.eye(3)).max(axis=(1, 2)).argmin())
-        refined = motions @ step_motions(corrections, self._shape)
+        corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1) / to_px)
         shifts = np.stack([mode.signal for mode in modes[:2]], axis=1)
-        noise = np.interp(frames, instants, np.sqrt(sum(mode.std**2 for mode in modes)))
+        noise = np.interp(np.arange(len(std_px)), instants, np.sqrt(sum(mode.std**2 for mode in modes)))
         return Refined(
-            normalised(inverse(refined[reference]) @ refined),
+            self._corrected(trajectory, len(std_px), corrections, instants),
             np.hypot(std_px, noise),
             f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(shifts, instants)}",
         )
+
+    def _corrected(self, trajectory: Trajectory, n_frames: int, corrections: CubicSpline, instants: FloatArray) -> FloatArray:
+        """Return the homographies of all frames, moved by a spline of (shift x, shift y, roll, zoom), (T, 3, 3).
+
+        Frames before the first instant, and after the last one, are moved as at these.
+        """
+        refined, from_reference = np.empty((n_frames, 3, 3)), np.empty(n_frames)
+        for start in range(0, n_frames, BLOCK_FRAMES):
+            frames = np.arange(start, min(start + BLOCK_FRAMES, n_frames))
+            motions = trajectory.at(frames)
+            from_reference[frames] = np.abs(motions - np.eye(3)).max(axis=(1, 2))
+            refined[frames] = motions @ step_motions(corrections(np.clip(frames, instants[0], instants[-1])), self._shape)
+        to_reference = inverse(refined[from_reference.argmin()])
+        for start in range(0, n_frames, BLOCK_FRAMES):
+            block = slice(start, start + BLOCK_FRAMES)
+            refined[block] = normalised(to_reference @ refined[block])
+        return refined
 
     def _frequencies(self, shifts: FloatArray, instants: FloatArray) -> str:
         """Return the strongest frequencies of (S, 2) shifts, as the end of a sentence."""

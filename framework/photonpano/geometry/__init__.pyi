@@ -8,6 +8,7 @@ from .canvas import canvas_of as canvas_of
 from .canvas import canvas_of_box as canvas_of_box
 from .canvas import depths as depths
 from .frame_trajectory import FrameTrajectory as FrameTrajectory
+from .homographies import BLOCK_FRAMES as BLOCK_FRAMES
 from .homographies import apply as apply
 from .homographies import corner_displacements as corner_displacements
 from .homographies import corners as corners
@@ -20,6 +21,7 @@ from .homographies import rescaled as rescaled
 from .homographies import rescaling as rescaling
 from .homographies import scaled_ahead as scaled_ahead
 from .homographies import step_motions as step_motions
+from .homographies import steps_px as steps_px
 from .homographies import translation as translation
 from .plausibility import why_implausible as why_implausible
 from .projections import PROJECTIONS as PROJECTIONS

@@ -7,12 +7,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from photonpano.geometry.homographies import apply, corners, rescaling, translation
+from photonpano.geometry.homographies import BLOCK_FRAMES, apply, corners, rescaling, translation
 from photonpano.geometry.projections import PROJECTIONS, Projection
 from photonpano.values import FloatArray, Homography
-
-BLOCK_FRAMES = 8192
-"""The corners of this many frames are mapped at a time, which bounds the memory."""
 
 Box: TypeAlias = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from photonpano.geometry.homographies import BLOCK_FRAMES
 from photonpano.values import FloatArray
 
 
@@ -20,9 +21,12 @@ class FrameTrajectory:
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the homographies of N instants, in frames: (N, 3, 3)."""
-        last = len(self._homographies) - 1
-        instants = np.clip(np.asarray(frame_indices, dtype=np.float64), 0, last)
-        before = np.floor(instants).astype(int)
-        share = (instants - before)[..., None, None]
-        after = np.minimum(before + 1, last)
-        return np.asarray((1 - share) * self._homographies[before] + share * self._homographies[after])
+        instants = np.asarray(frame_indices, dtype=np.float64)
+        found, last = np.empty((len(instants), 3, 3)), len(self._homographies) - 1
+        for start in range(0, len(instants), BLOCK_FRAMES):
+            block = np.clip(instants[start : start + BLOCK_FRAMES], 0, last)
+            before = np.floor(block).astype(int)
+            share = (block - before)[:, None, None]
+            after = np.minimum(before + 1, last)
+            found[start : start + len(block)] = (1 - share) * self._homographies[before] + share * self._homographies[after]
+        return found

@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike
 
 from photonpano.values import FloatArray, Homography
 
+BLOCK_FRAMES = 8192
+"""What is computed of all frames of a capture is computed for this many at a time, which bounds the memory."""
+
 
 def normalised(matrices: ArrayLike) -> Homography:
     """Scale (..., 3, 3) matrices so that h33 = 1.
@@ -34,16 +37,21 @@ def scaled_ahead(matrices: ArrayLike) -> Homography:
     Raises:
         ValueError: a matrix is not finite.
     """
-    matrices = np.asarray(matrices, dtype=np.float64)
-    if not np.isfinite(matrices).all():
-        raise ValueError("a homography must be finite")
-    h33 = matrices[..., 2, 2]
-    return np.asarray(matrices / np.where(h33 > 0, h33, 1.0)[..., None, None])
+    return _scaled_ahead(np.array(matrices, dtype=np.float64))
 
 
 def inverse(homographies: Homography) -> Homography:
     """Return the inverse maps, (..., 3, 3) with h33 = 1 where that can be: see `scaled_ahead`."""
-    return scaled_ahead(np.linalg.inv(homographies))
+    return _scaled_ahead(np.asarray(np.linalg.inv(homographies), dtype=np.float64))
+
+
+def _scaled_ahead(matrices: Homography) -> Homography:
+    """Scale matrices in place."""
+    if not np.isfinite(matrices).all():
+        raise ValueError("a homography must be finite")
+    h33 = matrices[..., 2, 2]
+    matrices /= np.where(h33 > 0, h33, 1.0)[..., None, None]
+    return matrices
 
 
 def translation(x: float, y: float) -> Homography:
@@ -135,6 +143,20 @@ def corner_displacements(first: Homography, second: Homography, shape: tuple[int
     """Return the distances, in pixels, between the four corners of an image under one map and under another: (..., 4)."""
     frame = corners(shape)
     return np.asarray(np.linalg.norm(apply(first, frame) - apply(second, frame), axis=-1))
+
+
+def steps_px(homographies: Homography, shape: tuple[int, int]) -> FloatArray:
+    """Return the distances, in pixels, that the four corners of an image move from each map to the next: (N - 1, 4).
+
+    Args:
+        homographies: (N, 3, 3), such as those of all frames of a capture.
+        shape: (height, width) of the image.
+    """
+    moved = np.empty((max(len(homographies) - 1, 0), 4))
+    for start in range(0, len(moved), BLOCK_FRAMES):
+        block = homographies[start : start + BLOCK_FRAMES + 1]
+        moved[start : start + BLOCK_FRAMES] = corner_displacements(inverse(block[:-1]) @ block[1:], np.eye(3), shape)
+    return moved
 
 
 def parameters(homographies: Homography) -> FloatArray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from photonpano.geometry.homographies import BLOCK_FRAMES
 from photonpano.values import FloatArray
 
 ROTATION_AXES = np.array(
@@ -37,7 +38,10 @@ def rotation_vectors(rotations: ArrayLike) -> FloatArray:
 
 def nearest_rotations(matrices: ArrayLike) -> FloatArray:
     """Return the rotations nearest to (..., 3, 3) matrices of positive determinant, whatever their scale (Kabsch 1976)."""
-    left, _, right = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
-    signs = np.ones(left.shape[:-1])
-    signs[..., 2] = np.linalg.det(left @ right)
-    return np.asarray((left * signs[..., None, :]) @ right)
+    given = np.asarray(matrices, dtype=np.float64)
+    flat, found = given.reshape(-1, 3, 3), np.empty(given.shape)
+    for start in range(0, len(flat), BLOCK_FRAMES):
+        left, _, right = np.linalg.svd(flat[start : start + BLOCK_FRAMES])
+        left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+        found.reshape(-1, 3, 3)[start : start + BLOCK_FRAMES] = left @ right
+    return found

@@ -22,6 +22,8 @@ from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homograp
 
 _RUN = 64
 """Chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded."""
+_BLOCK = 4096
+"""Chunks whose footprints are known at a time."""
 MIN_WEIGHT = 1.0
 """Pixels with less weight than this, in frames, are unknown."""
 
@@ -92,16 +94,21 @@ def accumulate(
     light = light_of(source)
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
     canvas = onto if isinstance(onto, Canvas) else Canvas(*shape, onto)
-    visible = _visible(source, chunks, canvas)
-    if off_grid := _frames(chunks) - _frames([chunk for chunk, _ in visible]):
-        advance(off_grid)
     if in_order is None:
+        visible = _visible(source, chunks, canvas)
+        if off_grid := _frames(chunks) - _frames([chunk for chunk, _ in visible]):
+            advance(off_grid)
         counts, coverages = _sum_on(source, terms, counts_of or source.counts, canvas, visible, advance)
     else:
         number = 1 if terms is None else terms.number
         counts, coverages = np.zeros(shape, np.float32), np.zeros((number, *shape), np.float32)
-        runs = [visible[first : first + _RUN] for first in range(0, len(visible), _RUN)]
-        for part in in_order(partial(_sum_of_run, source, terms, canvas), ([chunk for chunk, _ in run] for run in runs)):
+        # Footprints take more memory than chunks, and each run finds its own.
+        blocks = (chunks[first : first + _BLOCK] for first in range(0, len(chunks), _BLOCK))
+        shown = [chunk for block in blocks for chunk, _ in _visible(source, block, canvas)]
+        if off_grid := _frames(chunks) - _frames(shown):
+            advance(off_grid)
+        runs = (shown[first : first + _RUN] for first in range(0, len(shown), _RUN))
+        for part in in_order(partial(_sum_of_run, source, terms, canvas), runs):
             counts[part.box] += part.counts
             coverages[:, *part.box] += part.coverages
             advance(part.n_frames)

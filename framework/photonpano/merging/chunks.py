@@ -11,10 +11,9 @@ from threading import Lock
 
 import numpy as np
 
-from photonpano.geometry import corner_displacements, inverse
-from photonpano.geometry.canvas import BLOCK_FRAMES
+from photonpano.geometry import BLOCK_FRAMES, steps_px
 from photonpano.protocols import Source, Trajectory
-from photonpano.values import Counts, FloatArray, FrameSpan, Homography
+from photonpano.values import Counts, FrameSpan, Homography
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,22 +40,15 @@ def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, i
         tolerance_px: length of a corner's path, in pixels of a frame, that one warp may ignore. A chunk is warped at its
             centre instant, so that a photon is misplaced by about half of it at most.
     """
-    blocks = range(span.start, span.stop - 1, BLOCK_FRAMES)
-    steps = [_steps_px(trajectory, start, min(start + BLOCK_FRAMES, span.stop - 1), frame_shape) for start in blocks]
+    blocks = [FrameSpan(block.start, min(block.stop + 1, span.stop)) for block in span.blocks(BLOCK_FRAMES)]
+    # The motion of each frame in pixels of the frame before.
+    steps = [steps_px(trajectory.at(np.arange(block.start, block.stop)), frame_shape).max(axis=-1) for block in blocks]
     path_px = np.cumsum(np.concatenate([[0.0], *steps]))
     starts = span.start + np.flatnonzero(np.diff(np.floor(path_px / tolerance_px), prepend=-1.0))
     stops = np.append(starts[1:], span.stop)
     spans = [FrameSpan(start, stop) for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
     centres = trajectory.at([chunk.centre for chunk in spans])
     return tuple(Chunk(chunk, homography) for chunk, homography in zip(spans, centres, strict=True))
-
-
-def _steps_px(trajectory: Trajectory, start: int, stop: int, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return the largest corner displacement from each frame to the next, from `start` to `stop`: (stop - start,)."""
-    homographies = trajectory.at(np.arange(start, stop + 1))
-    # The motion of frame t + 1 in pixels of frame t.
-    steps = inverse(homographies[:-1]) @ homographies[1:]
-    return np.asarray(corner_displacements(steps, np.eye(3), frame_shape).max(axis=-1))
 
 
 def clipped(chunks: Sequence[Chunk], span: FrameSpan, trajectory: Trajectory) -> tuple[Chunk, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry import Camera, FrameTrajectory, nearest_rotations
+from photonpano.geometry import BLOCK_FRAMES, Camera, FrameTrajectory, nearest_rotations
 from photonpano.merging.canvas_plan import View
 from photonpano.motion.loop import LevelResult
 from photonpano.protocols import Source, Trajectory, camera_of, camera_of_motion
@@ -65,7 +65,7 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     frames, span = np.arange(stream.n_frames), last.located.covered
     located = (span.start <= frames) & (frames < span.stop)
     std_px = np.where(located, last.uncertainty.at(frames), np.inf)
-    homographies = last.trajectory.at(frames)
+    homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
     return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera)

@@ -174,11 +174,12 @@ def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Pat
 
 def _of_camera(motion: FrameMotion) -> dict[str, NDArray[Any]]:
     """Return what the archive of the motion holds beside the homographies, for a camera that only turns."""
-    if motion.camera is None or motion.rotations is None:
+    rotations = motion.rotations
+    if motion.camera is None or rotations is None:
         return {}
     return {
         "model": np.array("rotation"),
-        "rotations": motion.rotations,
+        "rotations": rotations,
         "camera_matrix": motion.camera.matrix,
         "distortion": motion.camera.distortion,
     }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import PROJECTIONS, apply, corners, outline_of
+from photonpano.geometry import PROJECTIONS, apply, corners, nearest_rotations, outline_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
@@ -107,10 +107,11 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
 def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray, str]:
     """Return the path of the frame centre from that of the reference frame, (N, 2), and its unit: degrees of a turn."""
     centre = centre_of(motion.frame_shape)
-    if motion.camera is None or motion.rotations is None:
+    if motion.camera is None:
         return apply(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
     ahead = motion.camera.directions(centre[0])
-    points = PROJECTIONS["spherical"].points(motion.rotations[instants] @ ahead) - PROJECTIONS["spherical"].points(ahead)
+    rotations = nearest_rotations(motion.camera.rotations(motion.homographies[instants]))
+    points = PROJECTIONS["spherical"].points(rotations @ ahead) - PROJECTIONS["spherical"].points(ahead)
     path = np.degrees(np.unwrap(points, axis=0))
     reference = min(int(np.searchsorted(instants, motion.reference)), len(path) - 1)
     return path - 360 * np.round(path[reference] / 360), "degrees"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.geometry import corner_displacements, corners, inverse
+from photonpano.geometry import corners, steps_px
 from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
 from photonpano.residuals.prediction import Prediction, Predictions
@@ -165,8 +165,7 @@ def spans_of(span: FrameSpan, predictions: Predictions) -> tuple[FrameSpan, ...]
     homographies = predictions.first.trajectory.at(frames)
     speed, jumps = 0.0, np.empty(0, int)
     if len(frames) > 1:
-        steps = inverse(homographies[:-1]) @ homographies[1:]
-        moved = corner_displacements(steps, np.eye(3), frame_shape).mean(axis=-1)
+        moved = steps_px(homographies, frame_shape).mean(axis=-1)
         speed = float(np.quantile(moved, 0.95))
         jumps = span.start + 1 + np.flatnonzero(moved > max(_JUMP_PX, _JUMP_RATIO * speed))
     probes = np.linspace(0, len(frames) - 1, _PROBES).astype(int)

@@ -10,7 +10,7 @@ import numpy as np
 
 from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import Canvas, FrameTrajectory, corner_displacements, inverse, nearest_rotations
+from photonpano.geometry import BLOCK_FRAMES, Canvas, FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
@@ -203,7 +203,8 @@ def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> 
         if motion.camera is not None:
             turned = nearest_rotations(motion.camera.rotations(homographies))
             return replace(found, homographies=motion.camera.homographies(turned[motion.reference].T @ turned))
-        return replace(found, homographies=homographies / homographies[:, 2:, 2:])
+        homographies /= homographies[:, 2:, 2:].copy()
+        return replace(found, homographies=homographies)
 
 
 def require_refined(found: object, std_px: FloatArray) -> Refined:
@@ -251,5 +252,8 @@ def require_refined(found: object, std_px: FloatArray) -> Refined:
 
 def _change_px(before: FrameMotion, after: FrameMotion) -> float:
     """Return the mean displacement of the corners of the located frames."""
-    steps = inverse(before.homographies[before.located]) @ after.homographies[before.located]
-    return float(corner_displacements(steps, np.eye(3), before.frame_shape).mean()) if len(steps) else 0.0
+    total = 0.0
+    for block in before.span.blocks(BLOCK_FRAMES):
+        first, last = (motion.homographies[block.start : block.stop] for motion in (before, after))
+        total += float(corner_displacements(inverse(first) @ last, np.eye(3), before.frame_shape).mean(axis=-1).sum())
+    return total / len(before.span)

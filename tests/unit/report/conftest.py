@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -188,6 +189,24 @@ def make_record(n_frames: int, panorama: RenderedPanorama) -> dict[str, Any]:
         "seconds": 83.2,
         "peak_memory_bytes": 812 * 1024**2,
     }
+
+
+@pytest.fixture(scope="session")
+def results_of() -> Callable[[int], tuple[FrameMotion, RenderedPanorama]]:
+    """Make the motion and the panorama of a number of frames."""
+    return make_results
+
+
+@pytest.fixture(scope="session")
+def tremor_of() -> Callable[[int], Residuals]:
+    """Make the residuals of a motion of a number of frames that lacks a tremor."""
+    return partial(make_residuals, tremor_px=0.3)
+
+
+@pytest.fixture(scope="session")
+def record_of() -> Callable[[int, RenderedPanorama], dict[str, Any]]:
+    """Make the record of a run of a number of frames."""
+    return make_record
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,135 @@
+"""What is done with every frame at the end of a run takes memory for its motion and little more, and pages do not grow."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonpano import Refined
+from photonpano.geometry import FrameTrajectory, nearest_rotations, steps_px
+from photonpano.merging import chunks_of
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.timeline import Timeline
+from photonpano.pipeline.run_folder import run_folder
+from photonpano.report import render_report
+from photonpano.residuals.measure import Residuals
+from photonpano.residuals.refinement import Explained, require_refined
+from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, standing_out, unexplained_px
+from photonpano_core.configs import ShortSpansConfig
+from photonpano_core.short_spans import ShortSpansRefiner
+
+SHORT, LONG = 20_000, 80_000
+
+
+@dataclass(frozen=True)
+class End:
+    """The end of a run of a capture that trembles."""
+
+    motion: FrameMotion
+    panorama: RenderedPanorama
+    residuals: Residuals
+    record: dict[str, Any]
+
+    @property
+    def n_frames(self) -> int:
+        return len(self.motion.homographies)
+
+    @property
+    def explained(self) -> Explained:
+        return Explained(self.motion, self.panorama.thumbnail, self.panorama.canvas, self.residuals, 1.0, ())
+
+    def refined(self) -> Refined | None:
+        refiner = ShortSpansRefiner(ShortSpansConfig(), self.motion.frame_shape, 96_800.0)
+        motion = self.motion
+        return refiner.refine(None, motion.trajectory, motion.std_px, self.residuals.steps(), None)
+
+    def written(self, directory: Path) -> None:
+        with run_folder(directory) as folder:
+            folder.write_results(self.panorama, self.motion)
+            folder.commit(self.record)
+            folder.reopen()
+            folder.write_report("<html></html>")
+            folder.commit(self.record)
+
+
+@pytest.fixture(scope="module")
+def ends(
+    results_of: Callable[[int], tuple[FrameMotion, RenderedPanorama]],
+    tremor_of: Callable[[int], Residuals],
+    record_of: Callable[[int, RenderedPanorama], dict[str, Any]],
+) -> tuple[End, End]:
+    """Return the end of a short run, and that of a run four times as long."""
+
+    def end(n_frames: int) -> End:
+        motion, panorama = results_of(n_frames)
+        motion = replace(motion, trajectory=FrameTrajectory(motion.homographies))
+        return End(motion, panorama, tremor_of(n_frames), record_of(n_frames, panorama))
+
+    return end(SHORT), end(LONG)
+
+
+def bytes_a_frame(work: Callable[[End], object], ends: tuple[End, End]) -> float:
+    """Return by how many bytes the memory that some work takes grows for each frame."""
+    peaks = []
+    for end in ends:
+        tracemalloc.start()
+        try:
+            work(end)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    return (peaks[1] - peaks[0]) / (LONG - SHORT)
+
+
+@pytest.mark.parametrize(
+    ("work", "most"),
+    [
+        pytest.param(lambda end: end.motion.trajectory.at(np.arange(end.n_frames)), 100, id="motion"),
+        pytest.param(lambda end: steps_px(end.motion.homographies, end.motion.frame_shape), 40, id="steps"),
+        pytest.param(lambda end: nearest_rotations(end.motion.homographies), 80, id="rotations"),
+        pytest.param(lambda end: chunks_of(end.motion.span, end.motion.trajectory, (254, 496), 0.5), 60, id="chunks"),
+        pytest.param(lambda end: plan_canvas(end.motion.trajectory, end.motion.span, (254, 496), 1.0, 2**31), 150, id="canvas"),
+        pytest.param(lambda end: residual_ratio(end.residuals), 40, id="ratio"),
+        pytest.param(lambda end: standing_out(end.residuals), 40, id="outliers"),
+        pytest.param(lambda end: unexplained_px(end.residuals, end.n_frames), 60, id="unexplained"),
+        pytest.param(lambda end: bounded_std_px(end.motion.std_px, end.residuals), 80, id="bounds"),
+        pytest.param(End.refined, 150, id="refinement"),
+        pytest.param(
+            lambda end: require_refined(Refined(end.motion.homographies, end.motion.std_px, ""), end.motion.std_px),
+            40,
+            id="check",
+        ),
+    ],
+)
+def test_memory_for_a_frame_is_little_more_than_its_motion(
+    work: Callable[[End], object], most: float, ends: tuple[End, End]
+) -> None:
+    """A homography takes 72 bytes."""
+    assert bytes_a_frame(work, ends) < most
+
+
+def test_writing_results_takes_no_more_than_another_motion(ends: tuple[End, End], tmp_path: Path) -> None:
+    assert bytes_a_frame(lambda end: end.written(tmp_path / str(end.n_frames)), ends) < 100
+
+
+def test_page_of_a_long_run_is_no_larger(ends: tuple[End, End]) -> None:
+    short, long = (len(render_report(end.record, end.explained, end.panorama)) for end in ends)
+    assert long < 1.1 * short
+
+
+def test_time_of_a_group_does_not_take_a_look_at_all_frames() -> None:
+    timeline = Timeline.regular(10 * LONG)
+    tracemalloc.start()
+    try:
+        assert timeline.times(123.25) == 123.25
+        assert tracemalloc.get_traced_memory()[1] < 10_000
+    finally:
+        tracemalloc.stop()
