@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from photonpano.context import Context
-from photonpano.geometry import corner_displacements, inverse
+from photonpano.geometry import steps_px
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
 from photonpano.protocols import Source
@@ -96,7 +96,7 @@ def _suspect(look: Look, margin: int) -> list[FrameSpan]:
 
 def _size_of_sums(look: Look) -> int:
     residuals, homographies = look.residuals, look.motion.homographies[look.motion.located]
-    moved = corner_displacements(inverse(homographies[:-1]) @ homographies[1:], np.eye(3), residuals.frame_shape)
+    moved = steps_px(homographies, residuals.frame_shape)
     per_frame = residuals.normal[:, [0, 1], [0, 1]].mean(axis=1) / [len(span) for span in residuals.spans]
     noise_px = _TRACK_RATIO / np.sqrt(max(float(np.median(per_frame)), 1e-9))
     wanted = min((noise_px / _TRACK_NOISE_PX) ** 2, _MOTION_PX / max(float(np.median(moved)), 1e-9))
@@ -125,35 +125,34 @@ def _outliers(track: SumTrack, size: int, smallest: float) -> list[_Outlier]:
     The frame of a jump lies in some sum, so that the shift from the sum before to that after is compared with the motion before
     and after. A shift between the two is that of a turn. Where sums without light lie between, the next sum is the one after.
     """
-    pairs, unexplained, sizes = [], [], []
-    centres = track.centres
-    for before in range(1, len(centres) - 3):
-        gap = centres[before + 1] - centres[before] > 1.5 * size
-        after = before + 1 if gap else before + 2
-        if after + 1 >= len(centres) or (not gap and centres[after] - centres[before] > 2.5 * size):
-            continue
-        frames = centres[after] - centres[before]
-        found = track.next_px[before] if gap else track.second_px[before]
-        left, right = track.velocity(before - 1, before) * frames, track.velocity(after, after + 1) * frames
-        pairs.append((before, after))
-        unexplained.append(_beyond(found, left, right))
-        # Over a longer time, the motion may change by more.
-        sizes.append(float(np.linalg.norm(unexplained[-1])) * min(1.0, 2 * size / frames))
+    centres, velocities = track.centres, track.velocities
+    before = np.arange(1, len(centres) - 3)
+    gap = centres[before + 1] - centres[before] > 1.5 * size
+    after = before + np.where(gap, 1, 2)
+    tracked = gap | (centres[after] - centres[before] <= 2.5 * size)
+    before, after, gap = before[tracked], after[tracked], gap[tracked]
+    frames = (centres[after] - centres[before])[:, None]
+    found = np.where(gap[:, None], track.next_px[before], track.second_px[before])
+    unexplained = _beyond(found, velocities[before - 1] * frames, velocities[after] * frames)
+    # Over a longer time, the motion may change by more.
+    sizes = np.linalg.norm(unexplained, axis=1) * np.minimum(1, 2 * size / frames[:, 0])
     outliers = []
-    for index, (before, after) in enumerate(pairs):
+    for index in np.flatnonzero(sizes > smallest).tolist():
+        if sizes[index] < sizes[max(0, index - 3) : index + 4].max():
+            continue
         around = np.r_[sizes[max(0, index - _LOCAL) : max(0, index - 3)], sizes[index + 4 : index + _LOCAL + 1]]
-        near = sizes[max(0, index - 3) : index + 4]
         usual = max(float(np.median(around)), smallest / _OUTLIER) if len(around) >= _FEWEST else np.inf
-        if sizes[index] == max(near) and sizes[index] > _OUTLIER * usual:
-            outliers.append(_Outlier(before, after, unexplained[index], float(sizes[index] / usual)))
+        if sizes[index] > _OUTLIER * usual:
+            sigmas = float(sizes[index] / usual)
+            outliers.append(_Outlier(int(before[index]), int(after[index]), unexplained[index], sigmas))
     return outliers
 
 
 def _beyond(found: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
-    """Return the vector to a point from the nearest one between two others: (2,)."""
+    """Return the vectors to N points from the nearest ones between two others: (N, 2)."""
     way = last - first
-    share = np.clip((found - first) @ way / max(float(way @ way), 1e-12), 0, 1)
-    return np.asarray(found - (first + share * way))
+    share = ((found - first) * way).sum(axis=1) / np.maximum((way**2).sum(axis=1), 1e-12)
+    return np.asarray(found - (first + np.clip(share, 0, 1)[:, None] * way))
 
 
 def _dark_frames(source: Source, span: FrameSpan) -> FrameSpan | None:

@@ -45,10 +45,10 @@ class SumTrack:
         """(N,) instants, in frames."""
         return np.array([span.centre for span in self.spans])
 
-    def velocity(self, first: int, last: int) -> FloatArray:
-        """Return the mean velocity of the image from one sum to another: (2,) in binned px per frame."""
-        frames = self.spans[last].centre - self.spans[first].centre
-        return np.asarray(self.next_px[first:last].sum(axis=0) / frames)
+    @property
+    def velocities(self) -> FloatArray:
+        """(N - 1, 2) mean velocity of the image from each sum to the next, in binned px per frame."""
+        return np.asarray(self.next_px / np.diff(self.centres)[:, None])
 
 
 def track_sums(source: Source, spans: Sequence[FrameSpan], context: Context) -> SumTrack | None:

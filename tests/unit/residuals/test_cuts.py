@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 
 import cv2
@@ -13,6 +14,7 @@ from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut
+from photonpano.residuals import sum_track
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
 from photonpano.testing import MemorySource
@@ -91,3 +93,29 @@ def test_jump_behind_dark_frames_is_cut_in_their_middle(cuts_of: Callable[..., t
 
 def test_dark_frames_without_jump_are_not_cut(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
     assert cuts_of(PAN_PX, PAN_PX, dark=FrameSpan(300, 350)) == ()
+
+
+def test_long_tremor_is_searched_without_keeping_its_sums(street: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of a capture that trembles is searched: sums of 48x64 px that are kept would take 12 kB each."""
+    monkeypatch.setattr(sum_track, "_BLOCK", 8)
+    rng, size = np.random.default_rng(5), (64, 48)
+
+    def peak(n_frames: int) -> int:
+        frames = np.arange(n_frames)
+        tremor_px = 3 * np.sin(2 * np.pi * frames / 40)
+        views = [cv2.warpAffine(street, np.float64([[1, 0, -250 - x], [0, 1, -300]]), size) for x in tremor_px]
+        source = MemorySource([rng.random((48, 64)) < -np.expm1(-view) for view in views])
+        homographies, everywhere = np.tile(np.eye(3), (n_frames, 1, 1)), np.ones(n_frames, dtype=bool)
+        span, std_px = FrameSpan(0, n_frames), np.full(n_frames, 0.05)
+        motion = FrameMotion(FrameTrajectory(homographies), span, homographies, everywhere, std_px, 0, (48, 64))
+        look = Look(source, motion, 0.25, 2**30, Context())
+        tracemalloc.start()
+        try:
+            assert find_cuts(source, look, Context()) == ()
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(500)
+    # Numbers and arrays of a few bytes for each frame are kept.
+    assert peak(2000) < peak(500) + 1_000_000
