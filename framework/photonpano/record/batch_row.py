@@ -35,7 +35,8 @@ class BatchRow:
         n_frames: frames of the capture.
         seconds: time that the run took.
         peak_memory_bytes: the largest memory of the run; None where the system does not report it.
-        has_report: whether the run folder has a `report.html`.
+        report: the page of the run: `report.html` of its folder or, if it failed, the page beside that folder; None where there
+            is none.
         thumbnail: the panorama as a data URI of a small JPEG; None without a panorama.
     """
 
@@ -55,7 +56,7 @@ class BatchRow:
     n_frames: int | None = None
     seconds: float | None = None
     peak_memory_bytes: int | None = None
-    has_report: bool = False
+    report: Path | None = None
     thumbnail: str | None = field(default=None, repr=False)
 
     @property

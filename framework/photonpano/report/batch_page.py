@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -78,7 +79,7 @@ def render_batch(
             failed=[row for row in rows if row.status == "failed"],
             numbers=Counter(row.verdict or row.status for row in rows),
             colours=_COLOURS,
-            links=[_link(directory, row) for row in rows],
+            link_of=partial(_link, directory),
             columns=[each for each in _COLUMNS if any(getattr(row, each.figure) is not None for row in rows)],
             pictures=any(row.thumbnail for row in rows),
             has_truth=any(row.true_error_px is not None or row.true_position_error is not None for row in rows),
@@ -96,4 +97,4 @@ def render_batch(
 
 def _link(directory: Path, row: BatchRow) -> str | None:
     """Return the address of the report of a run, relative to the page; None if there is none."""
-    return quote(os.fsencode((row.directory / "report.html").relative_to(directory).as_posix())) if row.has_report else None
+    return None if row.report is None else quote(os.fsencode(Path(os.path.relpath(row.report, directory)).as_posix()))

@@ -75,7 +75,7 @@ def _attempted(job: Job, catalog: Catalog | None) -> BatchRow:
         reason = "\n".join(each.message for each in own) if len(own) == len(error.problems) else str(error)
         return replace(job.row, status="failed", reason=reason)
     except PhotonpanoError as error:
-        return replace(job.row, status="failed", reason=str(error))
+        return replace(job.row, status="failed", reason=str(error), report=error.report)
     except MemoryError:
         return replace(job.row, status="failed", reason="there is not enough memory; lower run.memory, or the number of jobs")
     except Exception as error:
@@ -97,7 +97,7 @@ def _finished(row: BatchRow, result: RunResult) -> BatchRow:
         n_frames=record["source"]["n_frames"],
         seconds=record["seconds"],
         peak_memory_bytes=record["peak_memory_bytes"],
-        has_report="report.html" in record.get("files", {}),
+        report=result.directory / "report.html" if "report.html" in record.get("files", {}) else None,
         thumbnail=_thumbnail(result.directory / "panorama.png"),
     )
 

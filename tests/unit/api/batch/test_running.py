@@ -55,7 +55,8 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
 def test_run_is_scored_and_not_repeated(job_of: Callable[[Location], Job], scan: Path, without_report: None) -> None:
     job = pickle.loads(pickle.dumps(job_of(scan)))
     row = run_job(job)
-    assert (row.status, row.was_finished, row.n_frames, row.has_report) == ("done", False, 200, True), row.reason
+    assert (row.status, row.was_finished, row.n_frames) == ("done", False, 200), row.reason
+    assert row.report == job.row.directory / "report.html"
     assert row.verdict in ("trusted", "doubtful")
     assert 0 < row.true_error_px < 1
     assert 0 < row.expected_error_px < 1
@@ -101,6 +102,15 @@ def test_capture_that_cannot_be_used_says_why(
     assert row.status == "failed"
     assert row.reason.startswith(reason.format(path=path)), row.reason
     assert not row.directory.exists()
+
+
+def test_run_that_is_not_located_has_a_page(job_of: Callable[[Location], Job], tmp_path: Path, without_report: None) -> None:
+    noise = np.random.default_rng(0).random((200, 64, 96)) < 0.01
+    np.save(tmp_path / "cube.npy", np.packbits(noise, axis=-1))
+    row = run_job(job_of(tmp_path / "cube.npy"))
+    assert (row.status, row.report) == ("failed", tmp_path / "out" / "cube.failed.html")
+    assert "could be located" in row.reason
+    assert row.report.exists()
 
 
 def test_error_and_warnings_of_a_run_are_its_reason(

@@ -21,13 +21,13 @@ DONE = {
     "n_frames": 2000,
     "seconds": 1.5,
     "peak_memory_bytes": 2**28,
-    "has_report": True,
     "thumbnail": PICTURE,
 }
 
 
 def row(name: str, folder: Path, settings: dict[str, Any] | None = None, **found: Any) -> BatchRow:
-    return BatchRow(name, Path(f"captures/{name}.npy"), settings or {}, folder / name, **found)
+    report = folder / name / "report.html" if found.get("status") == "done" else None
+    return BatchRow(name, Path(f"captures/{name}.npy"), settings or {}, folder / name, **{"report": report} | found)
 
 
 def summary(folder: Path, rows: list[BatchRow], keys: tuple[str, ...] = ()) -> tuple[list[dict[str, str]], str]:
@@ -42,6 +42,7 @@ def test_every_status_is_a_row(tmp_path: Path) -> None:
         row("good", tmp_path, **DONE),
         row("odd #1", tmp_path, **DONE | {"verdict": "doubtful", "reason": "frames are blurred\nwarning: hot"}),
         row("bad", tmp_path, status="failed", reason='a "<b>" is cut short,\ncopy it again'),
+        row("dark", tmp_path, status="failed", reason="no pair", report=tmp_path / "dark.failed.html"),
         row("now", tmp_path, status="running"),
         row("next", tmp_path),
         row("never", tmp_path, status="interrupted"),
@@ -51,6 +52,7 @@ def test_every_status_is_a_row(tmp_path: Path) -> None:
         ("good", "done", "trusted"),
         ("odd #1", "done", "doubtful"),
         ("bad", "failed", ""),
+        ("dark", "failed", ""),
         ("now", "running", ""),
         ("next", "waiting", ""),
         ("never", "interrupted", ""),
@@ -58,9 +60,11 @@ def test_every_status_is_a_row(tmp_path: Path) -> None:
     assert table[0] | {"run": "good", "true_error_px": "0.05", "peak_memory_bytes": str(2**28)} == table[0]
     assert table[2]["reason"] == 'a "<b>" is cut short,\ncopy it again'
     statuses = re.findall(r'class="status \w*">([^<]+)<', page)
-    assert statuses == ["1 trusted", "1 doubtful", "1 failed", "1 running", "1 waiting", "1 interrupted"]
+    assert statuses == ["1 trusted", "1 doubtful", "2 failed", "1 running", "1 waiting", "1 interrupted"]
     assert "a &#34;&lt;b&gt;&#34; is cut short,<br/>copy it again" in page
     assert 'href="odd%20%231/report.html"' in page
+    assert page.count('<a href="dark.failed.html">dark</a>') == 2
+    assert page.count('<th scope="row">bad</th>') == 2
     assert page.count(PICTURE) == 2
     assert "<code>run.seed=1</code>" in page
 
