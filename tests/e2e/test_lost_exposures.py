@@ -116,7 +116,7 @@ def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Calla
     start = "If the image turns or shifts at a constant velocity, write motion: {start: constant-velocity}."
     assert lines[-1] == start
     assert lines[-2] == (
-        "In these exposures of 50 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
+        "In these exposures of 50 frames the scene does not stand out from a pixel's photon noise: either they are too dark "
         "(try larger groups, such as resample.with.group_size=100), or the scene has no texture there."
     )
     fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 3})

@@ -22,6 +22,8 @@ TOLERATED_RUN = 2
 _NOISY, _CLEAR = 0.25, 2.0
 """Below the first signal-to-noise ratio the likely cause is darkness, above the second it is blur, in between either. Lack of
 texture may be the cause at any ratio."""
+_NOTHING = 0.01
+"""Signal-to-noise ratio below which its value says no more than that there is hardly any signal."""
 _FAR = 1e9
 """Numbers of a homography from this on map a frame to infinity."""
 _SHOWN = 6
@@ -202,7 +204,8 @@ def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Co
         return []
     ratio = float(np.median([contrast.signal_to_noise for contrast in lost if not contrast.blank]))
     size = int(np.median([len(group.span) for group in groups]))
-    seen = f"In these exposures of {size} frames the scene varies {ratio:.2g} times as much as a pixel's photon noise"
+    varies = "does not stand out from" if ratio < _NOTHING else f"varies {ratio:.2g} times as much as"
+    seen = f"In these exposures of {size} frames the scene {varies} a pixel's photon noise"
     if ratio < _NOISY:
         return [
             f"{seen}: either they are too dark (try larger groups, such as resample.with.group_size={2 * size}), "

@@ -118,6 +118,13 @@ def test_refusal_advises_larger_groups_at_low_signal_to_noise() -> None:
     ]
 
 
+def test_refusal_gives_no_ratio_where_there_is_no_signal() -> None:
+    assert refusal((4, 5, 6), Contrast(0.0)).splitlines()[-2] == (
+        "In these exposures of 100 frames the scene does not stand out from a pixel's photon noise: either they are too dark "
+        "(try larger groups, such as resample.with.group_size=200), or the scene has no texture there."
+    )
+
+
 def test_refusal_advises_both_at_medium_signal_to_noise() -> None:
     faint = Contrast(0.8)
     assert refusal((4, 5, 6), faint).splitlines()[-2] == (
