@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,19 @@ def facts(rows: Iterable[tuple[str, str]]) -> str:
         for name, value in rows
     )
     return f"<table>{cells}</table>"
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table with a head, as HTML."""
+    left = "text-align:left"
+    titles = "".join(f'<th style="{left}">{escape(title)}</th>' for title in head)
+    body = "".join("<tr>" + "".join(f'<td style="{left}">{escape(cell)}</td>' for cell in cells) + "</tr>" for cells in rows)
+    return f"<table><tr>{titles}</tr>{body}</table>"
+
+
+def from_here(path: Path) -> Path:
+    """Return a path relative to the current folder where it lies in that, as people read it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def picture(image: NDArray[np.floating[Any]], alt: str) -> str:

@@ -21,19 +21,26 @@ def outputs(notebook: Any) -> list[list[tuple[str, ...]]]:
 
 
 @pytest.fixture(scope="module")
-def executed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Path]:
-    """The notebook as it is saved, as it has run, and the folder where it ran."""
-    nbformat = pytest.importorskip("nbformat", reason="the notebook needs photonpano[dev]")
-    pytest.importorskip("nbclient", reason="the notebook needs photonpano[dev]")
-    pytest.importorskip("ipykernel", reason="the notebook needs photonpano[dev]")
-    folder, patch = tmp_path_factory.mktemp("notebook"), pytest.MonkeyPatch()
-    (folder / "ipywidgets.py").write_text("raise ImportError('ipywidgets is not installed')\n")
+def make_notebook() -> Any:
+    """The script that runs the notebook and saves it."""
+    for name in ("nbformat", "nbclient", "ipykernel"):
+        pytest.importorskip(name, reason="the notebook needs photonpano[dev]")
     spec = importlib.util.spec_from_file_location("make_notebook", ROOT / "docs" / "make_notebook.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def executed(make_notebook: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Path]:
+    """The notebook as it is saved, as it has run, and the folder where it ran."""
+    import nbformat
+
+    folder, patch = tmp_path_factory.mktemp("notebook"), pytest.MonkeyPatch()
+    (folder / "ipywidgets.py").write_text("raise ImportError('ipywidgets is not installed')\n")
     with patch.context() as patched:
         patched.setenv("IPYTHONDIR", str(folder / ".ipython"))
-        return nbformat.read(module.NOTEBOOK, as_version=4), module.executed(folder), folder
+        return nbformat.read(make_notebook.NOTEBOOK, as_version=4), make_notebook.executed(folder), folder
 
 
 # ipykernel itself warns of its transport, and of event loops
@@ -46,6 +53,14 @@ def test_cells_show_what_is_saved(executed: tuple[Any, Any, Path]) -> None:
     shown = [kind for cell in outputs(run) for kind in cell]
     assert not [each for each in shown if each[0] == "error" or each[-1] == "stderr"]
     assert len([each for each in shown if each[0] == "display_data"]) == 2  # one for the bars of a cell
+
+
+def test_saved_notebook_does_not_tell_where_it_ran(executed: tuple[Any, Any, Path], make_notebook: Any) -> None:
+    saved, run, folder = executed
+    nbformat = pytest.importorskip("nbformat")
+    assert str(folder) in nbformat.writes(run)
+    assert str(folder) not in make_notebook.saved(run, folder)
+    assert "/tmp/" not in nbformat.writes(saved)
 
 
 def test_bars_are_full_and_results_are_pictures(executed: tuple[Any, Any, Path]) -> None:

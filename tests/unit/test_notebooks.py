@@ -14,8 +14,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonpano import InputError, Quiet, RunTrajectory, capture_plan, info, load_panorama, load_trajectory
+from photonpano import (
+    BatchResult,
+    BatchRow,
+    InputError,
+    Quiet,
+    RunTrajectory,
+    capture_plan,
+    evaluate,
+    info,
+    load_panorama,
+    load_trajectory,
+)
+from photonpano.captures.writing import truth_path
 from photonpano.context import usual
+from photonpano.evaluation.poses import pose_errors
 from photonpano.notebooks import NotebookBars, facts, in_notebook, picture
 
 
@@ -156,3 +169,26 @@ def test_capture_shows_itself(small_capture: Path) -> None:
     html = found._repr_html_()
     assert all(name in html for name, _ in found.rows())
     assert "photons per pixel per frame" in html
+
+
+def test_scores_show_themselves(small_run: Any, small_capture: Path) -> None:
+    scores = evaluate(small_run.directory, truth_path(small_capture), oracle=False)
+    poses = np.tile(np.eye(3, 4), (9, 1, 1))
+    poses[:, :, 3] = np.random.default_rng(0).normal(size=(9, 3))
+    for each in (scores, pose_errors(poses, poses, np.ones(9, bool), 1)):
+        html = each._repr_html_()
+        assert each.rows()
+        assert all(f">{name}<" in html and f">{value}<" in html for name, value in each.rows())
+
+
+def test_batch_shows_its_runs_and_its_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = BatchRow("a <b>", Path("a.npy"), {"levels": 1}, tmp_path / "monday" / "a", "done", verdict="trusted", n_frames=2000)
+    failed = BatchRow("c", Path("c.npy"), {"levels": 1}, tmp_path / "monday" / "c", "failed", reason="too dark\nfor this")
+    html = BatchResult(tmp_path / "monday", (done, failed), ("levels",))._repr_html_()
+    assert [re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", row) for row in html.split("<tr>")[1:]] == [
+        list(BatchRow.COLUMNS),
+        ["a &lt;b&gt;, levels=1", "trusted", "\N{EN DASH}", "\N{EN DASH}", "2,000", "\N{EN DASH}", "\N{EN DASH}", ""],
+        ["c, levels=1", "failed", *5 * ["\N{EN DASH}"], "too dark"],
+        ["summary", str(Path("monday", "summary.html"))],
+    ]

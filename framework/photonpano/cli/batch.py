@@ -1,15 +1,12 @@
 """photonpano batch."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from photonpano.cli.options import Overwrite, SpecPath
 from photonpano.cli.verdict import Strict
-
-if TYPE_CHECKING:
-    from photonpano.record.batch_row import BatchRow
 
 
 def batch(
@@ -80,6 +77,7 @@ def batch(
     from photonpano.cli.tables import columns
     from photonpano.cli.verdict import DoubtfulError
     from photonpano.errors import InputError, PhotonpanoError
+    from photonpano.record.batch_row import BatchRow
     from photonpano.text import counted
 
     try:
@@ -87,34 +85,10 @@ def batch(
     except InputError as error:
         raise WrongArgumentError(str(error)) from error
     result = run_batch(prepared, jobs, progress_for_stderr(notes=True), overwrite=overwrite)
-    typer.echo(columns([_HEAD, *map(_cells, result.rows)]))
+    typer.echo(columns([BatchRow.COLUMNS, *(row.cells() for row in result.rows)]))
     typer.echo(f"\nsummary   {result.directory / PAGE}")
     if result.failed:
         others = "; the others are done" if len(result.failed) < len(result.rows) else ""
         raise PhotonpanoError(f"{len(result.failed)} of {counted(len(result.rows), 'run')} failed{others}")
     if strict and (doubtful := [row for row in result.rows if row.verdict != "trusted"]):
         raise DoubtfulError(f"{counted(len(doubtful), 'run is', 'runs are')} doubtful, and --strict accepts only trusted ones")
-
-
-_HEAD = ("capture", "verdict", "expected error", "true error", "frames", "time", "memory", "reason")
-
-
-def _cells(row: "BatchRow") -> list[str]:
-    from photonpano.text import byte_size, count, duration, pixels
-
-    def cell(value: Any, write: Any) -> str:
-        return "\N{EN DASH}" if value is None else write(value)
-
-    def error(in_px: float | None, of_path: float | None) -> str:
-        return cell(in_px, lambda px: f"{pixels(px)} px") if of_path is None else f"{pixels(100 * of_path)} %"
-
-    return [
-        row.label,
-        row.verdict or row.status,
-        error(row.expected_error_px, row.expected_position_error),
-        error(row.true_error_px, row.true_position_error),
-        cell(row.n_frames, count),
-        cell(row.seconds, duration),
-        cell(row.peak_memory_bytes, byte_size),
-        row.reason.partition("\n")[0],
-    ]

@@ -49,51 +49,10 @@ def evaluate(
             warn(
                 f"{100 * score.honest_shares[2]:.0f} % of the positions are within 3 std_position: is {truth} of this capture?"
             )
-        typer.echo(json.dumps(_pose_data(score), indent=2) if as_json else columns(_pose_rows(score)))
+        typer.echo(json.dumps(_pose_data(score), indent=2) if as_json else columns(score.rows()))
         return
     evaluation = evaluate_run(run, truth, oracle, progress_for_stderr())
-    typer.echo(json.dumps(_data(evaluation), indent=2) if as_json else columns(_rows(evaluation)))
-
-
-def _rows(evaluation: "Evaluation") -> list[list[str]]:
-    motion = evaluation.trajectory
-    rows = [
-        ["corner error, mean", f"{motion.mean_px:.3f} px"],
-        ["corner error, median", f"{motion.median_px:.3f} px"],
-        ["corner error, 95 %", f"{motion.p95_px:.3f} px"],
-        ["corner error, worst frame", f"{motion.max_px:.3f} px"],
-        ["frames located", f"{100 * motion.located_share:.1f} %"],
-        ["frames within 3 std_px", f"{100 * evaluation.honest_share:.1f} %"],
-    ]
-    if evaluation.rotation is not None:
-        rotation = evaluation.rotation
-        rows += [
-            ["rotation error, mean", f"{rotation.mean_deg:.4f} degrees"],
-            ["rotation error, worst", f"{rotation.max_deg:.4f} degrees"],
-            ["focal length", f"{100 * rotation.focal_error:+.3f} %"],
-        ]
-    for name, score in (("panorama", evaluation.panorama), ("oracle", evaluation.oracle)):
-        if score is not None:
-            rows += [[f"PSNR, {name}", f"{score.psnr_db:.2f} dB"], [f"SSIM, {name}", f"{score.ssim:.4f}"]]
-    if evaluation.below_oracle_db is not None:
-        rows.append(["PSNR below the oracle", f"{evaluation.below_oracle_db:.2f} dB"])
-    return rows
-
-
-def _pose_rows(score: "PoseScore") -> list[list[str]]:
-    rows = [
-        ["position error (ATE), rms", f"{score.ate_m:.4g} m, {100 * score.ate_share:.3f} % of the path"],
-        ["rotation error, rms", f"{score.rotation_deg:.4f} degrees, {score.turns_deg:.4f} after the best common rotation"],
-    ]
-    if score.rpe_m is not None:
-        rows.append([f"RPE over {score.rpe_frames} frames, rms", f"{score.rpe_m:.4g} m, {score.rpe_deg:.4f} degrees"])
-    rows.append(["frames located", f"{100 * score.located_share:.1f} %"])
-    if score.honest_shares is not None:
-        shares = ", ".join(f"{100 * share:.1f} %" for share in score.honest_shares)
-        rows += [["within 1, 2, 3 std_position", shares], ["error over std_position, rms", f"{score.std_ratio:.2f}"]]
-    if score.focal_error is not None:
-        rows.append(["focal length", f"{100 * score.focal_error:+.3f} %"])
-    return rows
+    typer.echo(json.dumps(_data(evaluation), indent=2) if as_json else columns(evaluation.rows()))
 
 
 def _pose_data(score: "PoseScore") -> dict[str, Any]:

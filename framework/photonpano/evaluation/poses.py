@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from photonpano.errors import InputError
 from photonpano.evaluation.pose_inputs import load_run_poses, load_true_poses
 from photonpano.geometry import nearest_rotations, rotation_vectors
+from photonpano.notebooks import facts
 from photonpano.poses import centres
 from photonpano.record.contents import require_one_run
 from photonpano.values import BoolArray, FloatArray
@@ -57,6 +58,26 @@ class PoseScore:
     honest_shares: tuple[float, float, float] | None
     std_ratio: float | None
     focal_error: float | None = None
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the scores with their names, for people."""
+        rows = [
+            ("position error (ATE), rms", f"{self.ate_m:.4g} m, {100 * self.ate_share:.3f} % of the path"),
+            ("rotation error, rms", f"{self.rotation_deg:.4f} degrees, {self.turns_deg:.4f} after the best common rotation"),
+        ]
+        if self.rpe_m is not None:
+            rows.append((f"RPE over {self.rpe_frames} frames, rms", f"{self.rpe_m:.4g} m, {self.rpe_deg:.4f} degrees"))
+        rows.append(("frames located", f"{100 * self.located_share:.1f} %"))
+        if self.honest_shares is not None:
+            shares = ", ".join(f"{100 * share:.1f} %" for share in self.honest_shares)
+            rows += [("within 1, 2, 3 std_position", shares), ("error over std_position, rms", f"{self.std_ratio:.2f}")]
+        if self.focal_error is not None:
+            rows.append(("focal length", f"{100 * self.focal_error:+.3f} %"))
+        return rows
+
+    def _repr_html_(self) -> str:
+        """Show the scores in a notebook."""
+        return facts(self.rows())
 
 
 def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | None = None) -> PoseScore:

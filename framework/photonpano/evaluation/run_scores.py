@@ -14,6 +14,7 @@ from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, lo
 from photonpano.evaluation.rotations import RotationScore, rotation_errors, turned_alignment
 from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory, inverse, scaled_ahead
+from photonpano.notebooks import facts
 from photonpano.protocols import Trajectory
 from photonpano.record.contents import require_one_run
 from photonpano.values import Panorama
@@ -53,6 +54,34 @@ class Evaluation:
         if self.panorama is None or self.oracle is None:
             return None
         return self.oracle.psnr_db - self.panorama.psnr_db
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the scores with their names, for people."""
+        motion, rotation = self.trajectory, self.rotation
+        rows = [
+            ("corner error, mean", f"{motion.mean_px:.3f} px"),
+            ("corner error, median", f"{motion.median_px:.3f} px"),
+            ("corner error, 95 %", f"{motion.p95_px:.3f} px"),
+            ("corner error, worst frame", f"{motion.max_px:.3f} px"),
+            ("frames located", f"{100 * motion.located_share:.1f} %"),
+            ("frames within 3 std_px", f"{100 * self.honest_share:.1f} %"),
+        ]
+        if rotation is not None:
+            rows += [
+                ("rotation error, mean", f"{rotation.mean_deg:.4f} degrees"),
+                ("rotation error, worst", f"{rotation.max_deg:.4f} degrees"),
+                ("focal length", f"{100 * rotation.focal_error:+.3f} %"),
+            ]
+        for name, score in (("panorama", self.panorama), ("oracle", self.oracle)):
+            if score is not None:
+                rows += [(f"PSNR, {name}", f"{score.psnr_db:.2f} dB"), (f"SSIM, {name}", f"{score.ssim:.4f}")]
+        if self.below_oracle_db is not None:
+            rows.append(("PSNR below the oracle", f"{self.below_oracle_db:.2f} dB"))
+        return rows
+
+    def _repr_html_(self) -> str:
+        """Show the scores in a notebook."""
+        return facts(self.rows())
 
 
 def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | None = None) -> Evaluation:

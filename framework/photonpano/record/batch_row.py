@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 from photonpano.paths import Location
+from photonpano.text import byte_size, count, duration, pixels
 
+ValueT = TypeVar("ValueT")
 Status = Literal["waiting", "running", "done", "failed", "interrupted"]
 
 
@@ -40,6 +42,8 @@ class BatchRow:
         thumbnail: the panorama as a data URI of a small JPEG; None without a panorama.
     """
 
+    COLUMNS: ClassVar = ("capture", "verdict", "expected error", "true error", "frames", "time", "memory", "reason")
+
     name: str
     capture: Location
     settings: Mapping[str, Any]
@@ -63,6 +67,27 @@ class BatchRow:
     def label(self) -> str:
         """The name of the capture, and what the run has of its own: `night, resample.with.group_size=50`."""
         return ", ".join([self.name, *(f"{key}={written(value)}" for key, value in self.settings.items())])
+
+    def cells(self) -> list[str]:
+        """Return what stands in each of the `COLUMNS` of a table; a dash where the run has no such figure."""
+        return [
+            self.label,
+            self.verdict or self.status,
+            _error(self.expected_error_px, self.expected_position_error),
+            _error(self.true_error_px, self.true_position_error),
+            _cell(self.n_frames, count),
+            _cell(self.seconds, duration),
+            _cell(self.peak_memory_bytes, byte_size),
+            self.reason.partition("\n")[0],
+        ]
+
+
+def _cell(value: ValueT | None, write: Callable[[ValueT], str]) -> str:
+    return "\N{EN DASH}" if value is None else write(value)
+
+
+def _error(in_px: float | None, of_path: float | None) -> str:
+    return _cell(in_px, lambda px: f"{pixels(px)} px") if of_path is None else f"{pixels(100 * of_path)} %"
 
 
 def written(value: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from photonpano.notebooks import facts, picture_of_png
+from photonpano.notebooks import facts, from_here, picture_of_png
 from photonpano.record.run_json import verdict_of
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import shrunk
@@ -22,8 +22,7 @@ def run_html(folder: Path, record: RunRecord) -> str:
         folder: the run folder; a picture that is no longer there is left out.
         record: the content of its run.json.
     """
-    place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-    return _picture(folder / "panorama.png") + facts(_rows(record, place))
+    return _picture(folder / "panorama.png") + facts(_rows(record, from_here(folder)))
 
 
 def _picture(path: Path) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from photonpano.api.batch.captures import find_captures
 from photonpano.api.batch.job import Job, is_of_capture
-from photonpano.api.batch.summary import require_own, write_summary
+from photonpano.api.batch.summary import PAGE, require_own, write_summary
 from photonpano.api.batch.sweeps import (
     CAPTURE_KEY,
     SpecText,
@@ -25,6 +25,7 @@ from photonpano.api.batch.workers import rows_of
 from photonpano.context import Progress, usual
 from photonpano.errors import InputError, OutputError, Problem, SpecError
 from photonpano.locks import locked
+from photonpano.notebooks import facts, from_here, table
 from photonpano.paths import Location
 from photonpano.record.batch_row import BatchRow
 from photonpano.registry import discover
@@ -52,6 +53,11 @@ class BatchResult:
     def failed(self) -> tuple[BatchRow, ...]:
         """The rows of runs that failed."""
         return tuple(row for row in self.rows if row.status == "failed")
+
+    def _repr_html_(self) -> str:
+        """Show the runs, and where their summary is, in a notebook."""
+        runs = table(BatchRow.COLUMNS, (row.cells() for row in self.rows))
+        return runs + facts([("summary", str(from_here(self.directory) / PAGE))])
 
 
 @dataclass(frozen=True, slots=True)
