@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
+from shlex import quote
 
 from photonpano.atomic import flush, is_partial, partial_paths, remove, unfinished_folder
 from photonpano.errors import OutputError
@@ -106,7 +107,7 @@ def replace_folder(staging: Path, directory: Path, replaced: Iterable[str]) -> N
         except OSError as error:
             raise OutputError(
                 f"{directory}: the new files are complete in {directory / PENDING}, but could not be put in place "
-                f"({error.strerror}); `photonpano verify {directory}` puts them there"
+                f"({error.strerror}); `photonpano verify {quote(str(directory))}` puts them there"
             ) from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from shlex import quote
 from typing import TYPE_CHECKING
 from zipfile import ZipFile
 
@@ -45,4 +46,4 @@ def print_written(written: WrittenCapture) -> None:
     held = ZipFile(written.truth).namelist() if written.truth else ()
     for array, kind in (("homographies", "run"), ("camera_from_world", "run with `pose`")):
         if f"{array}.npy" in held:
-            typer.echo(f"\nTo score a {kind} of it: photonpano evaluate RUN --truth {written.truth}")
+            typer.echo(f"\nTo score a {kind} of it: photonpano evaluate RUN --truth {quote(str(written.truth))}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from photonpano.errors import Problem, SpecError
@@ -47,7 +48,8 @@ def load_spec(
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
             raise
-        message = f"this is a capture, not a spec; `photonpano info {path}` reads it and prints a spec to start from"
+        asked = f"photonpano info {quote(str(path))}"
+        message = f"this is a capture, not a spec; `{asked}` reads it and prints a spec to start from"
         raise SpecError([Problem("", message, path)]) from None
 
 

@@ -31,6 +31,12 @@ def test_simulate_prints_files_and_spec_section(finished: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("folder")
+def test_simulate_quotes_names_in_commands_that_are_copied(invoke: Callable[..., Any]) -> None:
+    result = invoke("simulate", "capture.yaml", "-o", "night #1.npy", "--set", "source.with.n_frames=5")
+    assert result.stdout.endswith("photonpano evaluate RUN --truth 'night #1.truth.npz'\n")
+
+
 def test_simulate_prints_valid_spec_section(finished: Path) -> None:
     line = next(line for line in (finished / "simulate.out").read_text().splitlines() if line.startswith("source:"))
     plan = parse_spec(f"version: 1\n{line}\n", directory=finished)

@@ -108,8 +108,10 @@ class Spool:
         )
 
     def _kept(self, written: int) -> str:
-        n_frames = self._n_frames(written)
-        return f"; the {n_frames:,} whole frames are in {self.path}" if n_frames else ""
+        if not (n_frames := self._n_frames(written)):
+            return ""
+        kept = "whole frame is" if n_frames == 1 else f"{n_frames:,} whole frames are"
+        return f"; the {kept} in {self.path}"
 
     def _n_frames(self, written: int) -> int:
         return max(0, written - self._piped.header_bytes) // self._piped.frame_bytes
