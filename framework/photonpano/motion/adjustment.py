@@ -33,6 +33,8 @@ _DAMPING, _TINY = 1e-10, 1e-200
 """Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by."""
 SAMPLES = 64
 """Solutions drawn to estimate the expected error of each node, to a few per cent."""
+_DRAWN_ROWS = 8192
+"""Equations that are drawn at a time."""
 
 StateT = TypeVar("StateT")
 
@@ -185,9 +187,12 @@ class Adjustment(ABC, Generic[StateT]):
         normal, free = jacobians.T @ jacobians, self._free(state)
         k = self._n_node
         blocks = np.stack([normal[k * node : k * node + k, k * node : k * node + k].toarray() for node in range(self._n_nodes)])
-        draws = np.random.default_rng(0).normal(size=(jacobians.shape[0], SAMPLES))
-        changes = np.zeros((len(free), SAMPLES))
-        changes[free] = _solved(normal[free][:, free], (jacobians.T @ draws)[free], draws=True)
+        rng, right, changes = np.random.default_rng(0), np.zeros((len(free), SAMPLES)), np.zeros((len(free), SAMPLES))
+        # All draws at once would take more memory than the equations.
+        for first in range(0, jacobians.shape[0], _DRAWN_ROWS):
+            rows = jacobians[first : first + _DRAWN_ROWS]
+            right += rows.T @ rng.normal(size=(rows.shape[0], SAMPLES))
+        changes[free] = _solved(normal[free][:, free], right[free], draws=True)
         std_shared = np.sqrt((changes[k * self._n_nodes :] ** 2).mean(axis=1))
         std_px = self._corner_std_px(state, changes)
         return Assessment(self.information(state, blocks), std_px, self.std_camera(state, std_shared))

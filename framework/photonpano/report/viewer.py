@@ -22,6 +22,7 @@ from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
 from photonpano.report.figures import centre_of, instants_of, places_on
 from photonpano.report.residual_figures import misfit_cells, same_projection
 from photonpano.residuals.refinement import Explained
+from photonpano.residuals.unexplained import distance_to_nearest
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
 LINEAR_VALUES = 1_200_000
@@ -204,7 +205,7 @@ def shared_instant(motion: FrameMotion, levels: Sequence[LevelResult]) -> int:
     """Return a located frame near an exposure of every level; of several such frames the one nearest to the reference frame."""
     located = [result.located.instants for result in levels]
     candidates = np.rint(located[-1]).astype(int)
-    gap = sum(np.abs(instants[None] - candidates[:, None]).min(axis=1) for instants in located)
+    gap = np.sum([distance_to_nearest(instants, candidates) for instants in located], axis=0)
     order = np.lexsort((np.abs(candidates - motion.reference), np.rint(gap)))
     return int(np.clip(candidates[order[0]], 0, len(motion.homographies) - 1))
 

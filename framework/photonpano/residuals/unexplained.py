@@ -96,14 +96,14 @@ def bounded_std_px(std_px: FloatArray, residuals: Residuals) -> FloatArray:
     local = sliding_window_view(squares, _BOUND_SPANS).mean(axis=1)
     frames, instants = np.arange(len(std_px)), residuals.instants[known]
     measured = np.interp(frames, instants, local)
-    measured[_distance_to(instants, frames) > _NEAR_SPANS * np.median(np.diff(residuals.instants))] = np.inf
+    measured[distance_to_nearest(instants, frames) > _NEAR_SPANS * np.median(np.diff(residuals.instants))] = np.inf
     reach = max(1, int(residuals.frames_seen / 4))
     surest = minimum_filter1d(std_px**2 + measured, 2 * reach + 1, mode="nearest")
     return np.asarray(np.minimum(std_px, np.where(np.isfinite(std_px), np.sqrt(surest + measured), np.inf)))
 
 
-def _distance_to(instants: FloatArray, frames: NDArray[np.integer]) -> FloatArray:
-    """Return the distance of each frame to the nearest instant, in frames."""
+def distance_to_nearest(instants: FloatArray, frames: NDArray[np.integer]) -> FloatArray:
+    """Return the distance of each frame to the nearest of instants that are in order, in frames."""
     after = np.searchsorted(instants, frames).clip(1, len(instants) - 1)
     return np.asarray(np.minimum(abs(frames - instants[after - 1]), abs(frames - instants[after])))
 

@@ -6,6 +6,7 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.report import render_report
+from photonpano.report.viewer import shared_instant
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained, require_refined
 from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, standing_out, unexplained_px
@@ -131,5 +133,17 @@ def test_time_of_a_group_does_not_take_a_look_at_all_frames() -> None:
     try:
         assert timeline.times(123.25) == 123.25
         assert tracemalloc.get_traced_memory()[1] < 10_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_instant_that_the_viewer_shows_is_found_without_comparing_all_exposures(ends: tuple[End, End]) -> None:
+    instants = np.arange(0.0, LONG, 16)
+    level: Any = SimpleNamespace(located=SimpleNamespace(instants=instants))
+    tracemalloc.start()
+    try:
+        assert shared_instant(ends[1].motion, [level, level]) == ends[1].motion.reference
+        # A table of the distances between all of them would take 200 MB.
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000
     finally:
         tracemalloc.stop()
