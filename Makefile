@@ -17,7 +17,7 @@ help:
 	@echo 'make demo     simulate a small capture, make its panorama, and score it'
 	@echo 'make test     run all checks and tests'
 	@echo 'make docs     build the documentation as a site'
-	@echo 'make paper    make the figures of the paper, which takes about half an hour'
+	@echo 'make paper    make the figures of the paper, which takes long'
 	@echo 'make bench    run the benchmarks, which takes long'
 	@echo 'make install  make the virtual environment $(VENV), with all that tests and benchmarks need'
 	@echo 'make clean    remove the virtual environment, the demo, the site and caches'

@@ -62,14 +62,22 @@ def make(study: Study, names: list[str], into: Path) -> None:
 
 
 def filled(page: str, numbers: dict[str, Any]) -> str:
-    """Return a page with the tables of the figures whose numbers are known."""
+    """Return a page with the captures and the tables of the figures whose numbers are known."""
     for name in numbers:
         begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
         before, rest = page.split(begin)
         rows = [claim.row() for claim in FIGURES[name].claims(numbers[name])]
-        table = "\n".join([begin, "| The paper | Measured here | Agrees |", "| --- | --- | --- |", *rows, end])
+        taken = captured(numbers[name])
+        table = "\n".join([begin, *taken, "| The paper | Measured here | Agrees |", "| --- | --- | --- |", *rows, end])
         page = before + table + rest.split(end)[1]
     return page
+
+
+def captured(numbers: dict[str, Any]) -> list[str]:
+    """Return the lines that say how many frames the captures of a figure have; none where there is no capture."""
+    if "n_frames" not in numbers:
+        return []
+    return [f"Each capture has {numbers['n_frames']:,} frames at {numbers['frame_rate_hz']:,} Hz.", ""]
 
 
 def save(image: Picture, path: Path) -> None:

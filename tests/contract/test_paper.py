@@ -38,6 +38,19 @@ def test_every_figure_has_numbers_and_pictures_are_small(make_paper):
     assert max(pictures.values()) < make_paper.MOST_BYTES
 
 
+def test_claims_of_failures_do_not_agree_where_nothing_fails(make_paper):
+    """The paper's camera in the dark, its flicker and its noise do harm only where the numbers show it."""
+    numbers = json.loads(json.dumps(NUMBERS))
+    dark = numbers["fig4-light"]
+    dark["read_noise"] = {"5": {method: [dark["n_frames"]] * len(dark["photons"]) for method in ("stitcher", "chain")}}
+    numbers["fig9"]["apertures"]["f/5.6"]["single"] = numbers["fig9"]["apertures"]["f/2.8"]["direct"]
+    numbers["fig10"]["steady"] = numbers["fig10"]["steady"][:1] * len(numbers["fig10"]["depths"])
+    claims = {name: make_paper.FIGURES[name].claims(numbers[name]) for name in ("fig4-light", "fig9", "fig10")}
+    assert all("never fails" in claim.measured and not claim.agrees for claim in claims["fig4-light"])
+    assert [claim.agrees for claim in claims["fig9"] if "f/5.6" in claim.paper] == [False, None]
+    assert [claim.agrees for claim in claims["fig10"]] == [False, None, None, False]
+
+
 @pytest.mark.parametrize("spec", sorted(SPECS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_specs_are_valid_and_linked(spec):
     load_spec(spec)
@@ -58,4 +71,4 @@ def test_quick_figures_show_what_the_paper_says(make_paper, tmp_path, without_re
         assert min(image.shape[:2]) > 100
     page = (tmp_path / "README.md").read_text()
     assert f"mean corner error {numbers['fig5']['constant']['mean_px']:g} px" in page
-    assert re.search(r"fig5: begin -->\n\| The paper", page)
+    assert re.search(r"fig5: begin -->\nEach capture has 1,200 frames at 100,000 Hz\.\n\n\| The paper", page)

@@ -9,6 +9,7 @@ FIGURES = {
     "fig2": matches.FIGURE,
     "fig3": levels.FIG3,
     "fig4": cameras.FIGURE,
+    "fig4-light": cameras.LIGHT,
     "fig5": levels.FIG5,
     "fig6": levels.FIG6,
     "fig7": light.FIG7,

@@ -1,4 +1,7 @@
-"""Fig. 4: fast and bright, slow and dark, fast and dark: a conventional camera and a single-photon camera on the same path."""
+"""Fig. 4: fast and bright, slow and dark, fast and dark: a conventional camera and a single-photon camera on the same path.
+
+And how dark it must be for the conventional camera to fail.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from paper.figures.study import (
     FigureOf,
     averaged_in_place,
     fitted,
+    frames_of,
     in_colour,
     in_rows,
     motion_of,
@@ -33,6 +37,13 @@ if TYPE_CHECKING:
 
 CASES = {"fast, bright": (1.0, 1.0), "slow, 6 times darker": (0.25, 1 / 6), "fast, 120 times darker": (1.0, 1 / 120)}
 """Length of the path and light of each column, relative to the first."""
+SLOW = CASES["slow, 6 times darker"][0]
+DARKER = (1, 6, 24, 60, 120, 240)
+"""How many times darker than the first column it gets."""
+READ_NOISES = (5, 20)
+"""Standard deviations, in photons."""
+PAPER_DARKER = 6
+"""How much darker the paper makes it until the conventional camera fails."""
 QUICK = {
     "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
     "source.with.frame_shape": [128, 192],
@@ -46,7 +57,7 @@ COLUMN = 420
 
 def make(study: Study) -> tuple[Picture, Numbers]:
     """Make the three columns."""
-    numbers: Numbers = {}
+    numbers = frames_of(scaled(study, "fig4", 1, 1))
     columns = []
     for name, (length, light) in CASES.items():
         column, numbers[name] = case(study, name, length, light)
@@ -65,7 +76,7 @@ def labelled_in_colour(image: Picture, label: str) -> Picture:
 def case(study: Study, name: str, length: float, light: float) -> tuple[list[Picture], Numbers]:
     """Return the pictures of a column, and its numbers."""
     spad, camera = (scaled(study, spec, length, light) for spec in ("fig4", "fig4-camera"))
-    label = "fig4-" + name.split(",")[0] + ("-bright" if light == 1 else "-dark")
+    label = "fig4-" + name.split(",")[0]
     capture = study.capture(label, spad)
     ours = study.run(label, spad, capture)
     flux = load_panorama(ours).flux
@@ -73,32 +84,24 @@ def case(study: Study, name: str, length: float, light: float) -> tuple[list[Pic
     first = study.run(label, spad | {"levels": [{"scale": 1}], "output": {"keep": "exposures"}}, capture)
     naive, naive_db = averaged_in_place(first, capture)
 
-    with open_source(parse_spec({"version": 1, "source": camera["source"]})) as source:
-        assert hasattr(source, "truth")
-        true_of_camera = source.truth()["homographies"]
-        response, span = source.response, source.info.span
-        shots = [
-            response.flux(source.counts(FrameSpan(index, index + 1)).astype(np.float32), 1)
-            for index in range(span.start, span.stop)
-        ]
     ratio = camera["source"]["with"]["flux"] / spad["source"]["with"]["flux"]
-    pictures = [picture(shot, white * ratio) for shot in shots]
+    pictures, true_of_camera = shots(camera, white * ratio)
     stitched, placed = stitch(pictures)
-    chain = chained(study, f"{label}-camera", camera, true_of_camera)
+    chain = in_chain(study, f"{label}-camera", camera, true_of_camera)
 
     numbers: Numbers = {
         "flux": rounded(spad["source"]["with"]["flux"]),
         "camera_photons": rounded(camera["source"]["with"]["flux"]),
-        "camera_frames": len(shots),
-        "camera_blur_px": rounded(camera["source"]["with"]["path"]["length_px"] / len(shots), 2),
+        "camera_frames": len(pictures),
+        "camera_blur_px": rounded(camera["source"]["with"]["path"]["length_px"] / len(pictures), 2),
         "stitched_frames": placed,
         "chain": chain[1],
         "averages_psnr_db": round(naive_db, 1),
         "ours": scores_of(ours, capture),
     }
     panels = {
-        f"conventional frame, {len(shots)} in all": fitted(pictures[len(pictures) // 2], COLUMN),
-        f"OpenCV's Stitcher: {placed} of {len(shots)} frames": stitched,
+        f"conventional frame, {len(pictures)} in all": fitted(pictures[len(pictures) // 2], COLUMN),
+        f"OpenCV's Stitcher: {placed} of {len(pictures)} frames": stitched,
         f"averages of {spad['resample']['with']['group_size']} binary frames": picture(naive.flux, white),
         "ours": picture(flux, white),
     }
@@ -118,6 +121,15 @@ def scaled(study: Study, name: str, length: float, light: float) -> dict[str, An
     camera["path"] = camera["path"] | {"length_px": camera["path"]["length_px"] * length}
     camera["flux"] = camera["flux"] * light
     return spec
+
+
+def shots(camera: dict[str, Any], white: float) -> tuple[list[Picture], NDArray[np.float64]]:
+    """Return the frames of the conventional camera, up to a white, and their true homographies."""
+    with open_source(parse_spec({"version": 1, "source": camera["source"]})) as source:
+        assert hasattr(source, "truth")
+        counts = [source.counts(FrameSpan(index, index + 1)) for index in range(source.info.n_frames)]
+        pictures = [picture(source.response.flux(each.astype(np.float32), 1), white) for each in counts]
+        return pictures, source.truth()["homographies"]
 
 
 def stitch(pictures: list[Picture]) -> tuple[Picture, int]:
@@ -141,7 +153,7 @@ def stitch(pictures: list[Picture]) -> tuple[Picture, int]:
     return best, most
 
 
-def chained(
+def in_chain(
     study: Study, name: str, spec: dict[str, Any], true: NDArray[np.float64]
 ) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, Numbers]:
     """Return the path of the conventional frames, each registered with the one before by SIFT, and its errors."""
@@ -159,6 +171,55 @@ def chained(
         "mean_px": rounded(score.mean_px),
         "worst_px": rounded(score.max_px),
     }
+
+
+def darker(study: Study) -> tuple[Picture, Numbers]:
+    """Count the conventional frames that can be placed while the light of the slow path goes out."""
+    times = DARKER[::3] if study.quick else DARKER
+    numbers: Numbers = {"times_darker": list(times), "photons": [], "read_noise": {}}
+    figure = Figure(figsize=(9.68, 3), dpi=100, layout="constrained")
+    panels = figure.subplots(1, len(READ_NOISES), sharey=True)
+    for panel, read_noise in zip(panels, READ_NOISES, strict=True):
+        placed: dict[str, list[int]] = {"stitcher": [], "chain": []}
+        for darkness in times:
+            camera = scaled(study, "fig4-camera", SLOW, 1 / darkness)
+            camera["source"]["with"]["sensor"]["read_noise"] = read_noise
+            pictures, true = shots(camera, 3 * camera["source"]["with"]["flux"])
+            placed["stitcher"].append(stitch(pictures)[1])
+            placed["chain"].append(in_chain(study, "fig4-darker", camera, true)[1]["located"])
+        numbers |= frames_of(camera)
+        numbers["photons"] = [rounded(scaled(study, "fig4-camera", SLOW, 1 / each)["source"]["with"]["flux"]) for each in times]
+        numbers["read_noise"][str(read_noise)] = placed
+        panel.semilogx(numbers["photons"], placed["stitcher"], ".-", label="OpenCV's Stitcher")
+        panel.semilogx(numbers["photons"], placed["chain"], ".-", color="tab:red", label="SIFT from frame to frame")
+        panel.set_title(f"read noise of {read_noise} photons", fontsize=10)
+        panel.set_xticks(numbers["photons"], [f"{each:g}" for each in numbers["photons"]])
+        panel.set_xticks([], minor=True)
+        panel.set_xlabel("photons per pixel per frame", fontsize=9)
+    panels[0].set_ylabel("conventional frames placed", fontsize=9)
+    panels[0].legend(fontsize=8)
+    return drawn(figure)[..., 2::-1], numbers
+
+
+def darker_claims(numbers: Numbers) -> list[Claim]:
+    """Return what the paper says of low light."""
+    every, rows = numbers["n_frames"], []
+    for read_noise, placed in numbers["read_noise"].items():
+        for method, name in {"stitcher": "OpenCV's Stitcher", "chain": "SIFT from frame to frame"}.items():
+            enough = [times for times, n in zip(numbers["times_darker"], placed[method], strict=True) if n == every]
+            short = [times for times, n in zip(numbers["times_darker"], placed[method], strict=True) if n < every]
+            photons = dict(zip(numbers["times_darker"], numbers["photons"], strict=True))
+            rows.append(
+                Claim(
+                    f"the conventional camera fails in low light: {PAPER_DARKER} times less light than suffices is too little "
+                    f"(read noise of {read_noise} photons, {name})",
+                    (f"places all {every} frames down to {photons[max(enough)]:g} photons" if enough else "never places all")
+                    + ("; " if short else "; never fails")
+                    + ", ".join(f"{placed[method][numbers['times_darker'].index(t)]} at {photons[t]:g} photons" for t in short),
+                    bool(enough and short) and min(short) <= PAPER_DARKER * max(enough),
+                )
+            )
+    return rows
 
 
 def paths(ours: Path, capture: Path, chain: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> Picture:
@@ -216,3 +277,4 @@ def claims(numbers: Numbers) -> list[Claim]:
 
 
 FIGURE = FigureOf(make, claims)
+LIGHT = FigureOf(darker, darker_claims)

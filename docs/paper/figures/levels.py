@@ -11,6 +11,7 @@ from paper.figures.study import (
     FigureOf,
     averaged_in_place,
     fitted,
+    frames_of,
     in_rows,
     motion_of,
     place,
@@ -64,7 +65,8 @@ def constant(study: Study, capture: Path) -> Path:
 def settings(spec: dict[str, Any]) -> Numbers:
     """Return how large the capture and its groups are."""
     return {
-        **{key: spec["source"]["with"][key] for key in ("n_frames", "frame_rate_hz", "flux")},
+        **frames_of(spec),
+        "flux": spec["source"]["with"]["flux"],
         "group_size": spec["resample"]["with"]["group_size"],
     }
 

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from paper.figures.study import Claim, FigureOf, in_rows, motion_of, record_of, rounded, scores_of
-from picture_parts import beside, labelled, picture
+from matplotlib.figure import Figure
+from paper.figures.study import (
+    Claim,
+    FigureOf,
+    fails,
+    frames_of,
+    in_rows,
+    motion_of,
+    record_of,
+    rounded,
+    scores_of,
+    scores_or_reason,
+    told,
+)
+from picture_parts import beside, drawn, labelled, picture
 
-from photonpano import PhotonpanoError, load_panorama, open_source, parse_spec
+from photonpano import load_panorama, open_source, parse_spec
 from photonpano.context import Context
 from photonpano.evaluation import covered, image_score, true_panorama, white_flux
 from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.merging.panorama import plan_canvas, render
 
 if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
     from paper.figures.study import Numbers, Study
     from picture_parts import Picture
 
@@ -29,11 +46,15 @@ QUICK_NIGHT = {
 }
 QUICK_FLICKER = {
     "source.with.n_frames": 1200,
+    "source.with.frame_rate_hz": 20000,
     "source.with.frame_shape": [96, 144],
     "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
     "source.with.path": {"kind": "pan", "length_px": 60},
     "source.with.flux": 0.5,
+    "resample.with.group_size": 100,
 }
+DEPTHS = (0.0, 0.5, 0.8, 0.9, 1.0)
+"""Amplitudes of the flicker, relative to the mean light."""
 
 
 def super_resolution(study: Study) -> tuple[Picture, Numbers]:
@@ -61,7 +82,7 @@ def super_resolution(study: Study) -> tuple[Picture, Numbers]:
     images = {"sensor's resolution, interpolated": bicubic, "super-resolution, 2x": fine.flux, "true scene": scene}
     shown = [labelled(np.kron(picture(image[part], bright), np.ones((2, 2), np.uint8)), name) for name, image in images.items()]
     numbers = {
-        "n_frames": spec["source"]["with"]["n_frames"],
+        **frames_of(spec),
         "scale": spec["render"]["scale"],
         "interpolated_psnr_db": round(image_score(bicubic, scene, compared, white).psnr_db, 1),
         "psnr_db": round(image_score(fine.flux, scene, compared, white).psnr_db, 1),
@@ -96,7 +117,7 @@ def dynamic_range(study: Study) -> tuple[Picture, Numbers]:
     shown["the same, all of its range (tone: local)"] = np.asarray(local, np.uint8)
     panorama = record_of(folder)["panorama"]
     numbers = {
-        "n_frames": n_frames,
+        **frames_of(spec),
         "flux": spec["source"]["with"]["flux"],
         "median_flux": rounded(float(np.nanmedian(flux)), 2),
         "shake_px": spec["source"]["with"]["path"]["shake"]["rms_px"],
@@ -125,45 +146,73 @@ def range_claims(numbers: Numbers) -> list[Claim]:
 
 
 def flicker(study: Study) -> tuple[Picture, Numbers]:
-    """Fig. 10: the panorama of a capture whose light flickers, taken for steady, and measured."""
-    shown, numbers = [], {}
-    for name, light in {"light taken for steady": "steady", "light measured": "auto"}.items():
-        spec = study.spec("fig10", {"light": light}, QUICK_FLICKER)
-        capture = study.capture("fig10", spec)
-        lamp = spec["source"]["with"]["lamps"][0]
-        numbers |= {
-            "frequency_hz": lamp["frequency_hz"],
-            "depth": lamp["depth"],
-            "n_frames": spec["source"]["with"]["n_frames"],
-        }
-        try:
-            folder = study.run("fig10", spec, capture)
-        except PhotonpanoError as error:
-            numbers[light] = {"reason": str(error).splitlines()[0]}
-            continue
-        flux = load_panorama(folder).flux
-        shown.append(labelled(picture(flux, float(np.nanquantile(flux, 0.995))), name))
-        numbers[light] = scores_of(folder, capture)
-    return in_rows(shown), numbers
+    """Fig. 10: errors over the depth of the flicker with the light taken for steady, and panoramas where the lamps go out."""
+    spec = study.spec("fig10", {}, QUICK_FLICKER)
+    (lamp,) = spec["source"]["with"]["lamps"]
+    group = spec["resample"]["with"]["group_size"]
+    numbers: Numbers = frames_of(spec) | {
+        "frequency_hz": lamp["frequency_hz"],
+        "group_periods": rounded(group * lamp["frequency_hz"] / spec["source"]["with"]["frame_rate_hz"], 2),
+        "depths": list(DEPTHS[::4] if study.quick else DEPTHS),
+    }
+    steady = spec | {"light": "steady"}
+    found = [under(study, steady, [lamp | {"depth": depth}]) for depth in numbers["depths"]]
+    measured = under(study, spec, [lamp])
+    phases = [
+        lamp | {"phase_deg": degrees, "at": [x, 0.5], "radius": 0.25} for degrees, x in ((0, 0.35), (120, 0.5), (-120, 0.65))
+    ]
+    numbers |= {
+        "steady": [scores for _, scores in found],
+        "auto": measured[1],
+        "phases": under(study, steady, phases)[1],
+    }
+    shown = []
+    for (folder, _), name in ((found[-1], "the lamps go out; light taken for steady"), (measured, "the same, light measured")):
+        if folder is not None:
+            flux = load_panorama(folder).flux
+            shown.append(labelled(picture(flux, float(np.nanquantile(flux, 0.995))), name))
+    figure = Figure(figsize=(8, 2.6), dpi=100, layout="constrained")
+    panel = figure.subplots()
+    errors = [scores.get("mean_px", np.nan) for scores in numbers["steady"]]
+    panel.semilogy(numbers["depths"], errors, ".-", color="0.6", label="light taken for steady")
+    panel.semilogy([lamp["depth"]], [numbers["auto"].get("mean_px", np.nan)], "o", color="black", label="light measured")
+    panel.set_xlabel("depth of the flicker (1: the lamps go out)")
+    panel.set_ylabel("mean corner error (px)")
+    panel.legend()
+    return in_rows([*shown, drawn(figure)[..., 0]]), numbers
+
+
+def under(study: Study, spec: dict[str, Any], lamps: list[dict[str, Any]]) -> tuple[Path | None, Numbers]:
+    """Return the run under lamps and its scores, or no run and the reason."""
+    spec = spec | {"source": {**spec["source"], "with": spec["source"]["with"] | {"lamps": lamps}}}
+    capture = study.capture("fig10", spec)
+    return scores_or_reason(partial(study.run, "fig10", spec, capture), capture)
 
 
 def flicker_claims(numbers: Numbers) -> list[Claim]:
     """Return what the paper says of Fig. 10."""
-    steady, measured = numbers["steady"], numbers["auto"]
-    fails = steady.get("reason") or (
-        f"mean corner error {steady['mean_px']:g} px, largest {steady['worst_px']:g} px, PSNR {steady['psnr_db']:.1f} dB"
-    )
+    *shallow, out = zip(numbers["depths"], numbers["steady"], strict=True)
     return [
         Claim(
             "flicker of artificial light violates brightness constancy, and the reconstruction fails",
-            f"lamps at {numbers['frequency_hz']:g} Hz that go out: {fails}",
-            "reason" in steady or steady["mean_px"] > 1,
+            f"all lamps go out at {numbers['frequency_hz']:g} Hz, groups of {numbers['group_periods']:g} periods: "
+            f"{told(out[1])}",
+            fails(out[1]),
+        ),
+        Claim(
+            "(not in the paper) how deep the flicker is when it fails",
+            "; ".join(f"depth {depth:g}: {told(scores)}" for depth, scores in shallow),
+            None,
+        ),
+        Claim(
+            "(not in the paper) lamps that go out on three phases, so that it is never dark everywhere",
+            told(numbers["phases"]),
+            None,
         ),
         Claim(
             "may be mitigated (by longer exposures where brightness is not constant)",
-            f"by measuring the light: mean corner error {measured['mean_px']:g} px, largest {measured['worst_px']:g} px, "
-            f"PSNR {measured['psnr_db']:.1f} dB",
-            measured["mean_px"] < steady.get("mean_px", np.inf) / 2,
+            f"by measuring the light: {told(numbers['auto'])}",
+            fails(out[1]) and not fails(numbers["auto"]),
         ),
     ]
 

@@ -14,7 +14,7 @@ import numpy as np
 from picture_parts import GAP, picture
 from ruamel.yaml import YAML
 
-from photonpano import evaluate, open_source, parse_spec, run
+from photonpano import PhotonpanoError, evaluate, open_source, parse_spec, run
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.context import Context
 from photonpano.evaluation import (
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from photonpano.evaluation import RunTrajectory, TrajectoryScore, Truth
 
 SPECS = Path(__file__).parents[3] / "examples" / "paper"
+FAILED_DB = 3.0
+"""A panorama that is further below the one along the true motion, in dB, has failed."""
 Numbers: TypeAlias = dict[str, Any]
 """Figures by name: numbers, words, and lists and mappings of them, which do not depend on the machine."""
 Changes: TypeAlias = Mapping[str, Any]
@@ -115,6 +117,17 @@ class Study:
         return folder
 
 
+def frames_of(spec: Mapping[str, Any]) -> Numbers:
+    """Return how many frames the capture of a spec has, and at which rate."""
+    return {key: spec["source"]["with"][key] for key in ("n_frames", "frame_rate_hz")}
+
+
+def chained(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a spec that registers each exposure with the one before by SIFT, as in the paper, in light that is steady."""
+    graph = {"skips": [], "closure_overlap": None}
+    return {**spec, "locate": {"use": "opencv-sift"}, "graph": graph, "light": "steady"}
+
+
 def digest(content: object) -> str:
     """Return eight characters that differ for other contents."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
@@ -131,6 +144,28 @@ def scores_of(folder: Path, capture: Path) -> Numbers:
         "psnr_db": round(scores.panorama.psnr_db, 1),
         "below_oracle_db": round(scores.below_oracle_db, 1),
     }
+
+
+def fails(scores: Mapping[str, Any]) -> bool:
+    """Return whether there is no motion, or one that spoils the panorama: by more than FAILED_DB."""
+    return "reason" in scores or scores["below_oracle_db"] > FAILED_DB
+
+
+def told(scores: Mapping[str, Any]) -> str:
+    """Return the scores of a path and its panorama in words."""
+    return scores.get("reason") or (
+        f"mean corner error {scores['mean_px']:g} px, largest {scores['worst_px']:g} px, {scores['below_oracle_db']:.1f} dB "
+        "below the panorama along the true motion"
+    )
+
+
+def scores_or_reason(run_folder: Callable[[], Path], capture: Path) -> tuple[Path | None, Numbers]:
+    """Run, and return the run folder and the scores, or no folder and the reason why there is no motion."""
+    try:
+        folder = run_folder()
+    except PhotonpanoError as error:
+        return None, {"reason": str(error).splitlines()[0]}
+    return folder, scores_of(folder, capture)
 
 
 def motion_of(folder: Path, capture: Path) -> tuple[RunTrajectory, Truth, TrajectoryScore]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import tifffile
-from paper.figures.study import Claim, FigureOf, in_rows, record_of, rounded, scores_of
+from paper.figures.study import Claim, FigureOf, frames_of, in_rows, record_of, rounded, scores_of
 from picture_parts import beside, labelled, picture
 
 from photonpano import FrameSpan, open_source, parse_spec
@@ -49,7 +49,8 @@ def make(study: Study) -> tuple[Picture, Numbers]:
     flux = tifffile.imread(run_folder / "panorama.tiff")
     white = float(np.nanquantile(flux, 0.995))
     numbers: Numbers = {
-        **{key: spec["source"]["with"][key] for key in ("n_frames", "frame_rate_hz", "flux")},
+        **frames_of(spec),
+        "flux": spec["source"]["with"]["flux"],
         "group_size": spec["resample"]["with"]["group_size"],
         "exposure_psnr_db": [round(psnr_db(each, capture, at), 1) for at, each in (first, second)],
         **scores_of(run_folder, capture),
