@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, TypeAlias
 
 from photonpano.geometry import why_implausible
 from photonpano.motion.checks import require_no_standstill, require_valid, why_undetermined
@@ -13,10 +14,15 @@ from photonpano.motion.closures import exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import FrameHomography, NamedLocator
 from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.pairs import shared_share
+from photonpano.motion.start import StartingMotion
+from photonpano.motion.tracking import Place, Track
 from photonpano.protocols import KeepsHypotheses
-from photonpano.threads import Stopwatch
-from photonpano.values import Decision, Homography, Located, NotLocated, VirtualExposure
+from photonpano.threads import Guard, Stopwatch
+from photonpano.values import Decision, Edge, Homography, Located, NotLocated, VirtualExposure
 
+MIN_PAIR_WEIGHT = 0.05
+"""Lower bound of a pair's weight. Shared photons carry no new information: their noise agrees with the motion known so far."""
 MAX_HYPOTHESES = 100
 """Most hypotheses of a pair that are used."""
 
@@ -26,12 +32,20 @@ class Described:
     """What stays of an exposure where it was merged.
 
     Attributes:
-        features: what a locator made of it; None of a blank exposure.
+        contrast: how much there is to see in it.
         exposure: the exposure itself, for loop closures.
+        features: what locators made of it so far, by their numbers; none of a blank exposure.
+        guard: held while a locator describes it, so that each does so once.
     """
 
-    features: Any
-    exposure: VirtualExposure | None
+    contrast: Contrast
+    exposure: VirtualExposure | None = None
+    features: dict[int, Any] = field(default_factory=dict)
+    guard: Guard = field(default_factory=Guard)
+
+
+Descriptions: TypeAlias = Mapping[int, Described]
+"""Exposures, by their numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,11 +56,13 @@ class Pair:
         moving: number of the later exposure.
         fixed: number of the earlier one.
         expected: the motion known so far, if any.
+        guessed: whether that is a guess of the first level, from which only locators that keep hypotheses start.
     """
 
     moving: int
     fixed: int
     expected: FrameHomography | None
+    guessed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,81 +79,84 @@ class Notes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Exposures of the first level that were registered with earlier ones.
+
+    Attributes:
+        edges: of each exposure, by its number.
+        places: where each lies.
+        alternatives_px: see `Track`.
+    """
+
+    edges: dict[int, list[Edge]]
+    places: dict[int, Place]
+    alternatives_px: dict[tuple[int, int], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ExposureTasks:
     """The tasks of a level. Each returns notes, too.
 
     Exposures are given by their numbers, together with mappings in which their descriptions are.
 
+    Convention:
+        All homographies are in pixels of frames; only a locator sees pixels of exposures.
+
     Attributes:
         exposures: of the level.
+        independent: the share of the photons of a typical group that no earlier group contains.
     """
 
     exposures: VirtualExposures
+    independent: float
 
-    def describe(
-        self, indices: Sequence[int], locator: int, keep: bool
-    ) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
-        """Merge exposures, and have a locator describe them.
+    def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
+        """Merge exposures, and have the first locator describe them; a blank exposure is not described.
 
         Args:
             indices: the numbers of the exposures.
-            locator: the number of the locator; a blank exposure is not described.
             keep: whether the exposures themselves are kept.
 
         Returns:
             What stays where the task was done, by exposure, and what is known of each exposure.
         """
-        clock, named = Stopwatch(1), self._locator(locator)
-        described: dict[int, Described] = {}
-        contrasts: list[Contrast] = []
+        clock, described = Stopwatch(1), dict[int, Described]()
         for index in indices:
-            exposure = replace(self.exposures, clock=clock).merged(index)
+            exposure = self._merged(index, clock)
             with clock("locate"):
-                contrasts.append(contrast := contrast_of(exposure))
-                features = None
-                if not contrast.blank:
-                    with self.exposures.level.attributing(named):
-                        features = named.component.describe(exposure)
-            described[index] = Described(features, exposure if keep else None)
-        return described, (contrasts, self._notes(clock))
+                contrast = contrast_of(exposure)
+            described[index] = Described(contrast, exposure if keep else None)
+            if not contrast.blank:
+                described[index].features[0] = self._features_of(exposure, 0, clock)
+        return described, ([each.contrast for each in described.values()], self._notes(clock))
 
-    def hypotheses(
-        self, locator: int, moving: int, fixed: int, *described: Mapping[int, Described]
-    ) -> tuple[list[Homography], Notes]:
-        """Return what a locator that keeps hypotheses makes of a pair, in pixels of frames."""
-        level, named, clock, known = self.exposures.level, self._locator(locator), Stopwatch(1), _joined(described)
-        component = named.component
-        assert isinstance(component, KeepsHypotheses)
-        with clock("locate"), level.attributing(named):
-            listed = list(islice(component.hypotheses(known[moving].features, known[fixed].features), MAX_HYPOTHESES))
-            found = [require_valid(Located(each)) for each in listed]
-        return [level.in_frame_px(each).homography for each in found if isinstance(each, Located)], self._notes(clock)
+    def register(self, pairs: Sequence[Pair], *described: Descriptions) -> tuple[list[Edge], Notes]:
+        """Pass pairs to one locator after the other, until one locates them."""
+        clock = Stopwatch(1)
+        return self._registered(pairs, _joined(described), clock), self._notes(clock)
 
-    def register(
-        self, locator: int, pairs: Sequence[Pair], *described: Mapping[int, Described]
-    ) -> tuple[list[Located | NotLocated], Notes]:
-        """Return the motion of each pair in pixels of frames, as one locator finds it from where it is expected."""
+    def register_along(
+        self,
+        start: StartingMotion | None,
+        partners: Mapping[int, Sequence[int]],
+        places: Mapping[int, Place],
+        *described: Descriptions,
+    ) -> tuple[Tracked, Notes]:
+        """Register exposures of the first level, in order; the nearest partner tells where each lies in those further away.
+
+        Args:
+            start: see `Track`.
+            partners: the exposures, each with earlier ones.
+            places: of partners that are not among the exposures, and of exposures that were placed before.
+            described: all of them.
+        """
         clock, known = Stopwatch(1), _joined(described)
-        with clock("locate"):
-            motions = [self._registered(self._locator(locator), pair, known) for pair in pairs]
-        return motions, self._notes(clock)
+        track = Track(start, self.exposures.groups, self.exposures.frame_shape, places)
+        edges = {moving: self._tracked(track, moving, earlier, known, clock) for moving, earlier in partners.items()}
+        new = {moving: track.places[moving] for moving in partners}
+        return Tracked(edges, new, track.alternatives_px), self._notes(clock)
 
-    def _registered(self, named: NamedLocator, pair: Pair, known: Mapping[int, Described]) -> Located | NotLocated:
-        level, shape = self.exposures.level, self.exposures.frame_shape
-        initial = None if pair.expected is None else level.in_exposure_px(pair.expected)
-        with level.attributing(named):
-            motion = require_valid(named.component.register(known[pair.moving].features, known[pair.fixed].features, initial))
-            if isinstance(motion, Located):
-                require_no_standstill(motion, pair.expected, shape)
-        if isinstance(motion, Located):
-            motion = level.in_frame_px(motion)
-            if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
-                motion = NotLocated(reason, motion.evidence)
-        return motion
-
-    def similarity(
-        self, moving: int, fixed: int, motion: FrameHomography, *described: Mapping[int, Described]
-    ) -> tuple[float, Notes]:
+    def similarity(self, moving: int, fixed: int, motion: FrameHomography, *described: Descriptions) -> tuple[float, Notes]:
         """Return the similarity of two exposures that were kept, along their motion."""
         clock, known = Stopwatch(1), _joined(described)
         one, other = known[moving].exposure, known[fixed].exposure
@@ -147,12 +166,114 @@ class ExposureTasks:
             similarity = exposure_similarity(one, other, motion)
         return similarity, self._notes(clock)
 
+    def _tracked(self, track: Track, moving: int, partners: Sequence[int], known: Descriptions, clock: Stopwatch) -> list[Edge]:
+        """Register an exposure with others, and place it."""
+        place, foreseen = track.places.get(moving), None
+        found: list[Edge] = []
+        for fixed in sorted(partners, reverse=True):
+            expected = track.expected(place, moving, fixed, partial(self._hypotheses, moving, fixed, known, clock))
+            found += self._registered([Pair(moving, fixed, expected, guessed=True)], known, clock)
+            if place is None and isinstance(motion := found[-1].motion, Located):
+                place = track.placed(moving, fixed, motion.homography)
+            elif foreseen is None and expected is not None:
+                foreseen = track.placed(moving, fixed, expected)
+        track.settle(moving, place or foreseen)
+        return found[::-1]
+
+    def _hypotheses(self, moving: int, fixed: int, known: Descriptions, clock: Stopwatch) -> list[Homography]:
+        """Return what the first locator that keeps hypotheses makes of a pair; none of blank exposures."""
+        level = self.exposures.level
+        if known[moving].contrast.blank or known[fixed].contrast.blank:
+            return []
+        for number, named in enumerate(level.locators):
+            if isinstance(named.component, KeepsHypotheses):
+                features = [self._features(index, number, known, clock) for index in (moving, fixed)]
+                with clock("locate"), level.attributing(named):
+                    listed = list(islice(named.component.hypotheses(*features), MAX_HYPOTHESES))
+                    found = [require_valid(Located(each)) for each in listed]
+                return [level.in_frame_px(each).homography for each in found if isinstance(each, Located)]
+        return []
+
+    def _registered(self, pairs: Sequence[Pair], known: Descriptions, clock: Stopwatch) -> list[Edge]:
+        """Pass pairs to one locator after the other, until one locates them."""
+        found: dict[Pair, Edge] = {pair: edge for pair in pairs if (edge := self._refused(pair, known))}
+        failures: dict[Pair, dict[str, NotLocated]] = {pair: {} for pair in pairs}
+        for number, locator in enumerate(self.exposures.level.locators):
+            for pair in [pair for pair in pairs if pair not in found]:
+                motion = self._located_by(number, locator, pair, known, clock)
+                if isinstance(motion, Located):
+                    found[pair] = Edge(pair.moving, pair.fixed, motion, locator.name)
+                else:
+                    failures[pair][locator.name] = motion
+        return [found.get(pair) or Edge(pair.moving, pair.fixed, _of_all(failures[pair])) for pair in pairs]
+
+    def _refused(self, pair: Pair, known: Descriptions) -> Edge | None:
+        """Return a pair that no locator needs to see, with the reason; None for any other."""
+        for index in (pair.moving, pair.fixed):
+            if blank := known[index].contrast.blank:
+                return Edge(pair.moving, pair.fixed, NotLocated(f"{self.exposures.groups[index]}: {blank}"))
+        if pair.expected is not None and (reason := why_implausible(pair.expected, self.exposures.frame_shape)):
+            return Edge(pair.moving, pair.fixed, NotLocated(f"by the motion known so far, {reason}"))
+        return None
+
+    def _located_by(
+        self, number: int, named: NamedLocator, pair: Pair, known: Descriptions, clock: Stopwatch
+    ) -> Located | NotLocated:
+        """Return the motion of a pair as one locator finds it from where it is expected; each photon counts once."""
+        level, shape = self.exposures.level, self.exposures.frame_shape
+        starts = not pair.guessed or isinstance(named.component, KeepsHypotheses)
+        expected = pair.expected if starts else None
+        initial = None if expected is None else level.in_exposure_px(expected)
+        moving, fixed = (self._features(index, number, known, clock) for index in (pair.moving, pair.fixed))
+        with clock("locate"):
+            with level.attributing(named):
+                motion = require_valid(named.component.register(moving, fixed, initial))
+                if isinstance(motion, Located):
+                    require_no_standstill(motion, expected, shape)
+            if isinstance(motion, NotLocated):
+                return motion
+            motion = level.in_frame_px(motion)
+            if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
+                return NotLocated(reason, motion.evidence)
+            return self._of_new_photons(pair, motion)
+
+    def _of_new_photons(self, pair: Pair, motion: Located) -> Located:
+        """Return a motion whose information does not count the photons that both exposures share."""
+        if motion.information is None:
+            return motion
+        groups = self.exposures.groups
+        new = self.independent * max(1 - shared_share(groups[pair.moving].span, groups[pair.fixed].span), MIN_PAIR_WEIGHT)
+        return replace(motion, information=motion.information * new)
+
+    def _features(self, index: int, locator: int, known: Descriptions, clock: Stopwatch) -> Any:
+        """Return what a locator makes of an exposure; for a fallback, it is merged again."""
+        described = known[index]
+        with described.guard:
+            if locator not in described.features:
+                exposure = self._merged(index, clock) if described.exposure is None else described.exposure
+                described.features[locator] = self._features_of(exposure, locator, clock)
+            return described.features[locator]
+
+    def _features_of(self, exposure: VirtualExposure, locator: int, clock: Stopwatch) -> Any:
+        named = self.exposures.level.locators[locator]
+        with clock("locate"), self.exposures.level.attributing(named):
+            return named.component.describe(exposure)
+
+    def _merged(self, index: int, clock: Stopwatch) -> VirtualExposure:
+        return replace(self.exposures, clock=clock).merged(index)
+
     def _notes(self, clock: Stopwatch) -> Notes:
         return Notes(clock.seconds, self.exposures.level.recorder.taken())
 
-    def _locator(self, number: int) -> NamedLocator:
-        return self.exposures.level.locators[number]
 
-
-def _joined(described: Iterable[Mapping[int, Described]]) -> Mapping[int, Described]:
+def _joined(described: Iterable[Descriptions]) -> Descriptions:
     return {index: each for mapping in described for index, each in mapping.items()}
+
+
+def _of_all(failures: Mapping[str, NotLocated]) -> NotLocated:
+    """Join the failures of several locators, each under its name; a single one stays as it is."""
+    if len(failures) == 1:
+        return next(iter(failures.values()))
+    reason = "; ".join(f"{name}: {each.reason}" for name, each in failures.items())
+    evidence = {f"{name}.{key}": value for name, each in failures.items() for key, value in each.evidence.items()}
+    return NotLocated(reason, evidence)

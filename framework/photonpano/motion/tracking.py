@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from photonpano.geometry import apply, corners, inverse, normalised
 from photonpano.motion.level import FrameHomography
 from photonpano.motion.start import StartingMotion
-from photonpano.values import FloatArray, Homography
+from photonpano.values import FloatArray, Group, Homography
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +30,31 @@ class Place:
 
 
 class Track:
-    """The exposures of the first level, each tied to the nearest earlier one. May be used from several threads.
-
-    An exposure is placed by the thread that registers it; others wait for that. Exposures must be begun in order.
+    """The exposures of the first level, each tied to the nearest earlier one.
 
     Attributes:
+        places: where exposures lie, by their numbers: those that were given, and those that were settled since.
         alternatives_px: of the pairs that may just as well have another motion, how far that is from the one they start at.
     """
 
-    def __init__(self, start: StartingMotion | None, instants: FloatArray, frame_shape: tuple[int, int]) -> None:
-        self._start, self._instants = start, instants
+    def __init__(
+        self,
+        start: StartingMotion | None,
+        groups: Sequence[Group],
+        frame_shape: tuple[int, int],
+        places: Mapping[int, Place],
+    ) -> None:
+        """Take what is known so far.
+
+        Args:
+            start: the motion that short spans of frames show.
+            groups: of all exposures of the level.
+            frame_shape: (height, width) of a frame.
+            places: of some exposures.
+        """
+        self._start, self._groups = start, groups
         self._middle = corners(frame_shape).mean(axis=0)
-        self._places: list[Future[Place]] = [Future() for _ in instants]
+        self.places = dict(places)
         self.alternatives_px: dict[tuple[int, int], float] = {}
 
     def expected(
@@ -56,10 +68,10 @@ class Track:
             fixed: number of the earlier one.
             hypotheses: returns the motions that the two images themselves suggest, likeliest first.
         """
-        there = self._places[fixed].result()
+        there = self.places[fixed]
         if place is not None and place.segment == there.segment:
             return FrameHomography(normalised(inverse(there.homography) @ place.homography))
-        instants = self._instants[moving], self._instants[fixed]
+        instants = self._groups[moving].reference, self._groups[fixed].reference
         if self._start is not None and (motion := self._start.between(*instants)) is not None:
             if alternative_px := self._start.alternative_px(*instants):
                 self.alternatives_px[moving, fixed] = alternative_px
@@ -68,17 +80,13 @@ class Track:
 
     def placed(self, moving: int, fixed: int, motion: Homography) -> Place:
         """Return where an exposure lies by its motion to an earlier one."""
-        there = self._places[fixed].result()
-        velocity = self._shift(motion) / (self._instants[moving] - self._instants[fixed])
+        there = self.places[fixed]
+        velocity = self._shift(motion) / self._frames_between(moving, fixed)
         return Place(there.segment, normalised(there.homography @ motion), velocity)
 
-    def place(self, index: int) -> Place:
-        """Return where an exposure lies, once that is known."""
-        return self._places[index].result()
-
     def settle(self, moving: int, place: Place | None) -> None:
-        """Let others know where an exposure lies; None for the first of its segment."""
-        self._places[moving].set_result(Place(moving, np.eye(3), None) if place is None else place)
+        """Keep where an exposure lies; None for the first of its segment."""
+        self.places[moving] = Place(moving, np.eye(3), None) if place is None else place
 
     def _steadiest(
         self, hypotheses: Sequence[Homography], velocity: FloatArray | None, moving: int, fixed: int
@@ -91,8 +99,11 @@ class Track:
             if len(shifts) > 1:
                 self.alternatives_px[moving, fixed] = float(np.linalg.norm(shifts[1] - shifts[0]))
             return FrameHomography(hypotheses[0])
-        going_on = velocity * (self._instants[moving] - self._instants[fixed])
+        going_on = velocity * self._frames_between(moving, fixed)
         return FrameHomography(hypotheses[int(np.linalg.norm(shifts - going_on, axis=1).argmin())])
+
+    def _frames_between(self, moving: int, fixed: int) -> float:
+        return self._groups[moving].reference - self._groups[fixed].reference
 
     def _shift(self, motion: Homography) -> FloatArray:
         return np.asarray(apply(motion, self._middle[None])[0] - self._middle)
