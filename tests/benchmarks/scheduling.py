@@ -86,6 +86,7 @@ class Stage:
         bundles: their number.
         first: seconds of the first task of a bundle, and how many tasks of the scheduler it is.
         second: the same of the task that follows it, and needs the first task of the bundle before, too.
+        chained: whether the second task also needs that of the bundle before, as at the first level.
         shared: bytes that travel from the client to each worker.
         returned: bytes that travel to the client.
         read: bytes of the capture.
@@ -99,6 +100,7 @@ class Stage:
     returned: int
     read: float
     begun_s: float
+    chained: bool = False
 
     def limits(self, costs: Costs, workers: int) -> dict[str, float]:
         """Return the seconds that each resource alone would take."""
@@ -109,14 +111,19 @@ class Stage:
             "bytes to and from the client": (self.shared * workers + self.returned) / LINK_BYTES_S,
             "reading the capture": self.read / STORAGE_BYTES_S,
             "start of each worker": self.begun_s,
+            "exposures that wait for the one before": self.bundles * self._link_s(costs) if self.chained else 0.0,
         }
+
+    def _link_s(self, costs: Costs) -> float:
+        """Return the seconds from the end of one second task to that of the next, where they are chained."""
+        return self.second[0] + costs.client_s + costs.scheduler_s
 
     def seconds(self, costs: Costs, workers: int) -> float:
         """Simulate the stage: each task goes in order to the first worker that is free, with four under way for each worker."""
         handing_s = max(costs.client_s, costs.scheduler_s, self.returned / self.bundles / LINK_BYTES_S)
         read_s = self.read / self.bundles / (STORAGE_BYTES_S / workers)
         begin = self.begun_s + self.shared * workers / LINK_BYTES_S
-        free, handed, described = [begin] * workers, begin, begin
+        free, handed, described, end = [begin] * workers, begin, begin, begin
         done: list[float] = [begin]
         for index in range(self.bundles):
             if index >= WINDOW * workers:
@@ -124,11 +131,13 @@ class Stage:
             handed += handing_s * self.first[1]
             before, described = described, max(heappop(free), handed) + self.first[0] + read_s
             heappush(free, described)
-            end = described
             if self.second[0]:
                 handed += handing_s * self.second[1]
-                end = max(heappop(free), handed, before, described) + self.second[0]
+                waits = end + self._link_s(costs) - self.second[0] if self.chained else before
+                end = max(heappop(free), handed, before, described, waits) + self.second[0]
                 heappush(free, end)
+            else:
+                end = described
             done.append(max(done[-1], end))
         return done[-1]
 
@@ -150,12 +159,10 @@ def stages_of(run: Measured, costs: Costs) -> list[Stage]:
             first = stage.startswith("level 1")
             bundles = -(-tasks["describe"].tasks // AT_ONCE)
             moved_s = kinds["kept: features"].to_worker / bundles / LINK_BYTES_S
-            pairs = tasks["register"].tasks / bundles if first else 1.0
-            describe = tasks["describe"].seconds / bundles, 3.0
-            register = tasks["register"].seconds / bundles + moved_s, pairs
-            found.append(
-                Stage(bundles, describe, register, shared, returned, read, 0.0 if first else costs.start_s * run.n_frames)
-            )
+            registered = sum(kind.seconds for name, kind in tasks.items() if name.startswith("register"))
+            describe, register = (tasks["describe"].seconds / bundles, 2.0), (registered / bundles + moved_s, 1.0)
+            begun_s = 0.0 if first else costs.start_s * run.n_frames
+            found.append(Stage(bundles, describe, register, shared, returned, read, begun_s, chained=first))
         else:
             bundles = -(-max(kind.tasks for kind in tasks.values()) // AT_ONCE)
             work = sum(kind.seconds for kind in tasks.values()) / bundles
