@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import dask
@@ -22,6 +23,10 @@ _SETTINGS = {
     "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",
     # It would look at the stack of each worker a hundred times a second.
     "distributed.worker.profile.enabled": False,
+}
+_SETTINGS_OF_TASKS = {
+    # The motion of a long capture is tens of megabytes: it travels once for many tasks, and again if a worker dies.
+    "distributed.admin.large-graph-warning-threshold": "1 TB",
 }
 
 
@@ -74,6 +79,8 @@ class DaskWorkers:
     def __init__(self, client: Client, cluster: LocalCluster | None = None) -> None:
         """Take the client of the scheduler, and the cluster that ends with it."""
         self._client, self._cluster = client, cluster
+        self._settings = ExitStack()
+        self._settings.enter_context(dask.config.set(_SETTINGS_OF_TASKS))
         self.under_way = _AHEAD * max(1, sum(client.nthreads().values()))
 
     def submit(self, function: Callable[..., Any], *given: Any) -> Future:
@@ -90,3 +97,4 @@ class DaskWorkers:
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
+        self._settings.close()

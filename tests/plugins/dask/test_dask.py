@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,9 @@ from photonpano.execution import CaptureElsewhere
 
 pytest.importorskip("distributed")
 
+import dask
 import psutil
+from distributed import Client
 
 from photonpano_dask import workers
 from photonpano_dask.configs import DaskConfig
@@ -79,6 +82,18 @@ def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: 
     assert there.record["decisions"] == here.record["decisions"]
     assert [each["what"] for each in here.record["decisions"]].count("chunk_frames") == 1
     assert not [each for each in psutil.Process().children(recursive=True) if "spawn_main" in str(each.cmdline())]
+
+
+def test_what_is_shared_may_be_large_without_a_warning() -> None:
+    before = dask.config.get("distributed.admin.large-graph-warning-threshold")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        client = Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None)
+        mine = workers.DaskWorkers(client)
+        assert mine.submit(len, bytes(11_000_000)).result() == 11_000_000
+        mine.close()
+    assert not [each for each in caught if "large graph" in str(each.message)]
+    assert dask.config.get("distributed.admin.large-graph-warning-threshold") == before
 
 
 def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
