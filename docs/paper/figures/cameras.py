@@ -176,10 +176,11 @@ def in_chain(
 def darker(study: Study) -> tuple[Picture, Numbers]:
     """Count the conventional frames that can be placed while the light of the slow path goes out."""
     times = DARKER[::3] if study.quick else DARKER
+    read_noises = READ_NOISES[-1:] if study.quick else READ_NOISES
     numbers: Numbers = {"times_darker": list(times), "photons": [], "read_noise": {}}
     figure = Figure(figsize=(9.68, 3), dpi=100, layout="constrained")
-    panels = figure.subplots(1, len(READ_NOISES), sharey=True)
-    for panel, read_noise in zip(panels, READ_NOISES, strict=True):
+    panels = figure.subplots(1, len(read_noises), sharey=True, squeeze=False)[0]
+    for panel, read_noise in zip(panels, read_noises, strict=True):
         placed: dict[str, list[int]] = {"stitcher": [], "chain": []}
         for darkness in times:
             camera = scaled(study, "fig4-camera", SLOW, 1 / darkness)

@@ -62,7 +62,7 @@ QUICK_BURST = {
     "resample.with.group_size": 100,
     "merge.with.block_frames": 20,
 }
-QUICK_ROOM = {"source.with.n_frames": 360}
+QUICK_ROOM = {"source.with.n_frames": 300}
 CAMERAS = {"conventional": 60, "high-speed": 4, "single-photon, averaged": 30}
 """Frames of an average that stand for each camera of Fig. 11."""
 
