@@ -80,8 +80,10 @@ def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
         return ()
     found: list[Cut] = []
     with context.progress.stage("cuts", sum(map(len, suspect)), "frames") as advance:
-        for span in suspect:
-            found += _cuts_in(source, span, size, context)
+        runs = [[each for each in span.blocks(size) if len(each) == size] for span in suspect]
+        for span, track in zip(suspect, track_sums(source, runs, context), strict=True):
+            if track is not None:
+                found += _cuts_along(source, track, size)
             advance(len(span))
     return tuple(found)
 
@@ -103,12 +105,8 @@ def _size_of_sums(look: Look) -> int:
     return int(np.clip(np.ceil(wanted), _SHORTEST, _LONGEST))
 
 
-def _cuts_in(source: Source, span: FrameSpan, size: int, context: Context) -> Iterator[Cut]:
-    """Yield the cuts in some frames, tracked by sums of `size` frames."""
-    sums = [each for each in span.blocks(size) if len(each) == size]
-    track = track_sums(source, sums, context)
-    if track is None:
-        return
+def _cuts_along(source: Source, track: SumTrack, size: int) -> Iterator[Cut]:
+    """Yield the cuts along a track of sums of `size` frames."""
     for outlier in _outliers(track, size, _SMALLEST_PX / binning_of(source)):
         between = FrameSpan(track.spans[outlier.before].start, track.spans[outlier.after].stop)
         dark = _dark_frames(source, between) if len(between) > 3.5 * size else None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, islice
 
 import numpy as np
 from scipy import fft
@@ -51,20 +52,27 @@ class SumTrack:
         return np.asarray(self.next_px / np.diff(self.centres)[:, None])
 
 
-def track_sums(source: Source, spans: Sequence[FrameSpan], context: Context) -> SumTrack | None:
-    """Track the sums that show something; None if they are too few.
+def track_sums(source: Source, runs: Sequence[Sequence[FrameSpan]], context: Context) -> Iterator[SumTrack | None]:
+    """Yield the track of each run of sums that show something; None if they are too few.
 
     Args:
         source: the capture.
-        spans: of the sums, in order.
+        runs: the sums of each run, in order.
         context: works on blocks of sums in tasks.
     """
-    light, track = _tracked(source, spans, context)
-    lit = light > DARK * np.median(light) if len(light) else light
-    if np.count_nonzero(lit) < _FEWEST:
-        return None
-    # Those without light are left out, and so are the shifts to them: once more, as few captures have any.
-    return track if lit.all() else _tracked(source, [spans[index] for index in np.flatnonzero(lit).tolist()], context)[1]
+    blocks = [_blocks_of(spans) for spans in runs]
+    parts = context.in_order(partial(_tracked_block, source), list(chain.from_iterable(blocks)))
+    for spans, of_run in zip(runs, blocks, strict=True):
+        light, track = _joined(spans, list(islice(parts, len(of_run))))
+        lit = light > DARK * np.median(light) if len(light) else light
+        if np.count_nonzero(lit) < _FEWEST:
+            yield None
+        elif lit.all():
+            yield track
+        else:
+            # Those without light are left out, and so are the shifts to them: once more, as few captures have any.
+            left = [spans[index] for index in np.flatnonzero(lit).tolist()]
+            yield _joined(left, [_tracked_block(source, block) for block in _blocks_of(left)])[1]
 
 
 def sum_image(source: Source, span: FrameSpan) -> FluxImage:
@@ -73,10 +81,14 @@ def sum_image(source: Source, span: FrameSpan) -> FluxImage:
     return np.nan_to_num(image, nan=float(np.nanmean(image)))
 
 
-def _tracked(source: Source, spans: Sequence[FrameSpan], context: Context) -> tuple[FloatArray, SumTrack]:
-    """Return the light of each sum, (N,), and the track of all of them."""
-    blocks = [tuple(spans[first : first + _BLOCK + 2]) for first in range(0, len(spans), _BLOCK)]
-    parts = list(context.in_order(partial(_tracked_block, source), blocks))
+def _blocks_of(spans: Sequence[FrameSpan]) -> list[tuple[FrameSpan, ...]]:
+    return [tuple(spans[first : first + _BLOCK + 2]) for first in range(0, len(spans), _BLOCK)]
+
+
+def _joined(
+    spans: Sequence[FrameSpan], parts: Sequence[tuple[FloatArray, FloatArray, FloatArray]]
+) -> tuple[FloatArray, SumTrack]:
+    """Return the light of each sum, (N,), and the track of all of them, from their blocks."""
     light, next_px, second_px = (np.concatenate([part[number] for part in parts] or [np.empty(0)]) for number in range(3))
     return light, SumTrack(spans, next_px, second_px)
 
