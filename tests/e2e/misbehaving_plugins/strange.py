@@ -23,6 +23,8 @@ from photonpano.registry import Origin
 
 ORIGIN = Origin("strange-plugin", "1.2", "strange = strange.hooks")
 SHAPE, FRAMES = (48, 64), 160
+NOTHING: Any = None
+"""What a plugin that is not typed gives instead of a text."""
 KINDS: Mapping[str, tuple[str, Any, str]] = {
     "source": ("source", SourceContribution, "memory"),
     "resampler": ("resample", ResamplerContribution, "midpoint"),

@@ -13,8 +13,10 @@ import pytest
 from photonpano import FrameSpan, Group, Located, NotLocated
 from photonpano.geometry import translation
 
-from .strange import Around, Outcome, around, cases_of, holed, instead, require_named
+from .strange import NOTHING, Around, Outcome, around, cases_of, holed, instead, require_named
 
+HALF: Any = 0.5
+"""What a plugin that is not typed gives instead of a number of frames."""
 AT_LEVEL = "broke its contract at level 1: "
 NO_HOMOGRAPHY = AT_LEVEL + "a homography is a finite (3, 3) matrix with h33 = 1, got "
 NO_INFORMATION = AT_LEVEL + (
@@ -69,7 +71,7 @@ RESAMPLERS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
         AT_LEVEL + "the capture has 160 frames, got 320 groups or more",
     ),
     "half frames": (
-        instead("groups", lambda *_: (Group(FrameSpan(0.5, 40.5), 20),)),  # type: ignore[arg-type]
+        instead("groups", lambda *_: (Group(FrameSpan(HALF, 40 + HALF), 20),)),
         AT_LEVEL + "expected groups, got Group(span=FrameSpan(start=0.5, stop=40.5), reference=20)",
     ),
     "outside of its span": (instead("groups", lambda *_: (Group(FrameSpan(0, 9), 50),)), "failed at level 1: ValueError: the "),
@@ -214,7 +216,7 @@ LOCATORS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
         AT_LEVEL + "evidence consists of numbers, got score = ",
     ),
     "no reason": (
-        instead("register", lambda *_: NotLocated(None)),  # type: ignore[arg-type]
+        instead("register", lambda *_: NotLocated(NOTHING)),
         AT_LEVEL + "the reason of NotLocated is a text, got a NoneType",
     ),
 }

@@ -13,7 +13,7 @@ from photonpano import FrameSpan, Refined
 from photonpano.geometry import translation
 from photonpano.testing import MemorySource
 
-from .strange import FRAMES, SHAPE, Around, Outcome, around, cases_of, holed, instead, require_named
+from .strange import FRAMES, NOTHING, SHAPE, Around, Outcome, around, cases_of, holed, instead, require_named
 
 AT_OPENING = "broke its contract at opening: "
 AT_READING = "broke its contract at frames 0 to 159: "
@@ -189,7 +189,7 @@ REFINERS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
         AT_ROUND + "std_px is infinite exactly where it was before; that of frame 0 was ",
     ),
     "no summary": (
-        refined_by(lambda found, std_px: Refined(found, std_px, None)),  # type: ignore[arg-type]
+        refined_by(lambda found, std_px: Refined(found, std_px, NOTHING)),
         AT_ROUND + "the summary is a text, got a NoneType",
     ),
 }

@@ -299,8 +299,8 @@ def test_resume_of_finished_poses_returns_them_and_of_changed_ones_begins_anew(
 
 def test_observers_see_the_stage_pose(plan_of: Callable[..., Plan], without_report: None) -> None:
     told: list[Any] = []
-    watcher = ModuleType("watcher")
-    watcher.photonpano_stage_finished = hookimpl(  # type: ignore[attr-defined]
+    watcher: Any = ModuleType("watcher")
+    watcher.photonpano_stage_finished = hookimpl(
         lambda level, stage, seconds, summary: told.append((level, stage, seconds >= 0, dict(summary)))
     )
     run(replace(plan_of(), observers=Catalog().including(watcher).observers))
