@@ -57,12 +57,15 @@ class Pair:
         fixed: number of the earlier one.
         expected: the motion known so far, if any.
         guessed: whether that is a guess of the first level, from which only locators that keep hypotheses start.
+        closure: whether it is a candidate for a loop closure. The motion known so far may have drifted by any distance between
+            its exposures, and tells nothing of whether the camera stands where it stood before.
     """
 
     moving: int
     fixed: int
     expected: FrameHomography | None
     guessed: bool = False
+    closure: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +231,7 @@ class ExposureTasks:
         with clock("locate"):
             with level.attributing(named):
                 motion = require_valid(named.component.register(moving, fixed, initial))
-                if isinstance(motion, Located):
+                if isinstance(motion, Located) and not pair.closure:
                     require_no_standstill(motion, expected, shape)
             if isinstance(motion, NotLocated):
                 return motion

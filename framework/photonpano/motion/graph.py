@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import breadth_first_order
+from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import inverse, nearest_rotations, normalised, scaled_ahead
 from photonpano.motion.adjustment import Adjustment, Assessment
@@ -118,8 +118,8 @@ def solve(
     """Solve the graph: find the motions with the least residuals of all located edges.
 
     Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
-    with Cauchy weights, from a spanning tree of edges to the nearest exposures unless a start is given. Outliers are dropped,
-    unless the graph would fall apart, and it is solved again.
+    with Cauchy weights, from a tree of edges between near exposures unless a start is given. Outliers are dropped, unless the
+    graph would fall apart, and it is solved again.
 
     Args:
         n_nodes: number of exposures.
@@ -176,7 +176,7 @@ class _Tied:
     Attributes:
         located: (N,) which nodes.
         order: these nodes, the anchor first, each after its parent.
-        parents: (N,) of the nodes.
+        parents: (N,) of the nodes: a tree of short edges.
         positions: (E,) of the located edges between them, in the list that is solved.
         pairs: (E, 2) their nodes.
         motions: their motions.
@@ -196,7 +196,7 @@ class _Tied:
         """Find the edges that are tied to the anchor."""
         located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
         pairs = _pairs(edges)
-        order, parents = breadth_first_order(adjacency(n_nodes, pairs), anchor, directed=False)
+        order, parents = _tree(n_nodes, pairs, anchor)
         located = np.zeros(n_nodes, dtype=bool)
         located[order] = True
         tied = [index for index, (moving, _) in enumerate(pairs) if located[moving]]
@@ -283,6 +283,28 @@ def _turns(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
     else:
         turns = camera.rotations(inverse(start[tied.anchor]) @ start[tied.located])
     return tied.fit(adjustment, Turns(nearest_rotations(turns), camera))
+
+
+def _tree(n_nodes: int, pairs: NDArray[np.integer], anchor: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """Return the nodes that are tied to the anchor, each after its parent, and the (N,) parents: a tree of short edges.
+
+    Errors along a path grow with its length. Two nodes that are next to each other therefore should have nearly the same path:
+    over a long capture, branches drift so far from each other that a least-squares solution from there is lost.
+    """
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    gaps = (pairs[:, 1] - pairs[:, 0]).astype(np.float64)
+    # By squares of gaps, many short edges are nearer than one that skips the nodes in between.
+    distances = np.asarray(dijkstra(adjacency(n_nodes, pairs, gaps**2), directed=False, indices=[anchor]))[0]
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    gaps = np.tile(gaps, 2)
+    on_path = distances[ends[:, 0]] + gaps**2 == distances[ends[:, 1]]
+    # Of parents that are equally near, the one farthest from the node: dense exposures, which skip their next neighbours, thus
+    # hang on one chain, and form no second one beside it.
+    kept = np.flatnonzero(on_path)[np.argsort(gaps[on_path], kind="stable")]
+    parents = np.full(n_nodes, -1)
+    parents[ends[kept, 1]] = ends[kept, 0]
+    order = np.argsort(distances, kind="stable")
+    return order[np.isfinite(distances[order])], parents
 
 
 def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:

@@ -64,9 +64,10 @@ def independent_share(groups: Sequence[Group]) -> float:
     return min(1.0, float(np.median(np.diff(instants_of(groups))) / np.median(lengths_of(groups))))
 
 
-def adjacency(n_nodes: int, pairs: NDArray[np.integer]) -> sparse.csr_array:
-    """Return the adjacency matrix of a graph: 1 where a pair of (P, 2) has its row and column, 0 elsewhere."""
-    return sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_nodes, n_nodes))
+def adjacency(n_nodes: int, pairs: NDArray[np.integer], weights: FloatArray | None = None) -> sparse.csr_array:
+    """Return the adjacency matrix of a graph: the (P,) weights of its (P, 2) pairs, or 1, at their rows and columns."""
+    given = np.ones(len(pairs)) if weights is None else weights
+    return sparse.csr_array((given, (pairs[:, 0], pairs[:, 1])), shape=(n_nodes, n_nodes))
 
 
 def component_labels(n_nodes: int, pairs: NDArray[np.integer]) -> NDArray[np.integer]:

@@ -139,7 +139,7 @@ class Registrar:
             for index, [(kept, _)] in zip(missing, pool.map(lambda each: self._describe([each], True), missing), strict=True):
                 self._kept[index] = kept
             expected = FrameHomography(inverse(homographies[fixed]) @ homographies[moving])
-            closure = self._similar(self._register([Pair(moving, fixed, expected)])[0])
+            closure = self._similar(self._register([Pair(moving, fixed, expected, closure=True)])[0])
             log.add(closure)
             yield closure
             for index in [index for index in self._kept if needed_until[index] <= position]:

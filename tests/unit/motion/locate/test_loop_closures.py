@@ -141,6 +141,19 @@ def test_closure_starts_from_the_solution_of_the_other_pairs(run: Callable, leve
     np.testing.assert_allclose(initials[-len(PAIRS) :], expected, atol=1e-3)
 
 
+def test_closure_that_returns_exactly_is_accepted_however_far_the_others_drifted(run: Callable, level: Callable) -> None:
+    """The drift is 5.75 px; as the motion of a pair of neighbours, the identity is refused from 4 px on."""
+
+    def far(moving: Group, fixed: Group, found: Located) -> Located:
+        off_px = 0.0 if is_closure(moving, fixed) else 5 * DRIFT_PX * (moving.reference - fixed.reference) / 10
+        return replace(found, homography=translation(0, off_px) @ found.homography)
+
+    found = run(level(far))
+    assert (found.edges[-1].motion.homography == np.eye(3)).all()
+    assert drift_px(run(level(far), closure_overlap=None)) == pytest.approx(5.75, rel=0.02)
+    assert drift_px(found) < 0.6
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_closure_of_different_places_is_refused(run: Callable, level: Callable, scale: float) -> None:
     wrong = at_closures(lambda found: replace(found, homography=translation(7, 9) @ found.homography, evidence={"inliers": 12}))

@@ -31,8 +31,10 @@ def edge(true: np.ndarray, moving: int, fixed: int, rng: np.random.Generator | N
     return Edge(moving, fixed, Located(homography, information))
 
 
-def measured(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator | None = None) -> list[Edge]:
-    return [edge(true, moving, moving - skip, rng) for moving in range(len(true)) for skip in skips if skip <= moving]
+def measured(
+    true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator | None = None, std_px: float = NOISE_PX
+) -> list[Edge]:
+    return [edge(true, moving, moving - skip, rng, std_px) for moving in range(len(true)) for skip in skips if skip <= moving]
 
 
 def confident(edges: list[Edge], times: float) -> list[Edge]:

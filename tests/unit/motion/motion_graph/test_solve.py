@@ -153,6 +153,17 @@ def test_solve_keeps_edges_outside_the_spanning_tree_it_starts_from() -> None:
     assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - 59 / len(edges)), rel=0.1)
 
 
+@pytest.mark.parametrize(("skips", "n"), [((1, 2, 8), 400), ((2, 3, 8), 600)], ids=["disjoint", "half overlapping"])
+def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, ...], n: int) -> None:
+    """Errors of 8 px a pair, as of blurred exposures: along skips of 8, paths to neighbours drift apart by far more."""
+    true = true_motion(n)
+    edges = measured(true, skips, np.random.default_rng(0), 8.0)
+    found, expected = (solve(n, edges, n // 2, SHAPE, start) for start in (None, true))
+    assert found.residual_px == pytest.approx(expected.residual_px, rel=0.01)
+    neighbours = inverse(found.homographies[:-1]) @ found.homographies[1:]
+    assert corner_displacements(neighbours, inverse(true[:-1]) @ true[1:], SHAPE).mean() < 8
+
+
 def test_solve_leaves_nodes_not_tied_to_the_anchor_unknown() -> None:
     true = true_motion(7)
     edges = [edge(true, 1, 0), edge(true, 2, 1), edge(true, 2, 0), Edge(3, 2, NotLocated("lost")), edge(true, 5, 4)]
