@@ -34,9 +34,10 @@ def drawn(figure: Figure) -> Picture:
 
 
 def labelled(image: Picture, label: str) -> Picture:
-    """Write a line above a picture."""
+    """Write a line above a picture, smaller where it would be longer than the picture is wide."""
     strip = Figure(figsize=(image.shape[1] / 100, LABEL / 100), dpi=100)
-    strip.text(2 / image.shape[1], 0.35, label, fontsize=10, color="0.25")
+    text = strip.text(2 / image.shape[1], 0.35, label, fontsize=10, color="0.25")
+    text.set_fontsize(10 * min(1, (image.shape[1] - 4) / text.get_window_extent().width))
     grey = drawn(strip)[..., 0]
     return np.vstack([grey[:LABEL, : image.shape[1]], image])
 
