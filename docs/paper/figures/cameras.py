@@ -137,20 +137,27 @@ def stitch(pictures: list[Picture]) -> tuple[Picture, int]:
 
     Both of its modes are tried, and the one that places more pictures counts.
     """
-    best: Picture = np.full((200, COLUMN), 225, np.uint8)
-    most = 0
-    for mode in (cv2.Stitcher_PANORAMA, cv2.Stitcher_SCANS):
+    for stitcher, placed in placing(pictures, cv2.Stitcher_PANORAMA, cv2.Stitcher_SCANS):
+        status, panorama = stitcher.composePanorama()
+        if status == cv2.Stitcher_OK:
+            grey = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY).astype(np.uint8)
+            return np.where(panorama.any(axis=2), grey, np.uint8(255)), placed
+    return np.full((200, COLUMN), 225, np.uint8), 0
+
+
+def placing(pictures: list[Picture], *modes: int) -> list[tuple[cv2.Stitcher, int]]:
+    """Return the modes of OpenCV's Stitcher that place some pictures, and how many: the one that places most first."""
+    found = []
+    for mode in modes:
         cv2.setRNGSeed(0)
         stitcher = cv2.Stitcher.create(mode)
         try:
-            status, panorama = stitcher.stitch([cv2.cvtColor(each, cv2.COLOR_GRAY2BGR) for each in pictures])
+            status = stitcher.estimateTransform([cv2.cvtColor(each, cv2.COLOR_GRAY2BGR) for each in pictures])
         except cv2.error:  # frames with hardly any keypoints
             continue
-        placed = len(stitcher.component()) if status == cv2.Stitcher_OK else 0
-        if placed > most:
-            grey = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY).astype(np.uint8)
-            best, most = np.where(panorama.any(axis=2), grey, np.uint8(255)), placed
-    return best, most
+        if status == cv2.Stitcher_OK:
+            found.append((stitcher, len(stitcher.component())))
+    return sorted(found, key=lambda each: -each[1])
 
 
 def in_chain(
@@ -186,7 +193,8 @@ def darker(study: Study) -> tuple[Picture, Numbers]:
             camera = scaled(study, "fig4-camera", SLOW, 1 / darkness)
             camera["source"]["with"]["sensor"]["read_noise"] = read_noise
             pictures, true = shots(camera, 3 * camera["source"]["with"]["flux"])
-            placed["stitcher"].append(stitch(pictures)[1])
+            # The mode for flat scenes: in the other, focal lengths are found from noise, and a panorama takes gigabytes.
+            placed["stitcher"].append(sum(number for _, number in placing(pictures, cv2.Stitcher_SCANS)))
             placed["chain"].append(in_chain(study, "fig4-darker", camera, true)[1]["located"])
         numbers |= frames_of(camera)
         numbers["photons"] = [rounded(scaled(study, "fig4-camera", SLOW, 1 / each)["source"]["with"]["flux"]) for each in times]

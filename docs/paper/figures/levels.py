@@ -242,7 +242,7 @@ def ends(study: Study) -> tuple[Picture, Numbers]:
         numbers["between_px"][name] = rounded(float(errors[length:-length].mean()))
     panel.set_xlabel("frame", fontsize=9)
     panel.set_ylabel("corner error (px)", fontsize=9)
-    panel.legend(fontsize=8, ncols=4)
+    figure.legend(loc="outside upper center", fontsize=8, ncols=4)
     return drawn(figure)[..., 2::-1], numbers
 
 
