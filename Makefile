@@ -42,7 +42,7 @@ test: $(COMPLETE)
 	$(STEP) 'import-linter'
 	@$(BIN)/lint-imports --no-logo
 	$(STEP) 'pytest'
-	@$(BIN)/pytest -n auto --dist worksteal
+	@$(BIN)/pytest -n auto --dist worksteal --durations 40
 
 demo: $(RUNS)
 	@mkdir -p demo

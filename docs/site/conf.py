@@ -29,6 +29,8 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "README"
 include_patterns = [
     "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
     "docs/README.md",
     "docs/**/*.md",
     "docs/**/*.ipynb",
@@ -59,7 +61,7 @@ html_copy_source = False
 def sections() -> Iterator[tuple[str, list[str]]]:
     """Yield the sections of the index of all pages, each with its pages, in their order."""
     for caption, items in re.findall(
-        r"^\*\*([^*]+)\*\*[^\n]*\n\n((?:- .*\n)+)", INDEX.read_text(encoding="utf-8"), re.MULTILINE
+        r"^##+ ([^\n]+)\n\n(?:\w[^\n]*\n\n)?((?:- .*\n)+)", INDEX.read_text(encoding="utf-8"), re.MULTILINE
     ):
         pages = [f"docs/{name}" for name in re.findall(r"^- \[[^\]]*\]\(([^)]+)\.(?:md|ipynb)\)", items, re.MULTILINE)]
         yield caption, pages + SITE_ONLY.get(caption, [])
@@ -68,7 +70,7 @@ def sections() -> Iterator[tuple[str, list[str]]]:
 def contents() -> Iterator[str]:
     """Yield the tables of contents, which the home page does not show."""
     examples = sorted(path.with_suffix("").relative_to(ROOT).as_posix() for path in ROOT.glob("examples/**/README.md"))
-    yield toctree("Overview", ["docs/README", "docs/site/gallery"])
+    yield toctree("Overview", ["docs/README", "docs/site/gallery", "CONTRIBUTING", "CHANGELOG"])
     for caption, pages in sections():
         yield toctree(caption, pages)
     yield toctree("Examples", examples)

@@ -32,7 +32,11 @@ from photonpano.corrections import CORRECTIONS
 from photonpano.residuals import verdict
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "examples").glob("*/README.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "examples").glob("*/README.md")),
+]
 REFERENCE = ROOT / "docs" / "reference"
 BLOCK = re.compile(
     r"(?:^<!-- (?P<marker>(?:test|file):[^\n]*?) *-->\n+)?^```(?P<language>\w+)\n(?P<text>.*?)^```$"
