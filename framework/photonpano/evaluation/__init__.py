@@ -5,9 +5,8 @@ from photonpano.evaluation.images import ImageScore, covered, image_score, true_
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.pose_inputs import RunPoses, has_poses, load_run_poses, load_true_poses
 from photonpano.evaluation.poses import PoseScore, align_positions, evaluate_poses, pose_errors
-from photonpano.evaluation.rotations import RotationScore, Turn, rotation_errors
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
-from photonpano.evaluation.trajectory import TrajectoryScore, corner_errors
+from photonpano.evaluation.trajectory import RotationScore, TrajectoryScore, Turn, corner_errors, rotation_errors
 
 __all__ = [
     "Evaluation",

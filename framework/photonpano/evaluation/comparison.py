@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.evaluation.inputs import RunTrajectory
-from photonpano.evaluation.rotations import turned_alignment
-from photonpano.evaluation.trajectory import corner_errors
+from photonpano.evaluation.trajectory import corner_errors, turned_alignment
 from photonpano.geometry import Canvas, inverse, rescaling
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano.values import FloatArray, Homography

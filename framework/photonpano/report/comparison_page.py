@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from photonpano.record.schema import RunRecord
 from photonpano.registry.description import flow
 from photonpano.report.drawing import INK, SERIES, WIDTH_IN, Margins, add_axes, jpeg_uri, plain_figure, svg_of
-from photonpano.report.environment import environment_of
+from photonpano.report.environment import filled
 from photonpano.report.figures import instants_of
 from photonpano.text import byte_size, count, duration, pixels, share
 from photonpano.values import FloatArray
@@ -65,23 +65,19 @@ def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
     """
     first = runs[0].record
     shown, hidden = _differing([run.record["spec"] for run in runs])
-    page: str = (
-        environment_of()
-        .get_template("comparison.html")
-        .render(
-            title=", ".join(run.name for run in runs),
-            version=importlib.metadata.version("photonpano"),
-            source=first["source"],
-            runs=runs,
-            links=[_link(run.folder, output) for run in runs],
-            pictures=[jpeg_uri(run.picture) for run in runs],
-            rows=_rows(runs),
-            settings=shown,
-            more_settings=hidden,
-            differences=differences_over_time(runs) if any(run.mean_difference_px for run in runs) else None,
-        )
+    return filled(
+        "comparison.html",
+        title=", ".join(run.name for run in runs),
+        version=importlib.metadata.version("photonpano"),
+        source=first["source"],
+        runs=runs,
+        links=[_link(run.folder, output) for run in runs],
+        pictures=[jpeg_uri(run.picture) for run in runs],
+        rows=_rows(runs),
+        settings=shown,
+        more_settings=hidden,
+        differences=differences_over_time(runs) if any(run.mean_difference_px for run in runs) else None,
     )
-    return page
 
 
 def differences_over_time(runs: Sequence[ComparedRun]) -> str:

@@ -1,4 +1,4 @@
-"""What the templates of all pages need."""
+"""Fill the templates of the pages."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 
+def filled(template: str, **values: Any) -> str:
+    """Return the page that a template makes of its values."""
+    page: str = _environment().get_template(template).render(**values)
+    return page
+
+
 @cache
-def environment_of() -> Environment:
-    """Return what fills the templates, with filters that write numbers."""
+def _environment() -> Environment:
+    """Return the environment of the templates, with filters that write numbers."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -14,9 +14,9 @@ from photonpano.record.run_json import failure_records
 from photonpano.record.schema import FailureRecord, RunRecord
 from photonpano.report import figures
 from photonpano.report.drawing import jpeg_uri, shrunk
-from photonpano.report.environment import environment_of
-from photonpano.report.failures import FailureGroup, failure_groups
+from photonpano.report.environment import filled
 from photonpano.report.page import head_of
+from photonpano.report.tables import FailureGroup, failure_groups
 from photonpano.values import NotLocated, VirtualExposure
 
 MAX_PAIRS = 8
@@ -51,23 +51,19 @@ def render_failure(record: RunRecord, error: PhotonpanoError) -> str:
     lost = error if isinstance(error, UntiedError) else None
     failed = [] if lost is None else failure_records(lost.groups, lost.edges)
     groups = [] if lost is None else failure_groups([{"level": lost.level, "failures": failed}])
-    page: str = (
-        environment_of()
-        .get_template("failure.html")
-        .render(
-            **head_of(record),
-            lines=_lines(error),
-            level=None if lost is None else lost.level,
-            lost_groups=groups,
-            n_pairs=0 if lost is None else len(lost.edges),
-            n_failed=len(failed),
-            parts=None if lost is None else figures.tied_parts(lost.groups, lost.parts),
-            pairs=[] if lost is None else _shown(lost, failed, groups),
-            stages=figures.STAGE_NAMES,
-            failures=failure_groups(record["levels"]),
-        )
+    return filled(
+        "failure.html",
+        **head_of(record),
+        lines=_lines(error),
+        level=None if lost is None else lost.level,
+        lost_groups=groups,
+        n_pairs=0 if lost is None else len(lost.edges),
+        n_failed=len(failed),
+        parts=None if lost is None else figures.tied_parts(lost.groups, lost.parts),
+        pairs=[] if lost is None else _shown(lost, failed, groups),
+        stages=figures.STAGE_NAMES,
+        failures=failure_groups(record["levels"]),
     )
-    return page
 
 
 def _lines(error: PhotonpanoError) -> list[str]:

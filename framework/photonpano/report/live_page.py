@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from photonpano.report.environment import environment_of
+from photonpano.report.environment import filled
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,5 +49,4 @@ def render_live(figures: LiveFigures, title: str, picture: str | None, report: s
         picture: the address of the picture so far; None as long as there is none.
         report: the address of the report, once there is one.
     """
-    page: str = environment_of().get_template("live.html").render(figures=figures, title=title, picture=picture, report=report)
-    return page
+    return filled("live.html", figures=figures, title=title, picture=picture, report=report)

@@ -17,9 +17,8 @@ from photonpano.protocols import Source
 from photonpano.record.schema import RunRecord
 from photonpano.report import figures, residual_figures
 from photonpano.report.drawing import jpeg_uri, shrunk
-from photonpano.report.environment import environment_of, yaml_of
-from photonpano.report.failures import failure_groups
-from photonpano.report.files import listed_files
+from photonpano.report.environment import filled, yaml_of
+from photonpano.report.tables import failure_groups, listed_files
 from photonpano.report.viewer import viewer_data
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Light, true_spans
@@ -63,21 +62,17 @@ def render_report(
         capture: for the viewer; None for a page without one.
     """
     files, more_files = listed_files(record.get("files", {}))
-    page: str = (
-        environment_of()
-        .get_template("report.html")
-        .render(
-            **head_of(record),
-            stages=figures.STAGE_NAMES,
-            failures=failure_groups(record["levels"]),
-            stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
-            files=files,
-            more_files=more_files,
-            viewer=None if capture is None else viewer_data(record, explained, panorama, capture.source, capture.levels),
-            **_results(record, explained, panorama, light),
-        )
+    return filled(
+        "report.html",
+        **head_of(record),
+        stages=figures.STAGE_NAMES,
+        failures=failure_groups(record["levels"]),
+        stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
+        files=files,
+        more_files=more_files,
+        viewer=None if capture is None else viewer_data(record, explained, panorama, capture.source, capture.levels),
+        **_results(record, explained, panorama, light),
     )
-    return page
 
 
 def head_of(record: RunRecord) -> dict[str, Any]:
