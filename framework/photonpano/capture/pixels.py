@@ -48,8 +48,8 @@ class LinearCorrection:
     Attributes:
         slope: (H, W) float32.
         offset: (H, W) float32, added for each frame.
-        filling: (P,) numbers of the pixels that are replaced, (P, N) those of the neighbours of each, and (P, N) float32 weights
-            of these, of which each row sums to 1; None if no pixel is replaced.
+        filling: (P,) numbers of the pixels that are replaced, (P, N) those of the neighbours of each, and (P, N) float32, the
+            weights of these, which sum to 1; None if no pixel is replaced.
     """
 
     slope: FluxImage

@@ -51,6 +51,12 @@ class PluginSource:
 
     Reading a span raises a `PluginError` if the source failed with an exception that is not for users, or broke its contract:
     if an array has another shape or type, or values that frames of this depth cannot have, or changes after it was returned.
+
+    Attributes:
+        given: what the plugin has built.
+        info: frames, size, rate.
+        valid: (H, W) mask.
+        response: how flux becomes counts.
     """
 
     def __init__(self, source: Source, origin: str | None) -> None:
@@ -59,7 +65,7 @@ class PluginSource:
         Raises:
             PluginError: `info`, `valid` or `response` is not what it should be.
         """
-        self._source: Any = source
+        self.given: Any = source
         self._origin = origin
         self._reads = count()
         self._own: set[str] = set()
@@ -73,7 +79,7 @@ class PluginSource:
 
     def __reduce__(self) -> Any:
         """Travel as what was given; the source of a colour as a colour of the capture, which is opened in each process."""
-        return (PluginSource, (self._source, self._origin)) if self._of is None else (_colour_of, self._of)
+        return (PluginSource, (self.given, self._origin)) if self._of is None else (_colour_of, self._of)
 
     def offers(self, name: str) -> bool:
         """Return whether the source has an optional method."""
@@ -98,25 +104,25 @@ class PluginSource:
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
         """Take everything but the flux out of a sum of frames: see `photonpano.LinearlyCorrectedSource`."""
         with self._attributing("correcting"):
-            return self._image("corrected", self._source.corrected(counts, n_frames), counts.shape)
+            return self._image("corrected", self.given.corrected(counts, n_frames), counts.shape)
 
     def weights(self) -> FluxImage:
         """Return what a frame of each pixel is worth: see `photonpano.WeightedSource`."""
         with self._attributing("weights()"):
-            return self._image("weights", self._source.weights(), self.info.frame_shape)
+            return self._image("weights", self.given.weights(), self.info.frame_shape)
 
     @property
     def light(self) -> Light:
         """The gain of each frame."""
         with self._attributing("light"):
-            light: Light = self._source.light
+            light: Light = self.given.light
             return light
 
     @property
     def camera(self) -> Camera:
         """The camera of all frames."""
         with self._attributing("camera"):
-            camera: Camera = self._source.camera
+            camera: Camera = self.given.camera
             return camera
 
     def colours(self) -> Mapping[str, PluginSource]:
@@ -126,7 +132,7 @@ class PluginSource:
     @cached_property
     def _colours(self) -> Mapping[str, PluginSource]:
         with self._attributing("colours()"):
-            colours = {name: PluginSource(each, self._origin) for name, each in self._source.colours().items()}
+            colours = {name: PluginSource(each, self._origin) for name, each in self.given.colours().items()}
         for name, each in colours.items():
             each._of = self, name
         return colours
@@ -134,12 +140,12 @@ class PluginSource:
     def clear_mix(self) -> FloatArray:
         """Return the flux of a clear pixel: see `photonpano.ColouredSource`."""
         with self._attributing("clear_mix()"):
-            return np.asarray(self._source.clear_mix(), np.float64)
+            return np.asarray(self.given.clear_mix(), np.float64)
 
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
         """Return the ground truth: see `photonpano.KnowsTruth`."""
         with self._attributing("truth()"):
-            found: Any = self._source.truth()
+            found: Any = self.given.truth()
             if not isinstance(found, Mapping):
                 raise BrokenContract(f"truth() returns a mapping of arrays by name, got {shown(found)}")
             truth: Mapping[str, NDArray[np.generic]] = found
@@ -148,13 +154,13 @@ class PluginSource:
     def sharp_view(self, frame: int) -> FluxImage:
         """Return the flux of a frame without noise: see `photonpano.KnowsSharpViews`."""
         with self._attributing("sharp_view()"):
-            return self._image("sharp_view", self._source.sharp_view(frame), self.info.frame_shape)
+            return self._image("sharp_view", self.given.sharp_view(frame), self.info.frame_shape)
 
     def close(self) -> None:
         """Close the source; a failure is logged, since what was read from it is not affected."""
         try:
             with self._attributing("closing"):
-                self._source.close()
+                self.given.close()
         except PluginError as error:
             logger.warning("%s", error)
 
@@ -177,7 +183,7 @@ class PluginSource:
 
     def _read(self, what: str, span: FrameSpan, shape: tuple[int, ...], highest: int) -> Any:
         """Read a span with a method of the source, and check the array."""
-        method: Callable[[FrameSpan], Any] = getattr(self._source, what)
+        method: Callable[[FrameSpan], Any] = getattr(self.given, what)
         if self._origin is None:
             return method(span)
         with self._attributing(str(span)):
