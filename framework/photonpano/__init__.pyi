@@ -28,6 +28,8 @@ from .api.verification import clean as clean
 from .api.verification import verify as verify
 from .api.video import Video as Video
 from .api.video import video as video
+from .capture import Capture as Capture
+from .capture import capture_of as capture_of
 from .context import Progress as Progress
 from .context import Quiet as Quiet
 from .contributions import Config as Config

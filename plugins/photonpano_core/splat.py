@@ -10,12 +10,10 @@ from photonpano import (
     FrameSpan,
     Group,
     InputError,
-    LensedSource,
-    LinearlyCorrectedSource,
-    LitSource,
     Source,
     Trajectory,
     VirtualExposure,
+    capture_of,
 )
 from photonpano.geometry import apply, corners, inverse
 from photonpano.merging import PhotonSum, gain_image
@@ -43,12 +41,13 @@ class SplatMerger:
         Raises:
             InputError: the source corrects sums of frames, which this merger does not make, or its lens distorts.
         """
-        if isinstance(source, LinearlyCorrectedSource):
+        capture = capture_of(source)
+        if capture.corrects_sums:
             raise InputError(
                 "merge.use: splat warps photons one by one, so that it cannot subtract dark counts, interpolate pixels or "
                 "compare colours; use photon-mle, or only corrections that move or mask pixels"
             )
-        if isinstance(source, LensedSource) and source.camera.distorts:
+        if capture.camera is not None and capture.camera.distorts:
             raise InputError("merge.use: splat does not warp through a lens that distorts; use photon-mle")
         if trajectory is None:
             photons = unwarped_sum(source, group, scale)
@@ -57,9 +56,9 @@ class SplatMerger:
             to_grid = to_exposure(group, trajectory, scale) @ trajectory.at(frames)
             to_grid /= np.cbrt(np.linalg.det(to_grid))[:, None, None]
             photons = _splatted(source, group.span, to_grid, exposure_shape(source, scale))
-            if isinstance(source, LitSource):
+            if capture.light is not None:
                 to_plane = inverse(to_exposure(group, trajectory, scale))
-                gain = gain_image(source.light, group.span, to_plane, exposure_shape(source, scale))
+                gain = gain_image(capture.light, group.span, to_plane, exposure_shape(source, scale))
                 photons = PhotonSum(photons.counts, photons.weight * gain)
         return exposure_of(photons, source, group, scale)
 

@@ -26,7 +26,7 @@ from colour import Camera, demosaicked
 
 from photonpano import FrameSpan, StreamInfo, open_source, parse_spec
 from photonpano.context import Context
-from photonpano.corrections.colours import filtered
+from photonpano.corrections.colours import with_colours
 from photonpano.evaluation import covered, image_score, true_panorama, white_flux
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of, inverse, normalised
 from photonpano.merging.colour import composed, filled
@@ -70,7 +70,7 @@ def chances_of(scene: np.ndarray, motion: np.ndarray, places: np.ndarray) -> lis
 def images_of(cubes: list[Any], sources: list[Any], places: np.ndarray, motion: FrameTrajectory, canvas: Canvas) -> Any:
     """Return the images by name, and the number of frames that saw each pixel in each colour."""
     span = FrameSpan(0, len(cubes[0]))
-    bayer = filtered(sources[0], lambda: places.astype(np.int8), [])
+    bayer = with_colours(sources[0], places.astype(np.int8))
     raw = render(bayer, motion, span, canvas, 0.125, Context(2))
     single = [render(each, motion, span, canvas, 0.125, Context(2)).flux for each in sources[1:]]
     three = np.stack(single, axis=-1) / SHARE

@@ -30,7 +30,7 @@ from photonpano.evaluation import corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of_box, inverse, normalised
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.panorama import render
-from photonpano.source_wrapper import SourceWrapper
+from photonpano.reading import Closing
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux
 
@@ -64,11 +64,11 @@ class Measured:
     gathered: DynamicRange
 
 
-class WithoutNoise(SourceWrapper):
+class WithoutNoise(Closing):
     """The expected counts of a simulation in place of its photons."""
 
     def __init__(self, simulator: Any) -> None:
-        super().__init__(simulator)
+        self.info, self.response, self.valid = simulator.info, simulator.response, simulator.valid
         truth = simulator.truth()
         self._scene, self._motion = truth["scene"], truth["homographies"]
 

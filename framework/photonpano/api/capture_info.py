@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from photonpano.captures.order import order_warning
+from photonpano.captures.obstacles import order_warning
 from photonpano.captures.summary import require_photons, saturated_share, summarise
-from photonpano.corrections import CorrectedSource, FilteredSource, HotPixels, without_still_pixels
+from photonpano.corrections import HotPixels, without_still_pixels
 from photonpano.errors import InputError
 from photonpano.notebooks import facts
 from photonpano.paths import Url
@@ -125,8 +125,7 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
         with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
-        decisions = marked.decisions if isinstance(marked, CorrectedSource | FilteredSource) else ()
-        decided = {each.what: each for each in decisions}
+        decided = {each.what: each for each in marked.decisions}
         found = CaptureInfo(
             source=plan.source.contribution.name,
             reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),

@@ -10,7 +10,7 @@ from typing import Any
 
 from photonpano.atomic import atomic_folder
 from photonpano.captures.picture_files import counted, write_pngs
-from photonpano.captures.sharp import require_sharp_views, sharp_pictures
+from photonpano.captures.preview import require_sharp_views, sharp_pictures
 from photonpano.captures.writing import write_folder, write_packed
 from photonpano.context import Progress, usual
 from photonpano.contributions import SourceContribution

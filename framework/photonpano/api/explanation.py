@@ -55,7 +55,7 @@ def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None 
     """
     if with_forecast:
         _require_levels(plan)
-    with open_source(plan) as source:
+    with open_source(plan, look=with_forecast) as source:
         title = f"# {plan.file or 'the spec'} as it will run, on {source.info}"
         writer = _Writer(plan, discover() if catalog is None else catalog, list(_levels(plan, source)))
         prediction = [f"# {line}" for line in _forecast_lines(plan, source)] if with_forecast else []

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from photonpano.capture import seen_through
 from photonpano.corrections import Vignette, divided_by, read_vignette
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
@@ -23,7 +24,6 @@ from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
-from photonpano.source_wrapper import seen_through
 from photonpano.specs import Plan, parse_spec
 from photonpano.values import FrameSpan, StreamInfo
 

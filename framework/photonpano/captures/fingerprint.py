@@ -12,9 +12,10 @@ from typing import Any, TypedDict
 import numpy as np
 from pydantic import BaseModel
 
+from photonpano.capture import capture_of
 from photonpano.errors import InputError
 from photonpano.paths import Location, Url
-from photonpano.protocols import LinearlyCorrectedSource, PackedSource, Source
+from photonpano.protocols import Source
 from photonpano.reading.remote import remote_file
 from photonpano.specs.plan import Plan
 
@@ -73,10 +74,10 @@ def _locations(plan: Plan) -> list[Location]:
 
 def frames_sha256(source: Source) -> str:
     """Hash the size of a capture, and 4 frames at each of 16 places."""
-    info = source.info
+    capture, info = capture_of(source), source.info
     digest = hashlib.sha256(repr((info.n_frames, *info.frame_shape, info.kind)).encode())
     for span in info.spread(_PLACES, _FRAMES):
-        frames = source.packed(span) if isinstance(source, PackedSource) else source.frames(span)
+        frames = capture.packed(span) if capture.is_packed else capture.frames(span)
         digest.update(np.ascontiguousarray(frames).data)
     return digest.hexdigest()
 
@@ -102,10 +103,10 @@ def changes(old: CaptureRecord, new: CaptureRecord) -> list[str]:
 
 
 def _pixels_sha256(source: Source) -> str:
-    digest = hashlib.sha256(np.packbits(source.valid).data)
-    if isinstance(source, LinearlyCorrectedSource):
+    capture, digest = capture_of(source), hashlib.sha256(np.packbits(source.valid).data)
+    if capture.corrects_sums:
         (first, *_) = source.info.spread(_PLACES, _FRAMES)
-        digest.update(np.ascontiguousarray(source.corrected(source.counts(first), len(first))).data)
+        digest.update(np.ascontiguousarray(capture.corrected_counts(first)).data)
     return digest.hexdigest()
 
 

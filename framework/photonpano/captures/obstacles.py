@@ -1,4 +1,4 @@
-"""Obstacles to locating: properties of a capture that explain why its exposures could not be located."""
+"""Find what makes a capture hard to locate: pixels in a wrong order, parts that stand still, a scene that repeats."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from photonpano.capture import capture_of
 from photonpano.errors import LocationError
 from photonpano.locating.phase import correlation_peaks
 from photonpano.merging.accumulate import weights_of
-from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source
+from photonpano.protocols import Source
+from photonpano.reading import other_order, sampled_spans
 from photonpano.values import Decision, FrameSpan
 
 _PLACES, _FRAMES = 5, 256
@@ -34,6 +36,21 @@ _FILTER_BLUR_PX = 1.0
 """Standard deviation of the Gaussian that blurs a colour filter array."""
 _STANDING = 0.3
 """Share of the frame from which what stands still is named."""
+
+
+def order_warning(source: Source) -> str | None:
+    """Return a warning if sampled frames of a packed source show another order of pixels in their bytes; None if not.
+
+    Most formats fix the order, and a sensor may arrange its pixels in its own way: so this is no error.
+    """
+    capture, info = capture_of(source), source.info
+    if not capture.is_packed:
+        return None
+    spans = sampled_spans(info.n_frames, info.height * -(-info.width // 8))
+    other = other_order([capture.packed(span) for span in spans])
+    if other is None:
+        return None
+    return f"the pixels of the frames seem to be in another order than they are read in: {other}; check the source and its keys"
 
 
 @contextmanager
@@ -91,14 +108,11 @@ def _repetition_within(source: Source, span: FrameSpan) -> float | None:
 
 def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
     """Sum the frames of a span; colours are made alike, and blurred, so that their filter array is not seen."""
-    counts = source.counts(span)
-    if not isinstance(source, ColouredSource):
-        return np.where(source.valid, counts, 0)
-    weights = weights_of(source)
-    assert weights is not None
-    assert isinstance(source, LinearlyCorrectedSource)
+    capture, weights = capture_of(source), weights_of(source)
+    if capture.colour is None or weights is None:
+        return np.where(source.valid, source.counts(span), 0)
     lit, near = (
-        ndimage.gaussian_filter(image, _FILTER_BLUR_PX) for image in (source.corrected(counts, len(span)) * weights, weights)
+        ndimage.gaussian_filter(image, _FILTER_BLUR_PX) for image in (capture.corrected_counts(span) * weights, weights)
     )
     return np.asarray(lit / np.maximum(near, 1e-6))
 

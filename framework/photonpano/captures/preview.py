@@ -1,4 +1,4 @@
-"""Make pictures of a capture: each the flux of some frames, summed without any motion."""
+"""Make pictures of a capture: of sums of frames, without any motion; of a simulated one, also of frames without noise."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import Capture, capture_of
+from photonpano.errors import InputError
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.colour import composed, in_colours
 from photonpano.photometry import tone_mapped
@@ -16,8 +18,8 @@ from photonpano.protocols import Source
 from photonpano.threads import in_order
 from photonpano.values import FluxImage, FrameSpan, Panorama, StreamInfo
 
-_WHITE_EXPOSURES = 16
-"""The white flux is a quantile of 16 exposures all over the capture."""
+_WHITE_EXPOSURES = 16  # the white flux is a quantile of that many exposures, or views, all over the capture
+_WHITE_QUANTILE = 0.999  # of views without noise
 _FONT, _FONT_SCALE, _LINE_PX, _MARGIN_PX = cv2.FONT_HERSHEY_PLAIN, 0.8, 14, 3
 
 
@@ -87,3 +89,25 @@ def _label(span: FrameSpan, info: StreamInfo) -> NDArray[np.uint8]:
     if strip.shape[1] == info.width:
         return strip
     return np.asarray(cv2.resize(strip, (info.width, _LINE_PX), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def require_sharp_views(source: Source) -> Capture:
+    """Return a capture that knows what its frames show without noise.
+
+    Raises:
+        InputError: it does not.
+    """
+    capture = capture_of(source)
+    if capture.has_sharp_views:
+        return capture
+    raise InputError(
+        "only simulated captures have sharp frames, and not through corrections that move pixels or keep colours; leave out "
+        "--sharp-every"
+    )
+
+
+def sharp_pictures(capture: Capture, frames: range, threads: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield pictures without noise of some frames, of at least one: (H, W) uint8 each, sRGB, with the same white in all."""
+    chosen = sorted({frames[round(place)] for place in np.linspace(0, len(frames) - 1, _WHITE_EXPOSURES)})
+    white = max(float(np.quantile(view, _WHITE_QUANTILE)) for view in in_order(capture.sharp_view, chosen, threads)) or 1.0
+    return in_order(lambda frame: tone_mapped(capture.sharp_view(frame), white), frames, threads)

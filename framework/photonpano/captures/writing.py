@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.atomic import atomic_folder, atomic_path, require_space, resumable_path
+from photonpano.capture import capture_of
 from photonpano.errors import InputError, OutputError, PluginError
-from photonpano.protocols import KnowsTruth, LinearlyCorrectedSource, PackedSource, Source
+from photonpano.protocols import Source
 from photonpano.threads import in_order
 from photonpano.values import FrameSpan, StreamInfo
 
@@ -69,7 +70,7 @@ def _counted(blocks: Iterator[NDArray[np.uint8]], progress: Callable[[int], obje
 
 
 def _truth_of(source: Source) -> Mapping[str, NDArray[Any]]:
-    return source.truth() if isinstance(source, KnowsTruth) else {}
+    return capture_of(source).truth() or {}
 
 
 def _write_truth(path: Path, truth: Mapping[str, NDArray[Any]]) -> tuple[Path, ...]:
@@ -83,7 +84,7 @@ def _write_truth(path: Path, truth: Mapping[str, NDArray[Any]]) -> tuple[Path, .
 def _require_bits(source: Source, path: Path) -> None:
     if source.info.kind != "binary":
         raise InputError(f"cannot write {path}: packed captures hold binary frames, and this source gives intensities")
-    if isinstance(source, LinearlyCorrectedSource):
+    if capture_of(source).corrects_sums:
         raise InputError(
             f"cannot write {path}: some corrections change sums of frames, and not the frames; "
             "leave them to the specs that read the file"
@@ -100,8 +101,7 @@ def write_packed(
     """Write a binary source as uint8 (frames, height, ceil(width / 8)), packed along the width, in constant memory.
 
     Args:
-        source: the capture; if it is a `KnowsTruth`, its truth is written beside it, see `truth_path`. The frames of a
-            `PackedSource` are never unpacked.
+        source: the capture; if its truth is known, it is written beside it, see `truth_path`. Packed frames are never unpacked.
         path: the .npy file.
         progress: called with the number of frames written since the last call.
         threads: how many threads read the source.
@@ -168,10 +168,10 @@ class PackedFrames:
     """A binary source as the content of a packed .npy file."""
 
     def __init__(self, source: Source) -> None:
-        self._source = source
+        self._capture = capture_of(source)
         info = source.info
         self._frame = (info.height, -(-info.width // 8))
-        self._read_bytes = math.prod(self._frame if isinstance(source, PackedSource) else info.frame_shape)
+        self._read_bytes = math.prod(self._frame if self._capture.is_packed else info.frame_shape)
         header = io.BytesIO()
         shape = (info.n_frames, *self._frame)
         np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": shape})
@@ -180,7 +180,7 @@ class PackedFrames:
     @property
     def n_bytes(self) -> int:
         """The size of the whole file."""
-        return self.position(self._source.info.n_frames)
+        return self.position(self._capture.info.n_frames)
 
     def position(self, frame: int) -> int:
         """Return where a frame begins in the file."""
@@ -188,7 +188,7 @@ class PackedFrames:
 
     def blocks(self, first: int, stop: int | None = None) -> Iterator[FrameSpan]:
         """Yield the spans in which the frames are read, from the first on, all by default."""
-        last, step = self._source.info.n_frames if stop is None else stop, max(1, _BLOCK_BYTES // self._read_bytes)
+        last, step = self._capture.info.n_frames if stop is None else stop, max(1, _BLOCK_BYTES // self._read_bytes)
         for start in range(first, last, step):
             yield FrameSpan(start, min(start + step, last))
 
@@ -198,8 +198,7 @@ class PackedFrames:
         Raises:
             PluginError: the source returns an array of another shape or type.
         """
-        source = self._source
-        packed = source.packed(span) if isinstance(source, PackedSource) else np.packbits(source.frames(span), axis=-1)
+        packed = self._capture.packed(span)
         expected = (len(span), *self._frame)
         if packed.shape != expected or packed.dtype != np.uint8:
             raise PluginError(
@@ -218,7 +217,7 @@ class PackedFrames:
         if start != self.header:
             return 0 if self.header.startswith(start) else None
         size = file.seek(0, io.SEEK_END)
-        there = min((size - len(self.header)) // math.prod(self._frame), self._source.info.n_frames)
+        there = min((size - len(self.header)) // math.prod(self._frame), self._capture.info.n_frames)
         file.seek(len(self.header))
         done = 0
         for frames in in_order(self.of, self.blocks(0, there), threads):

@@ -18,7 +18,7 @@ def check(spec: SpecPath, overrides: Overrides = None) -> None:
     from photonpano.text import counted
 
     plan = load_spec(spec, overrides or ())
-    with open_source(plan) as source:
+    with open_source(plan, look=False) as source:
         what = f"poses by {plan.pose.contribution.name}" if plan.pose else counted(len(plan.levels), "level")
         up_to = "up to " if plan.until_converged else ""
         typer.echo(f"{spec}: ok, {up_to}{what} on {plan.source.contribution.name}: {source.info}")

@@ -219,7 +219,7 @@ class MergerContribution(StageContribution):
     """Offers a merger.
 
     Attributes:
-        accepts_corrected_sums: whether it merges a `LinearlyCorrectedSource`. The framework then divides the sums of frames by
+        accepts_corrected_sums: whether it merges corrected sums. The framework then divides the sums of frames by
             a vignette that it finds.
     """
 

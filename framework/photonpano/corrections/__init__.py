@@ -1,9 +1,9 @@
 """Corrections of sensors: applied to frames in the order of a list, before any other stage."""
 
+from photonpano.corrections.applying import corrected_source
 from photonpano.corrections.colour_filter import ColourFilter
-from photonpano.corrections.colours import FilteredSource
 from photonpano.corrections.dark import DarkCounts, DarkFrames, measure_dark, read_dark, write_dark
-from photonpano.corrections.flat_field import FlatField
+from photonpano.corrections.flat_field import FlatField, Vignette, divided_by, read_vignette, write_vignette
 from photonpano.corrections.geometry import (
     TURNS,
     ColourSwissSpad2,
@@ -16,10 +16,8 @@ from photonpano.corrections.geometry import (
 from photonpano.corrections.hot_pixels import HotPixels, hot_in_the_dark
 from photonpano.corrections.masks import Mask
 from photonpano.corrections.pixels import Correction
-from photonpano.corrections.source import CorrectedSource, corrected_source
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
-from photonpano.corrections.vignette import Vignette, divided_by, estimate_vignette
-from photonpano.corrections.vignette_file import read_vignette, write_vignette
+from photonpano.corrections.vignette import estimate_vignette
 
 _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
@@ -32,11 +30,9 @@ CORRECTIONS = {correction.name: correction for correction in _ALL}
 
 __all__ = [
     "CORRECTIONS",
-    "CorrectedSource",
     "Correction",
     "DarkCounts",
     "DarkFrames",
-    "FilteredSource",
     "FlatField",
     "HotPixels",
     "StillPixels",

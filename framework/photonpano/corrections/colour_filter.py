@@ -19,8 +19,8 @@ from photonpano.values import Bayer
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano.capture import Capture
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source
 
 Colour = Literal["red", "green", "blue", "clear"]
 _ALL = "all"
@@ -64,10 +64,10 @@ class ColourFilter(Correction):
         """Whether the panorama is in colour."""
         return self.keep == _ALL
 
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Mark the colour of each pixel, or mask or interpolate those of other colours; see `Correction`."""
         del decide
-        colour, what = self._pattern(pixels, source)
+        colour, what = self._pattern(pixels, capture)
         there = [name for place, name in enumerate(COLOURS) if (colour == place).any()]
         wanted = ("red", "green", "blue") if self.keep == _ALL else self.keep
         lacking = [name for name in wanted if name not in there]
@@ -84,7 +84,7 @@ class ColourFilter(Correction):
             return pixels.without(~kept)
         return replace(pixels, interpolated=pixels.interpolated | ~kept)
 
-    def _pattern(self, pixels: Pixels, source: Source) -> tuple[NDArray[np.int8], str]:
+    def _pattern(self, pixels: Pixels, capture: Capture) -> tuple[NDArray[np.int8], str]:
         """Return the place in `COLOURS` of the colour of each pixel, (H, W), and what to call the pattern in messages."""
         if isinstance(self.pattern, Path):
             pattern = read_filter_array(self.pattern)
@@ -92,9 +92,9 @@ class ColourFilter(Correction):
             return pattern, f"{self.pattern}"
         if self.pattern is not None:
             return bayer_array(self.pattern, pixels.shape), f"pattern: {self.pattern}"
-        if source.info.bayer is None:
+        if capture.info.bayer is None:
             raise InputError(
                 f"pattern is missing, and the capture does not give it; set it to a file, or to {', '.join(get_args(Bayer))}"
             )
-        as_read = bayer_array(source.info.bayer, source.info.frame_shape)
-        return as_read.ravel()[pixels.index], f"the array of the capture, {source.info.bayer},"
+        as_read = bayer_array(capture.info.bayer, capture.info.frame_shape)
+        return as_read.ravel()[pixels.index], f"the array of the capture, {capture.info.bayer},"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from pydantic import Field
 
+from photonpano.capture import capture_of
 from photonpano.contributions import SpecPath
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from photonpano.capture import Capture
     from photonpano.corrections.pixels import Decide, Pixels
     from photonpano.protocols import Source
     from photonpano.values import FluxImage
@@ -57,12 +59,12 @@ class DarkCounts(Correction):
         """See `Correction`."""
         return True
 
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Add the rates to subtract, and mask pixels where they exceed the limit; see `Correction`."""
         rates = read_dark(self.dark).rates
         pixels.require(rates.shape, self.dark)
         noted = replace(pixels, dark_rates=pixels.dark_rates + rates)
-        if source.info.kind != "binary":
+        if capture.info.kind != "binary":
             return noted
         high = noted.dark_rates > self.limit
         if decide is not None:
@@ -83,10 +85,10 @@ def measure_dark(source: Source, advance: Callable[[int], object] | None = None)
         source: the capture.
         advance: called with the number of frames read since the last call.
     """
-    info = source.info
+    info, spans = source.info, list(source.info.span.blocks(_AT_ONCE))
     counts = np.zeros(info.frame_shape, np.uint64)
-    for span in info.span.blocks(_AT_ONCE):
-        counts += source.counts(span)
+    for span, summed in zip(spans, capture_of(source).chunks(spans), strict=True):
+        counts += summed
         if advance is not None:
             advance(len(span))
     mean = (counts / info.n_frames).astype(np.float32)

@@ -10,17 +10,17 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from photonpano.corrections.pixels import MISSING, Correction, Decide, Index, Pixels, numbered
+from photonpano.capture import MISSING, Capture, Index, numbered
+from photonpano.corrections.pixels import Correction, Decide, Pixels
 from photonpano.errors import InputError
-from photonpano.protocols import Source
 
 
 class Rearrangement(Correction):
     """Moves, removes or inserts pixels."""
 
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Move the pixels; see `Correction`."""
-        del source, decide
+        del capture, decide
         return pixels.rearranged(self.moved(numbered(pixels.shape)))
 
     @abstractmethod

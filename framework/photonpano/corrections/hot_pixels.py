@@ -15,9 +15,9 @@ from photonpano.corrections.pixels import Correction
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonpano.capture import Capture
     from photonpano.corrections.dark import DarkFrames
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source
     from photonpano.values import BoolArray, FluxImage
 
 THRESHOLD = 10.0
@@ -54,7 +54,7 @@ class HotPixels(Correction):
         description="smallest deviation of a hot pixel, in robust standard deviations of the other pixels",
     )
 
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Mask the pixels that stand out; see `Correction`."""
         if self.dark is not None:
             dark = read_dark(self.dark)
@@ -62,7 +62,7 @@ class HotPixels(Correction):
             bad, limit = hot_in_the_dark(dark, self.threshold, pixels.valid)
             how = f"have more than {limit:.2g} dark counts a frame in {self.dark.name}"
         elif decide is not None:
-            bad, n_frames = _standing_out(pixels, source, self.threshold)
+            bad, n_frames = _standing_out(pixels, capture, self.threshold)
             how = f"stand out from their neighbours in {n_frames} frames sampled all over the capture"
         else:
             return pixels
@@ -97,12 +97,12 @@ def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tup
     return dark.rates > limit, limit
 
 
-def _standing_out(pixels: Pixels, source: Source, threshold: float) -> tuple[BoolArray, int]:
+def _standing_out(pixels: Pixels, capture: Capture, threshold: float) -> tuple[BoolArray, int]:
     """Return the pixels of a capture that are brighter or darker than their neighbours, and the number of frames compared."""
-    spans = source.info.spread(_SPANS, _SPAN_FRAMES)
+    spans = capture.info.spread(_SPANS, _SPAN_FRAMES)
     seen = sum(map(len, spans))
-    counts = np.sum([source.counts(span) for span in spans], axis=0)
-    response, frames = source.response, float(seen)
+    counts = np.sum(list(capture.chunks(spans)), axis=0)
+    response, frames = capture.response, float(seen)
     image = response.stabilised(response.flux(np.asarray(counts / seen, np.float32), frames), frames)
     usable = pixels.valid & ~pixels.interpolated
     image, noise_std = image.ravel()[pixels.index], float(np.max(response.stabilised_std(frames)))

@@ -15,8 +15,8 @@ from photonpano.reading import look_first, read_array, read_picture
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from photonpano.capture import Capture
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source
     from photonpano.values import BoolArray
 
 
@@ -29,9 +29,9 @@ class Mask(Correction):
         "the size of the frames at this place of the list"
     )
 
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Mask the bad pixels; see `Correction`."""
-        del source, decide
+        del capture, decide
         bad = _read_mask(self.file)
         pixels.require(bad.shape, self.file)
         return pixels.without(bad)

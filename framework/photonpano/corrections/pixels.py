@@ -10,16 +10,12 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import MISSING, Capture, Index, numbered
 from photonpano.contributions import Config
 from photonpano.errors import InputError
-from photonpano.protocols import Source
 from photonpano.values import BoolArray, FluxImage
 
-Index: TypeAlias = NDArray[np.intp]
-Decide: TypeAlias = Callable[[str, float, str], None]
-"""Records a decision: what was chosen, its value, and the reason."""
-MISSING = -1
-"""The index of a pixel that the sensor does not have."""
+Decide: TypeAlias = Callable[[str, float, str], None]  # records a decision: what was chosen, its value, and the reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,20 +94,15 @@ class Correction(Config, ABC):
         return False
 
     @abstractmethod
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Apply the correction to the pixels that the corrections before it have left.
 
         Args:
             pixels: the pixels so far.
-            source: the capture as it is read.
+            capture: as it is read.
             decide: records what was chosen because of the capture or a file. None means that no frame may be read yet: the
                 correction leaves out what depends on frames.
 
         Raises:
             InputError: the correction does not suit the pixels, or a file holds something else.
         """
-
-
-def numbered(shape: tuple[int, ...]) -> Index:
-    """Number the pixels of a frame along its rows, from 0: (H, W) intp."""
-    return np.arange(np.prod(shape), dtype=np.intp).reshape(shape)

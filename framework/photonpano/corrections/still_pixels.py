@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from photonpano.capture import Capture, capture_of
+from photonpano.corrections.applying import corrected_source
 from photonpano.corrections.colour_filter import ColourFilter
 from photonpano.corrections.hot_pixels import brightest, outliers, reach_of, sorted_neighbours
 from photonpano.corrections.pixels import Correction
-from photonpano.corrections.source import corrected_source
-from photonpano.protocols import LinearlyCorrectedSource
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,13 +58,13 @@ class StillPixels(Correction):
 
     name: ClassVar[str] = "still-pixels"
 
-    def applied(self, pixels: Pixels, source: Source, decide: Decide | None) -> Pixels:
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Mask what stands still; see `Correction`. Frames of grey levels, whose noise is not known well, stay as they are."""
-        n_frames = min(_SPAN_FRAMES, (source.info.n_frames - 1) // _SPANS)
-        if decide is None or source.info.kind != "binary" or n_frames == 0:
+        n_frames = min(_SPAN_FRAMES, (capture.info.n_frames - 1) // _SPANS)
+        if decide is None or capture.info.kind != "binary" or n_frames == 0:
             return pixels
-        spans = source.info.spread(_SPANS, n_frames)
-        sums = np.stack([source.counts(span).ravel()[pixels.index].astype(np.uint8) for span in spans])
+        spans = capture.info.spread(_SPANS, n_frames)
+        sums = np.stack([counts.ravel()[pixels.index].astype(np.uint8) for counts in capture.chunks(spans)])
         found = find_still(sums, n_frames, pixels.valid & ~pixels.interpolated, pixels.alike())
         n_masked, n_pixels = int((found.mask & pixels.valid).sum()), int(pixels.valid.sum())
         decide("still_pixels", n_masked, f"{n_masked / max(n_pixels, 1):.2%} of {n_pixels} pixels {found.why}")
@@ -72,18 +72,19 @@ class StillPixels(Correction):
         return pixels.without(found.mask)
 
 
-def without_still_pixels(source: Source) -> Source:
-    """Return a source in which what stands still is masked.
+def without_still_pixels(source: Source, look: bool = True) -> Capture:
+    """Return a capture in which what stands still is masked.
 
-    A source of grey levels stays as it is, and one that corrects its sums itself, which cannot be corrected further. One that
-    gives the Bayer array before its pixels is seen in colour.
+    A capture of grey levels stays as it is, and one that corrects its sums itself, which cannot be corrected further. One that
+    gives the Bayer array before its pixels is seen in colour. For `look`, see `corrected_source`.
     """
-    corrections: list[Correction] = [] if source.info.bayer is None else [ColourFilter(keep="all")]
-    if source.info.kind == "binary":
+    capture = capture_of(source)
+    corrections: list[Correction] = [] if capture.info.bayer is None else [ColourFilter(keep="all")]
+    if capture.info.kind == "binary":
         corrections.append(StillPixels())
-    if not corrections or isinstance(source, LinearlyCorrectedSource):
-        return source
-    return corrected_source(source, corrections)
+    if not corrections or capture.corrects_sums:
+        return capture
+    return corrected_source(capture, corrections, look=look)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

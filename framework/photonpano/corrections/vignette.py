@@ -1,4 +1,4 @@
-"""Estimate the vignette of a lens from a scene that moves through the frame, and divide sums of frames by it."""
+"""Estimate the vignette of a lens from a scene that moves through the frame."""
 
 from __future__ import annotations
 
@@ -7,72 +7,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from photonpano.capture import Capture, capture_of
+from photonpano.corrections.flat_field import Vignette
 from photonpano.geometry import apply, corner_displacements, inverse
-from photonpano.protocols import LinearlyCorrectedSource, WeightedSource, camera_of
-from photonpano.source_wrapper import (
-    ColouredWrapper,
-    LensedWrapper,
-    PackedWrapper,
-    SourceWrapper,
-    WeightedWrapper,
-    capabilities_of,
-    with_capabilities,
-)
-from photonpano.values import Decision, FrameSpan, Homography
+from photonpano.values import FrameSpan, Homography
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.protocols import Source, Trajectory
-    from photonpano.values import Counts, FloatArray, FluxImage
+    from photonpano.values import FloatArray
 
-VIGNETTE_DECISION = "vignette_gain"
-"""What a record names the decision to divide by a vignette."""
-FLAT_FIELD_DECISION = "flat_field"
-"""What a record names the decision to divide by a flat field."""
-_SPANS, _SPAN_FRAMES, _SPAN_PX = 48, 64, 8.0
-"""48 spans all over the capture are summed, each of at most 64 frames, in which the image moves by about 8 px at most."""
-_CELL_PX = 8
-"""Side of the squares of the sensor and of the scene that are compared, px."""
-_POWERS = (2, 4, 6)
-"""The logarithm of the gain is a polynomial of these powers of the distance from the middle of the frame."""
-_ROUNDS = 6
-"""The equations are solved this many times, with outliers down-weighted."""
-_OUTLIER = 3.0
-"""Standard deviations from which a square is down-weighted (Huber)."""
-_LEAST_RMS = 0.03
-"""Vignettes whose root mean square is smaller than this are left as they are: they cost nothing."""
-_SURE = 6.0
-"""Standard errors by which a vignette must differ from none. The structure of the scene within squares makes errors larger than
-photon noise does, and correlated."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Vignette:
-    """The relative sensitivity of the pixels.
-
-    Attributes:
-        gain: (H, W) float32, 1 in the middle, or on average if it is a flat field.
-        mean: (H, W) float32, mean count of a frame of each pixel, around which the division is linear.
-        spans: the frames that it was estimated from.
-        std: (H, W) float32, standard deviation of the gain, relative to it; None if it is not known.
-    """
-
-    gain: FluxImage
-    mean: FluxImage
-    spans: tuple[FrameSpan, ...]
-    std: FluxImage | None = None
-
-    @property
-    def decision(self) -> Decision:
-        """What was found, for the record."""
-        corner, n_frames = float(self.gain[0, 0]), sum(map(len, self.spans))
-        if self.std is not None:
-            known = f"known to {np.median(self.std):.2g} in half of the frame, and to {self.std.max():.2g} everywhere"
-            reason = f"root mean square of the differences in gain, from {n_frames} frames, {known}; the flux is divided by it"
-            return Decision(FLAT_FIELD_DECISION, round(float(self.gain.std()), 3), reason)
-        reason = f"light that reaches the corners, relative to the middle, from {n_frames} frames; the flux is divided by it"
-        return Decision(VIGNETTE_DECISION, round(corner, 3), reason)
+_SPANS, _SPAN_FRAMES = 48, 64  # spans all over the capture, and most frames of each
+_SPAN_PX = 8.0  # the image moves by about this in a span, at most
+_CELL_PX = 8  # side of the squares of the sensor and of the scene that are compared
+_POWERS = (2, 4, 6)  # the logarithm of the gain is a polynomial of these powers of the distance from the middle of the frame
+_ROUNDS = 6  # of iteratively reweighted least squares
+_OUTLIER = 3.0  # standard deviations from which a square is down-weighted (Huber)
+_LEAST_RMS = 0.03  # smaller vignettes (root mean square) cost nothing, and are ignored
+_SURE = 6.0  # standard errors by which a vignette must differ from none: the scene within squares adds correlated errors
 
 
 def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None:
@@ -88,8 +41,9 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
     Returns:
         None where there is no vignette, or nothing moves that could show it.
     """
-    spans = _spans(source, trajectory)
-    seen = [_Seen.of(source, span, trajectory) for span in spans]
+    capture = capture_of(source)
+    spans = _spans(capture, trajectory)
+    seen = [_Seen.of(capture, span, trajectory) for span in spans]
     flux, weight = (np.concatenate([getattr(each, name) for each in seen]) for name in ("flux", "weight"))
     places = np.concatenate([each.places for each in seen])
     times = np.repeat(np.arange(len(seen)), [len(each.flux) for each in seen])
@@ -101,63 +55,13 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
     found = _solved(flux, weight, cells.ravel(), times, shape)
     if found is None:
         return None
-    of_pixel = _distances(source.info.frame_shape, 1)
+    of_pixel = _distances(capture.info.frame_shape, 1)
     log_gain = sum(float(each) * of_pixel**power for each, power in zip(found, _POWERS, strict=True))
     # No lens brightens the borders.
     if np.std(log_gain) < _LEAST_RMS or np.max(log_gain) > _LEAST_RMS:
         return None
-    counts = np.sum([source.counts(span) for span in spans], axis=0) / sum(map(len, spans))
+    counts = np.sum(list(capture.chunks(spans)), axis=0) / sum(map(len, spans))
     return Vignette(np.exp(log_gain).astype(np.float32), counts.astype(np.float32), tuple(spans))
-
-
-def divided_by(source: Source, vignette: Vignette) -> FlatSource:
-    """Return a source whose corrected sums are those of a lens without vignette.
-
-    It is a `WeightedSource` for a flat field, whose pixels may differ so far in gain that faint ones, which are multiplied
-    most, would add more noise than light.
-    """
-    weighted = WeightedWrapper if vignette.std is None else _WeightedByGain
-    known: tuple[type[SourceWrapper], ...] = (PackedWrapper, ColouredWrapper, LensedWrapper)
-    capabilities = [each for each in capabilities_of(source) if each in known]
-    if vignette.std is not None or isinstance(source, WeightedSource):
-        capabilities.append(weighted)
-    return with_capabilities(FlatSource, capabilities)(source, vignette)
-
-
-class FlatSource(SourceWrapper):
-    """A source whose sums are divided by a vignette: made by `divided_by`.
-
-    A pixel of gain g is lit with the probability `p = 1 - exp(-g f)`, and without vignette with `q = 1 - (1 - p)^(1 / g)`. Sums
-    are corrected linearly, around the mean of each pixel.
-    """
-
-    def __init__(self, source: Source, vignette: Vignette) -> None:
-        super().__init__(source)
-        self.vignette = vignette
-        power = 1 / vignette.gain
-        dark = np.maximum(1 - vignette.mean, np.float32(1e-3))
-        self._slope = np.asarray(power * dark ** (power - 1), np.float32)
-        self._offset = np.asarray(1 - dark**power - self._slope * (1 - dark), np.float32)
-
-    def around(self, source: Source) -> FlatSource:
-        """See `SourceWrapper`."""
-        return divided_by(source, self.vignette)
-
-    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """Take everything but the flux out of a sum of frames: see `LinearlyCorrectedSource`."""
-        summed = self.wrapped.corrected(counts, n_frames) if isinstance(self.wrapped, LinearlyCorrectedSource) else counts
-        return np.asarray(summed * self._slope + np.float32(n_frames) * self._offset, np.float32)
-
-
-class _WeightedByGain(SourceWrapper):
-    """What a source offers that is divided by a flat field."""
-
-    vignette: Vignette
-
-    def weights(self) -> FluxImage:
-        """Return what a frame of each pixel is worth: the photons that it counts, of those of a pixel of gain 1."""
-        own = self.wrapped.weights() if isinstance(self.wrapped, WeightedSource) else np.float32(1)
-        return np.asarray(own * self.vignette.gain, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,22 +81,20 @@ class _Seen:
     distance: FloatArray
 
     @classmethod
-    def of(cls, source: Source, span: FrameSpan, trajectory: Trajectory) -> _Seen:
-        counts = source.counts(span)
-        lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
-        photons, area = _binned(lit * source.valid), _binned(source.valid)
+    def of(cls, capture: Capture, span: FrameSpan, trajectory: Trajectory) -> _Seen:
+        photons, area = _binned(capture.corrected_counts(span) * capture.valid), _binned(capture.valid)
         seen = (area == _CELL_PX**2) & (photons > 0)
-        distance, (rows, columns) = _distances(source.info.frame_shape, _CELL_PX)[seen], np.nonzero(seen)
+        distance, (rows, columns) = _distances(capture.info.frame_shape, _CELL_PX)[seen], np.nonzero(seen)
         centres: FloatArray = (np.stack([columns, rows], axis=-1).astype(float) + 0.5) * _CELL_PX - 0.5
-        places = _places(source, trajectory.at([span.centre])[0], centres)
+        places = _places(capture, trajectory.at([span.centre])[0], centres)
         mean = np.asarray(photons[seen] / (area[seen] * len(span)), np.float32)
-        flux = source.response.flux(mean, _CELL_PX**2 * len(span)).astype(float)
+        flux = capture.response.flux(mean, _CELL_PX**2 * len(span)).astype(float)
         return cls(flux, photons[seen], np.floor(places / _CELL_PX).astype(np.int64), distance)
 
 
-def _places(source: Source, homography: Homography, points: FloatArray) -> FloatArray:
+def _places(capture: Capture, homography: Homography, points: FloatArray) -> FloatArray:
     """Return where (N, 2) pixels of a frame lie in the scene: (N, 2) on its plane, or around its camera if that is known."""
-    camera = camera_of(source)
+    camera = capture.camera
     if camera is None:
         return apply(homography, points)
     rays = camera.directions(points) @ (np.linalg.inv(camera.matrix) @ homography @ camera.matrix).T
@@ -200,9 +102,9 @@ def _places(source: Source, homography: Homography, points: FloatArray) -> Float
     return camera.focal_px * np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
 
 
-def _spans(source: Source, trajectory: Trajectory) -> list[FrameSpan]:
+def _spans(capture: Capture, trajectory: Trajectory) -> list[FrameSpan]:
     """Return spans all over the capture, so short that the image hardly moves in them."""
-    info = source.info
+    info = capture.info
     instants = np.linspace(0, info.n_frames - 1, _SPANS + 1)
     steps = inverse(trajectory.at(instants[:-1])) @ trajectory.at(instants[1:])
     moved = float(np.median(corner_displacements(steps, np.eye(3), info.frame_shape).max(axis=-1)))

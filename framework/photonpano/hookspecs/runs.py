@@ -103,7 +103,7 @@ def photonpano_renderers() -> Iterable[RendererContribution]:
         import numpy as np
         from pydantic import Field
 
-        from photonpano import Config, FrameSpan, LinearlyCorrectedSource, Panorama, RendererContribution, hookimpl
+        from photonpano import Config, FrameSpan, Panorama, RendererContribution, capture_of, hookimpl
         from photonpano.geometry import apply
 
 
@@ -119,9 +119,7 @@ def photonpano_renderers() -> Iterable[RendererContribution]:
                 lit, weight = np.zeros(canvas.shape, np.float32), np.zeros(canvas.shape, np.float32)
                 y, x = np.nonzero(source.valid)
                 for frame in range(span.start, span.stop, self.every):
-                    counts = source.counts(FrameSpan(frame, frame + 1))
-                    if isinstance(source, LinearlyCorrectedSource):
-                        counts = source.corrected(counts, 1)
+                    counts = capture_of(source).corrected_counts(FrameSpan(frame, frame + 1))
                     to_canvas = canvas.transform @ trajectory.at([frame])[0]
                     column, row = np.rint(apply(to_canvas, np.stack([x, y], axis=1))).astype(int).T
                     inside = (column >= 0) & (column < canvas.width) & (row >= 0) & (row < canvas.height)

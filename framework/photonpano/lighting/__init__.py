@@ -1,14 +1,13 @@
 """Light that changes: measured from what a capture shows along its motion, and attached to its source."""
 
+from photonpano.capture import in_light
 from photonpano.lighting.files import LIGHT_FILE, in_light_of, write_light
 from photonpano.lighting.finding import LIGHT_DECISION, corrected_light, decision_of, find_light, measure_light
 from photonpano.lighting.flat_field import PixelGain, measure_pixel_gain
-from photonpano.lighting.source import InLight, in_light
 
 __all__ = [
     "LIGHT_DECISION",
     "LIGHT_FILE",
-    "InLight",
     "PixelGain",
     "corrected_light",
     "decision_of",

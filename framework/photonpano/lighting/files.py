@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from photonpano.capture import in_light
 from photonpano.errors import InputError
-from photonpano.lighting.source import in_light
 from photonpano.protocols import Source
 from photonpano.values import Light
 

@@ -10,13 +10,14 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.bent import BentFootprint, BentGrid, Rays, add_bent, padded
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.light import LightTerms, LitFrames
 from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
-from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource, camera_of, light_of
+from photonpano.protocols import Source
 from photonpano.threads import InOrder
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
@@ -79,9 +80,8 @@ def accumulate(
         that their quotient is not biased at masks and borders.
 
     Args:
-        source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected, pixels
-            of a `WeightedSource` are weighted, and frames of a `LitSource` by their gains. Frames of a `LensedSource` are
-            warped through its lens.
+        source: the capture. Pixels outside of its mask are left out; sums are corrected, pixels are weighted, and so are frames
+            by the gains of their light. Frames are warped through the lens of its camera.
         chunks: frames, with their maps to the reference plane.
         onto: (3, 3), pixels of the reference plane to pixels of the grid; or a canvas of any projection, which is the grid.
         shape: (height, width) of the grid.
@@ -91,24 +91,25 @@ def accumulate(
         counts_of: returns the uncorrected sum of the frames of a span, such as a `CountsCache`; `source.counts` by default.
     """
     advance = advance or (lambda _: None)
-    light = light_of(source)
+    capture = capture_of(source)
+    light = capture.light
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
     canvas = onto if isinstance(onto, Canvas) else Canvas(*shape, onto)
     if in_order is None:
-        visible = _visible(source, chunks, canvas)
+        visible = _visible(capture, chunks, canvas)
         if off_grid := _frames(chunks) - _frames([chunk for chunk, _ in visible]):
             advance(off_grid)
-        counts, coverages = _sum_on(source, terms, counts_of or source.counts, canvas, visible, advance)
+        counts, coverages = _sum_on(capture, terms, counts_of or capture.counts, canvas, visible, advance)
     else:
         number = 1 if terms is None else terms.number
         counts, coverages = np.zeros(shape, np.float32), np.zeros((number, *shape), np.float32)
         # Footprints take more memory than chunks, and each run finds its own.
         blocks = (chunks[first : first + _BLOCK] for first in range(0, len(chunks), _BLOCK))
-        shown = [chunk for block in blocks for chunk, _ in _visible(source, block, canvas)]
+        shown = [chunk for block in blocks for chunk, _ in _visible(capture, block, canvas)]
         if off_grid := _frames(chunks) - _frames(shown):
             advance(off_grid)
         runs = (shown[first : first + _RUN] for first in range(0, len(shown), _RUN))
-        for part in in_order(partial(_sum_of_run, source, terms, canvas), runs):
+        for part in in_order(partial(_sum_of_run, capture, terms, canvas), runs):
             counts[part.box] += part.counts
             coverages[:, *part.box] += part.coverages
             advance(part.n_frames)
@@ -139,10 +140,10 @@ def _frames(chunks: Sequence[Chunk]) -> int:
     return sum(len(chunk.span) for chunk in chunks)
 
 
-def _visible(source: Source, chunks: Sequence[Chunk], canvas: Canvas) -> _Visible:
+def _visible(source: Capture, chunks: Sequence[Chunk], canvas: Canvas) -> _Visible:
     """Return the chunks that lie on a canvas, with their footprints."""
     homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
-    grid = BentGrid.of(canvas, camera_of(source), homographies, frame_shape)
+    grid = BentGrid.of(canvas, source.camera, homographies, frame_shape)
     footprints: Sequence[Footprint | BentFootprint]
     if grid is None:
         footprints = footprints_of(canvas.transform @ homographies, frame_shape, canvas.shape)
@@ -152,7 +153,7 @@ def _visible(source: Source, chunks: Sequence[Chunk], canvas: Canvas) -> _Visibl
     return [(chunk, at) for chunk, at in pairs if at.rows and at.columns]
 
 
-def _sum_of_run(source: Source, terms: LightTerms | None, canvas: Canvas, chunks: Sequence[Chunk]) -> _Part:
+def _sum_of_run(source: Capture, terms: LightTerms | None, canvas: Canvas, chunks: Sequence[Chunk]) -> _Part:
     """Sum chunks on the part of a canvas that they cover."""
     footprints = [at for _, at in _visible(source, chunks, canvas)]
     top, bottom = min(at.rows.start for at in footprints), max(at.rows.stop for at in footprints)
@@ -164,7 +165,7 @@ def _sum_of_run(source: Source, terms: LightTerms | None, canvas: Canvas, chunks
 
 
 def _sum_on(
-    source: Source,
+    source: Capture,
     terms: LightTerms | None,
     counts_of: Callable[[FrameSpan], Counts],
     canvas: Canvas,
@@ -173,7 +174,7 @@ def _sum_on(
 ) -> tuple[FluxImage, FluxImage]:
     """Return the counts and the coverages of a canvas: (H, W) and (P, H, W)."""
     masked = weights_of(source)
-    corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
+    corrected = source.corrected if source.corrects_sums else None
     bent = any(isinstance(at, BentFootprint) for _, at in visible)
     rays = (*canvas.columns(), *canvas.rows()) if bent else None
     total = _Total.zeros(canvas.shape, 1 if terms is None else terms.number, rays)
@@ -185,9 +186,10 @@ def _sum_on(
 
 def weights_of(source: Source) -> FluxImage | None:
     """Return what a frame of each pixel is worth, 0 for a masked one: (H, W); None if it is 1 for all."""
-    if isinstance(source, WeightedSource):
-        return np.where(source.valid, source.weights(), np.float32(0))
-    return None if source.valid.all() else source.valid.astype(np.float32)
+    capture = capture_of(source)
+    if capture.weight is not None:
+        return np.where(capture.valid, capture.weight, np.float32(0))
+    return None if capture.valid.all() else capture.valid.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from photonpano.capture import capture_of
 from photonpano.merging.accumulate import weights_of
-from photonpano.protocols import LinearlyCorrectedSource, Source
+from photonpano.protocols import Source
 from photonpano.values import FluxImage, FrameSpan
 
 _SIDE_PX = 64
@@ -25,9 +26,7 @@ def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
     size = (width // binning, height // binning)
     weights = weights_of(source)
     valid = np.ones((height, width), np.float32) if weights is None else weights[:height, :width]
-    counts = source.counts(span)
-    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
-    lit = lit[:height, :width] * valid
+    lit = capture_of(source).corrected_counts(span)[:height, :width] * valid
     share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, lit.astype(np.float32)))
     mean = np.full(share.shape, np.nan, dtype=np.float32)
     np.divide(summed, share * len(span), out=mean, where=share > 0)

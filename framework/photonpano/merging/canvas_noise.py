@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Camera, Canvas, rescaling
 from photonpano.merging.averaging import Averaging
 from photonpano.merging.bent import BentGrid, laid
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
-from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory, WeightedSource, camera_of
+from photonpano.protocols import Source, Trajectory
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
 _INSTANTS = 64
@@ -57,27 +58,27 @@ class CanvasNoise:
             span: the frames that are rendered.
             canvas: the pixel grid.
         """
-        averaging = Averaging.of(trajectory, span, source.info.frame_shape, canvas, camera_of(source))
-        if not isinstance(source, ColouredSource):
-            return replace(cls._corrected(source, trajectory, span, canvas), averaging=averaging)
+        capture = capture_of(source)
+        averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera)
+        if capture.colour is None:
+            return replace(cls._corrected(capture, trajectory, span, canvas), averaging=averaging)
         # The grey source equalises the colours, which are rendered without it.
-        colours = [cls._corrected(each, trajectory, span, canvas) for each in list(source.colours().values())[:_RGB]]
+        colours = [cls._corrected(each, trajectory, span, canvas) for each in list(capture.colours().values())[:_RGB]]
         slope, offset = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset"))
-        return cls(source.response, slope, offset, max(each.reduction for each in colours), averaging)
+        return cls(capture.response, slope, offset, max(each.reduction for each in colours), averaging)
 
     @classmethod
-    def _corrected(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
+    def _corrected(cls, source: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
         """Lay the corrections of a source on a canvas."""
-        if not isinstance(source, LinearlyCorrectedSource):
+        if not source.corrects_sums:
             return cls(source.response)
         none = np.zeros(source.info.frame_shape, np.uint32)
         offset = np.asarray(source.corrected(none, 1), np.float32)
         slope = np.asarray(source.corrected(none + 1, 1) - offset, np.float32)
         valid = source.valid
-        if isinstance(source, WeightedSource):
+        if source.weight is not None:
             # A count of weight w adds w to the weight and w^2 times its variance: in frames of weight 1, w times its variance.
-            worth = source.weights()
-            slope, offset = slope * worth, offset * worth
+            slope, offset = slope * source.weight, offset * source.weight
         means = float(slope[valid].mean()), float(offset[valid].mean())
         if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
             return cls(source.response, *means)
@@ -85,7 +86,7 @@ class CanvasNoise:
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
         coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
-        sums, share = _laid(coarse, camera_of(source), trajectory.at(instants), (slope, offset), valid)
+        sums, share = _laid(coarse, source.camera, trajectory.at(instants), (slope, offset), valid)
         on_slope, on_offset = (
             np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import capture_of
 from photonpano.merging.shared_detail import noise_of_a_frame, with_shared_detail
-from photonpano.protocols import ColouredSource, Source
+from photonpano.protocols import Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
 COLOURS = ("red", "green", "blue")
@@ -32,18 +33,19 @@ def in_colours(source: Source, render: Callable[[Source], Panorama]) -> Panorama
         render: returns flux and weight of a source on a grid, (H, W) each.
 
     Returns:
-        What `render` returns; of a `ColouredSource`, flux and weight are (H, W, C), one image for each of its colours.
+        What `render` returns; of a capture in colour, flux and weight are (H, W, C), one image for each of its colours.
     """
-    if not isinstance(source, ColouredSource):
+    colours = capture_of(source).colours()
+    if not colours:
         return render(source)
-    parts = [render(each) for each in source.colours().values()]
+    parts = [render(each) for each in colours.values()]
     flux, weight = (np.stack([getattr(part, name) for part in parts], axis=-1) for name in ("flux", "weight"))
     return Panorama(flux, weight, parts[0].canvas)
 
 
 def channels_of(source: Source) -> int:
     """Return the number of images that `in_colours` renders."""
-    return len(source.colours()) if isinstance(source, ColouredSource) else 1
+    return len(capture_of(source).colours()) or 1
 
 
 def composed(panorama: Panorama, source: Source) -> Panorama:
@@ -53,16 +55,17 @@ def composed(panorama: Panorama, source: Source) -> Panorama:
     the colours share: see `with_shared_detail`. Clear pixels count for all colours: see `with_clear`.
 
     Returns:
-        Flux and weight are (H, W, 3) for a `ColouredSource`. The weight is the number of frames that saw the place in this
+        Flux and weight are (H, W, 3) for a capture in colour. The weight is the number of frames that saw the place in this
         colour; it is 0 where the flux was filled. Flux is NaN in all colours where none was seen.
     """
-    if not isinstance(source, ColouredSource):
+    capture = capture_of(source)
+    if capture.colour is None:
         return panorama
     flux, weight = filled(panorama.flux, panorama.weight), panorama.weight
     seen, trusted = seen_in(panorama), np.maximum(weight, _due(weight))
     flux = with_shared_detail(np.nan_to_num(flux), trusted, source.response)
     if flux.shape[-1] > len(COLOURS):
-        flux = with_clear(flux, trusted, source.clear_mix(), source.response)
+        flux = with_clear(flux, trusted, capture.clear_mix(), source.response)
     flux[~seen] = np.nan
     flux, weight = (np.ascontiguousarray(each[..., : len(COLOURS)]) for each in (flux, weight))
     return Panorama(flux, weight, panorama.canvas)

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import capture_of
 from photonpano.geometry import Canvas, inverse
-from photonpano.protocols import Source, light_of
+from photonpano.protocols import Source
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Response
 
 _ROUNDS = 8
@@ -25,7 +26,7 @@ _SEEN = 1e-3
 
 def bytes_of_light(source: Source) -> int:
     """Return the memory that the light of a capture takes for each pixel of a grid; 0 in steady light."""
-    light = light_of(source)
+    light = capture_of(source).light
     if light is None:
         return 0
     # Each coverage has two images; frames and gains, and their quotient, are three more for a class.

@@ -112,7 +112,7 @@ def render(
 ) -> Panorama:
     """Render the frames of a span on a canvas that is not divided.
 
-    Flux and weight of a `ColouredSource` are (H, W, C), one image for each of its colours; `composed` makes red, green and blue
+    Flux and weight of a capture in colour are (H, W, C), an image for each of its colours; `composed` makes red, green and blue
     of them.
 
     Args:

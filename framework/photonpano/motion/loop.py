@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from photonpano.capture import seen_through
 from photonpano.context import Context
 from photonpano.motion.attribution import AttributedTrajectory
 from photonpano.motion.checks import require_groups, require_knots_kept
@@ -19,7 +20,6 @@ from photonpano.motion.timeline import Timeline
 from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, fit_turns
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.protocols import Source, Trajectory, camera_of_motion
-from photonpano.source_wrapper import seen_through
 from photonpano.threads import Stopwatch
 from photonpano.values import FloatArray, Group
 

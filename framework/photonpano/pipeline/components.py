@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
-from photonpano.captures.part import part_of
+from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contributions import (
     ExecutorContext,
     ExporterContribution,
@@ -24,12 +24,11 @@ from photonpano.contributions import (
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
-from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import attributing, shown
 from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.motion.recorder import Recorder
-from photonpano.protocols import ColouredSource, PoseEstimator, Resampler, Source, light_of
+from photonpano.protocols import PoseEstimator, Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
@@ -51,40 +50,44 @@ LARGE_FRAME_PX = 192
 
 
 @contextmanager
-def open_source(plan: Plan) -> Iterator[Source]:
+def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
     """Open the capture of a plan, and check the stages against it. With `corrections: auto`, what stands still is masked.
+
+    Args:
+        plan: the plan.
+        look: whether corrections may read frames. If not, what depends on frames is left out.
 
     Raises:
         InputError: the capture cannot be used as it is.
         SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
     """
-    opened = build_source(plan)
-    with without_still_pixels(opened) if plan.corrects_itself else opened as source:
-        require_suitable(plan, source, source.info)
-        yield source
+    with build_source(plan, look) as opened:
+        capture = without_still_pixels(opened, look) if plan.corrects_itself else opened
+        require_suitable(plan, capture, capture.info)
+        yield capture
 
 
-def require_suitable(plan: Plan, source: Source, info: StreamInfo) -> None:
+def require_suitable(plan: Plan, capture: Capture, info: StreamInfo) -> None:
     """Check the stages of a plan against its capture.
 
     Args:
         plan: the plan.
-        source: the capture.
+        capture: the capture.
         info: its frames, which may be more than those that are there.
 
     Raises:
         SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
     """
     problems = check_stream(plan, info)
-    if plan.render.white_balance != "none" and not isinstance(source, ColouredSource):
+    if plan.render.white_balance != "none" and capture.colour is None:
         message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
         problems.append(plan.place("render.white_balance").problem(message))
     if problems:
         raise SpecError(problems)
 
 
-def build_source(plan: Plan) -> Source:
-    """Open the capture of a plan, with its corrections.
+def build_source(plan: Plan, look: bool = True) -> Capture:
+    """Open the capture of a plan, with its corrections. For `look`, see `open_source`.
 
     Raises:
         InputError: the capture cannot be used as it is.
@@ -93,47 +96,47 @@ def build_source(plan: Plan) -> Source:
     """
     try:
         opened = built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
-        source = _part(plan, attributed(opened, plan.source.label))
+        capture = _part(plan, capture_of(opened, plan.source.label))
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
             raise
         # The spec says `auto`, so the message explains how this source was chosen.
         raise InputError(f"{error} (source {found.value}: {found.reason})") from error
-    return with_corrections(plan, source)
+    return with_corrections(plan, capture, look)
 
 
-def with_corrections(plan: Plan, source: Source) -> Source:
+def with_corrections(plan: Plan, capture: Capture, look: bool = True) -> Capture:
     """Return a capture with the corrections of a plan.
 
     Raises:
         SpecError: a correction does not suit the capture, or its file is not what it should be; the capture is closed.
     """
     if not plan.corrections:
-        return source
+        return capture
 
     def located(index: int, message: str) -> SpecError:
         where = f"corrections.{index}"
         return SpecError([plan.place(where).problem(message)])
 
     try:
-        return corrected_source(source, plan.corrections, located)
+        return corrected_source(capture, plan.corrections, located, look)
     except BaseException:
-        source.close()
+        capture.close()
         raise
 
 
-def _part(plan: Plan, source: Source) -> Source:
+def _part(plan: Plan, capture: Capture) -> Capture:
     """Return the frames that `source.with.frames` names; all if it names none."""
     config = plan.source.config
     if not isinstance(config, PartOfCapture) or config.frames is None:
-        return source
-    (start, stop), n_frames = config.frames, source.info.n_frames
+        return capture
+    (start, stop), n_frames = config.frames, capture.info.n_frames
     if stop > n_frames:
-        source.close()
+        capture.close()
         message = f"the capture has {n_frames} frames: expected [start, stop] with stop up to {n_frames}, got [{start}, {stop}]"
         raise SpecError([plan.place("source.with.frames").problem(message)])
-    return part_of(source, FrameSpan(start, stop))
+    return part_of(capture, FrameSpan(start, stop))
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from photonpano.capture import seen_through
 from photonpano.captures.repeats import timeline_of
 from photonpano.context import Context
 from photonpano.contributions import MergerContribution
@@ -27,7 +28,6 @@ from photonpano.pipeline.run_steps import require_centre
 from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
-from photonpano.source_wrapper import seen_through
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Light
 

@@ -12,14 +12,13 @@ from functools import partial
 from typing import Any
 from uuid import uuid4
 
+from photonpano.capture import PluginSource, capture_of
 from photonpano.contributions import ExecutorContext
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.execution import CaptureElsewhere, Executor, Here, differences
-from photonpano.motion.attributed_source import AttributedSource
 from photonpano.pipeline.components import build_source, built
 from photonpano.protocols import Source
 from photonpano.record.environment import library_versions, plugin_records
-from photonpano.source_wrapper import SourceWrapper
 from photonpano.specs.loading import parse_spec
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside, thread_count
@@ -53,11 +52,9 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
         executor.close()
 
 
-def as_read(source: Source) -> Source:
-    """Return the capture without what the framework does to it."""
-    while isinstance(source, SourceWrapper) and not isinstance(source, AttributedSource):
-        source = source.wrapped
-    return source
+def as_read(source: Source) -> PluginSource:
+    """Return the source of a capture as its plugin gives it, which is opened anew in each process."""
+    return capture_of(source).source
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +75,7 @@ class CaptureOpener:
     keys: Mapping[str, Any] = field(compare=False)
     needed: Mapping[str, str] = field(compare=False)
 
-    def __call__(self) -> Source:
+    def __call__(self) -> PluginSource:
         """Open the capture. From then on, the libraries of the process work in one thread: workers are many processes.
 
         Raises:
@@ -89,7 +86,7 @@ class CaptureOpener:
             raise InputError(f"a worker that joined during the run differs from the process that runs it: {different}")
         return source
 
-    def unchecked(self) -> Source:
+    def unchecked(self) -> PluginSource:
         """Open the capture, whatever this process has."""
         _WHILE_THE_PROCESS_LIVES.enter_context(one_thread_inside())
         spec = {"version": 1, "source": {"use": self.source, "with": self.keys}, "corrections": [], "run": {"seed": self.seed}}
@@ -108,14 +105,14 @@ def met_elsewhere(opener: CaptureOpener) -> dict[str, str]:
     return met_by(opener.needed, source)
 
 
-def met_by(needed: Iterable[str], source: Source | None) -> dict[str, str]:
+def met_by(needed: Iterable[str], source: PluginSource | None) -> dict[str, str]:
     """Return what this process has of what a run needs: versions of distributions by name, and a hash of the capture."""
     return {name: _version(name) for name in needed if name != "capture"} | {
         "capture": "" if source is None else _hash_of(source)
     }
 
 
-def _hash_of(source: Source) -> str:
+def _hash_of(source: PluginSource) -> str:
     """Return a hash of what describes a capture, and of its first, middle and last frame."""
     digest, last = hashlib.sha256(repr(source.info).encode()), source.info.n_frames - 1
     for frame in (0, last // 2, last):

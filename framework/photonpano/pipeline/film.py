@@ -10,6 +10,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from photonpano.capture import capture_of
 from photonpano.captures.picture_files import Picture
 from photonpano.geometry import Camera, Canvas, outline_of
 from photonpano.merging.colour import composed, in_colours
@@ -17,7 +18,7 @@ from photonpano.merging.merge_renderer import MergeRenderer
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.smooth_path import smooth_view
 from photonpano.photometry import WhiteBalance, balanced, grey_world, linear_to_srgb
-from photonpano.protocols import ColouredSource, Source, camera_of
+from photonpano.protocols import Source, camera_of
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
@@ -62,7 +63,7 @@ class Film:
             threads: how many pictures are made at once; they do not depend on it.
             bits: of each pixel.
         """
-        film = self._balanced(spans) if isinstance(self.source, ColouredSource) else self
+        film = self._balanced(spans) if capture_of(self.source).colour is not None else self
         around = None if self.panorama is None else np.nan_to_num(_DIMMED * film._levels(self.panorama))
 
         def picture(span: FrameSpan) -> Picture:

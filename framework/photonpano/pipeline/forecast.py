@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.captures.part import part_of
+from photonpano.capture import part_of
 from photonpano.context import Context
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import View, box_of, plan_canvas

@@ -11,12 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from photonpano.capture import capture_of
 from photonpano.captures.fingerprint import capture_files
-from photonpano.captures.order import order_warning
+from photonpano.captures.obstacles import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
 from photonpano.context import Progress
-from photonpano.corrections import CorrectedSource, FilteredSource
 from photonpano.errors import InputError, OutputError
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.observers import Observers
@@ -82,7 +82,7 @@ def first_decisions(plan: Plan, source: Source) -> list[Decision]:
     """Return what was decided while the capture was opened; warn if its pixels seem to be in another order."""
     if warning := order_warning(source):
         logger.warning(warning)
-    return [*plan.decisions, *(source.decisions if isinstance(source, CorrectedSource | FilteredSource) else ())]
+    return [*plan.decisions, *capture_of(source).decisions]
 
 
 def require_centre(plan: Plan, source: Source) -> None:

@@ -18,6 +18,7 @@ from photonpano.protocols.motion import (
 from photonpano.protocols.panorama import Exporter, FinishedPanorama, Renderer
 from photonpano.protocols.sources import (
     Arrived,
+    Closing,
     ColouredSource,
     KnowsSharpViews,
     KnowsTruth,
@@ -34,6 +35,7 @@ from photonpano.protocols.sources import (
 
 __all__ = [
     "Arrived",
+    "Closing",
     "ColouredSource",
     "Exporter",
     "FinishedPanorama",

@@ -1,11 +1,11 @@
-"""The interfaces of sources: what every capture gives, and what some give besides."""
+"""The interfaces of sources: what every source gives, and the optional methods that some give besides."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
 
 if TYPE_CHECKING:
+    from abc import ABCMeta as _ProtocolMeta
+
     from photonpano.geometry import Camera
+else:
+    _ProtocolMeta = type(Protocol)
 
 
 class Source(Protocol):
@@ -51,6 +55,19 @@ class Source(Protocol):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
 
 
+class Closing:
+    """Closes itself at the end of a `with` block: a base class of sources."""
+
+    def close(self) -> None:
+        """Release files; by default there are none."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrived:
     """What is there of a capture that is still being written.
@@ -77,8 +94,21 @@ class Piped:
     frame_bytes: int
 
 
+class _Optional(_ProtocolMeta):
+    """Metaclass of the protocols of optional methods.
+
+    A `photonpano.Capture` has all methods, and says itself which of them apply: a capture in steady light is no `LitSource`.
+    """
+
+    def __instancecheck__(cls, instance: Any) -> bool:  # noqa: N805 - of a metaclass
+        offers = getattr(instance, "_offers", None)
+        if offers is None:
+            return super().__instancecheck__(instance)
+        return all(offers(name) for name in vars(cls) if not name.startswith("_"))
+
+
 @runtime_checkable
-class PackedSource(Source, Protocol):
+class PackedSource(Source, Protocol, metaclass=_Optional):
     """Gives packed frames, so that copying and summing need no unpacking."""
 
     def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
@@ -92,18 +122,11 @@ class PackedSource(Source, Protocol):
 
 
 @runtime_checkable
-class LinearlyCorrectedSource(Source, Protocol):
-    """A source whose sums contain more than the flux, such as dark counts, and that can subtract it."""
+class LinearlyCorrectedSource(Source, Protocol, metaclass=_Optional):
+    """Its sums of frames contain more than the flux, such as dark counts, and it can subtract that."""
 
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """Correct a sum of frames, so that on average it is the sum of frames of the flux alone.
-
-        Mergers correct sums of frames before they warp them. The correction is linear, so that the average is right; the result
-        may be negative.
-
-        Args:
-            counts: (H, W), from `counts`.
-            n_frames: number of frames in the sum.
+        """Correct a sum of frames, (H, W): see `Capture.corrected`.
 
         Returns:
             (H, W) float32.
@@ -112,13 +135,11 @@ class LinearlyCorrectedSource(Source, Protocol):
 
 
 @runtime_checkable
-class WeightedSource(Source, Protocol):
-    """A source whose pixels carry different amounts of information, as those behind filters of different colours do."""
+class WeightedSource(Source, Protocol, metaclass=_Optional):
+    """Its pixels carry different amounts of information, as those behind filters of different colours do."""
 
     def weights(self) -> FluxImage:
-        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32, not negative.
-
-        Ordinary is the best pixel behind a filter, and a pixel of gain 1 of a sensor whose pixels differ in gain.
+        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32; see `Capture`.
 
         Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
         """
@@ -126,7 +147,7 @@ class WeightedSource(Source, Protocol):
 
 
 @runtime_checkable
-class ColouredSource(Source, Protocol):
+class ColouredSource(Source, Protocol, metaclass=_Optional):
     """A source behind a colour filter array. By itself it is grey: its corrected sums are those of pixels of one colour.
 
     Motion is estimated from this grey source, and the panorama is rendered from the sources of its colours.
@@ -146,11 +167,10 @@ class ColouredSource(Source, Protocol):
 
 
 @runtime_checkable
-class LitSource(Source, Protocol):
-    """A source in changing light, which is known.
+class LitSource(Source, Protocol, metaclass=_Optional):
+    """A source in changing light, which is known. A source in steady light does not have this property.
 
-    What is summed over frames counts each frame by its gain; what predicts a frame multiplies the flux by it. A source in
-    steady light does not have it.
+    What is summed over frames counts each frame by its gain; what predicts a frame multiplies the flux by it.
     """
 
     @property
@@ -159,13 +179,8 @@ class LitSource(Source, Protocol):
         ...
 
 
-def light_of(source: Source) -> Light | None:
-    """Return the changing light of a capture; None if it is steady, or not known."""
-    return source.light if isinstance(source, LitSource) else None
-
-
 @runtime_checkable
-class LensedSource(Source, Protocol):
+class LensedSource(Source, Protocol, metaclass=_Optional):
     """A source whose camera is known.
 
     Frames are warped through its lens: homographies then map ideal pixels, those without distortion, to ideal pixels.
@@ -177,13 +192,18 @@ class LensedSource(Source, Protocol):
         ...
 
 
+def light_of(source: Source) -> Light | None:
+    """Return the changing light of a capture; None if it is steady, or not known."""
+    return getattr(source, "light", None)
+
+
 def camera_of(source: Source) -> Camera | None:
     """Return the camera of a capture; None if it is not known."""
-    return source.camera if isinstance(source, LensedSource) else None
+    return getattr(source, "camera", None)
 
 
 @runtime_checkable
-class KnowsTruth(Protocol):
+class KnowsTruth(Protocol, metaclass=_Optional):
     """A source with ground truth, such as a simulator: a `Source` with one more method.
 
     `photonpano simulate` stores the truth as an .npz archive, for `photonpano evaluate`.
@@ -210,7 +230,7 @@ class KnowsTruth(Protocol):
 
 
 @runtime_checkable
-class KnowsSharpViews(KnowsTruth, Protocol):
+class KnowsSharpViews(KnowsTruth, Protocol, metaclass=_Optional):
     """A source that can return its frames without noise, such as a simulator.
 
     `photonpano simulate --sharp-every` stores them as pictures.

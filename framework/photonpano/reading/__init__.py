@@ -1,6 +1,7 @@
 """What sources share that read captures from files: packed frames, .npy headers, arrays, files in order."""
 
 from photonpano.paths import as_written
+from photonpano.protocols import Closing
 from photonpano.reading.array_content import Content, frames_are_last, packed_frames_are_last, unpacked_content
 from photonpano.reading.arrays import read_array, read_arrays, read_picture
 from photonpano.reading.binary_source import BinarySource
@@ -30,7 +31,6 @@ from photonpano.reading.pixel_order import OtherOrder, PixelOrder, other_order
 from photonpano.reading.remote import library, read_range
 from photonpano.reading.sampling import sampled_frames, sampled_spans
 from photonpano.reading.single_frame_source import SingleFrameSource
-from photonpano.source_wrapper import Closing
 
 __all__ = [
     "COLOURS",

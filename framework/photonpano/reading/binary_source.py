@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.photometry import BinaryResponse
+from photonpano.protocols import Closing
 from photonpano.reading.files import OpenFiles
 from photonpano.reading.packed_layout import FrameLayout
-from photonpano.source_wrapper import Closing
 from photonpano.values import Counts, FrameSpan, StreamInfo
 
 

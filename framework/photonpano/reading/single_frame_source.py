@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.source_wrapper import Closing
+from photonpano.protocols import Closing
 from photonpano.values import Counts, Frames, FrameSpan, StreamInfo
 
 

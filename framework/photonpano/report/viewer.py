@@ -12,11 +12,12 @@ import numpy as np
 
 from photonpano.captures.preview import still_exposure
 from photonpano.geometry import Canvas, inverse, outline_of, rescaling
+from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import WhiteBalance, balanced, flux_std, tone_mapped
-from photonpano.protocols import ColouredSource, Source
+from photonpano.protocols import Source
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
 from photonpano.report.figures import centre_of, instants_of, places_on
@@ -191,7 +192,7 @@ def glimpses(source: Source, n_frames: int, white: float) -> list[dict[str, Any]
     """Return short sums of frames, all over the capture."""
     total = source.info.n_frames
     n_frames = min(n_frames, total)
-    most = COLOURED_GLIMPSES if isinstance(source, ColouredSource) else GLIMPSES
+    most = COLOURED_GLIMPSES if channels_of(source) > 1 else GLIMPSES
     found = []
     for start in np.unique(np.linspace(0, total - n_frames, min(most, total)).astype(int)):
         span = FrameSpan(int(start), int(start) + n_frames)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import Capture
 from photonpano.context import Context
 from photonpano.geometry import corners, steps_px
-from photonpano.protocols import LinearlyCorrectedSource, Source
 from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
 from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
@@ -247,7 +247,7 @@ class _Colour:
         slope: (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct.
     """
 
-    source: Source
+    source: Capture
     prediction: Prediction
     masked: FluxImage | None
     corrected: Callable[[Counts, int], FluxImage] | None
@@ -256,9 +256,9 @@ class _Colour:
     slope: FluxImage | None
 
     @classmethod
-    def of(cls, source: Source, prediction: Prediction) -> _Colour:
+    def of(cls, source: Capture, prediction: Prediction) -> _Colour:
         shape = prediction.frame_shape
-        corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
+        corrected = source.corrected if source.corrects_sums else None
         zeros = np.zeros(shape, np.uint32)
         # Corrected counts are `slope * counts - n * dark`: counts of the dark, and of less sensitive pixels, add noise.
         dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)

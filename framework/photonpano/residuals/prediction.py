@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Camera, Canvas, corners
 from photonpano.merging.light import gain_image
-from photonpano.protocols import ColouredSource, Source, Trajectory, camera_of, light_of
+from photonpano.protocols import Source, Trajectory
 from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
@@ -175,7 +176,7 @@ class Predictions:
         parts: the source of each colour, with its prediction. Their motion is the same.
     """
 
-    parts: tuple[tuple[Source, Prediction], ...]
+    parts: tuple[tuple[Capture, Prediction], ...]
 
     @classmethod
     def of(
@@ -190,18 +191,19 @@ class Predictions:
             trajectory: frame pixels to reference pixels.
             frame_shape: (height, width) of a frame.
         """
+        capture = capture_of(source)
 
-        def prediction(each: Source, single: Panorama) -> Prediction:
-            seen = trajectory, frame_shape, light_of(source), camera_of(source)
+        def prediction(each: Capture, single: Panorama) -> Prediction:
+            seen = trajectory, frame_shape, capture.light, capture.camera
             return Prediction.of(single, canvas, each.response, *seen)
 
-        if not isinstance(source, ColouredSource):
-            return cls(((source, prediction(source, panorama)),))
+        if capture.colour is None:
+            return cls(((capture, prediction(capture, panorama)),))
         images = zip(np.moveaxis(panorama.flux, -1, 0), np.moveaxis(panorama.weight, -1, 0), strict=True)
         singles = [
             Panorama(np.ascontiguousarray(flux), np.ascontiguousarray(weight), panorama.canvas) for flux, weight in images
         ]
-        parts = zip(source.colours().values(), singles, strict=True)
+        parts = zip(capture.colours().values(), singles, strict=True)
         return cls(tuple((each, prediction(each, single)) for each, single in parts))
 
     @property

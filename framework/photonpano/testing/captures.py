@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photonpano.photometry import BinaryResponse
-from photonpano.protocols import Trajectory
-from photonpano.source_wrapper import Closing
+from photonpano.protocols import Closing, Trajectory
 from photonpano.testing.scenes import Scene
 from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Group, Homography, StreamInfo, VirtualExposure
 

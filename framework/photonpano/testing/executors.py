@@ -10,12 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from photonpano.capture import PluginSource
 from photonpano.context import Context
 from photonpano.contributions import ExecutorContext, ExecutorContribution
 from photonpano.errors import LocationError
 from photonpano.execution import CaptureElsewhere, Executor
-from photonpano.motion.attributed_source import attributed
-from photonpano.protocols import Source
 from photonpano.testing.captures import MemorySource
 from photonpano.testing.conformance import Conformance
 from photonpano.values import Counts, FrameSpan
@@ -24,13 +23,13 @@ N_FRAMES, SPAN = 30, FrameSpan(3, 20)
 
 
 @cache
-def capture() -> Source:
+def capture() -> PluginSource:
     """Return a small capture, the same in every process."""
     frames = np.random.default_rng(0).random((N_FRAMES, 12, 16)) < 0.3
-    return attributed(MemorySource(frames), "a capture of photonpano.testing")
+    return PluginSource(MemorySource(frames), "a capture of photonpano.testing")
 
 
-def counted(source: Source, span: FrameSpan) -> Counts:
+def counted(source: PluginSource, span: FrameSpan) -> Counts:
     """Sum the frames of a span: a task."""
     return source.counts(span)
 

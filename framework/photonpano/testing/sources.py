@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonpano.capture import capture_of
 from photonpano.contributions import SourceContext, SourceContribution
 from photonpano.errors import InputError
-from photonpano.motion.attributed_source import attributed
 from photonpano.protocols import Arrived, PackedSource, Source
 from photonpano.testing.conformance import Conformance, must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
@@ -108,7 +108,7 @@ class SourceConformance(Conformance):
     def test_source_passes_the_checks_of_a_run(self) -> None:
         """A run refuses properties of other types, numbers that frames cannot have, and arrays that change later."""
         with self.opened() as source, passing("the source"):
-            named = attributed(source, "it")
+            named = capture_of(source, "it")
             for span in _spans(source):
                 named.counts(span)
                 named.frames(span)

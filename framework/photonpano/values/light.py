@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,11 @@ class Light:
     def mean(self, span: FrameSpan) -> float:
         """Return the mean over the frames of a span of the gain of all of the scene."""
         return float(self.gain[span.start : span.stop].mean())
+
+    def part(self, span: FrameSpan) -> Light:
+        """Return the light of some frames."""
+        frames = slice(span.start, span.stop)
+        return replace(self, gain=self.gain[frames], waves=self.waves[:, frames], std=self.std[frames])
 
     def classes(self) -> NDArray[np.int64]:
         """Return the class of each frame: (T,), from 0. Within a class the gain of each place hardly changes."""

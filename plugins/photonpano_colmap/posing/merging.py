@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photonpano import FloatArray, FrameSpan, Group, LinearlyCorrectedSource, Source, VirtualExposure
+from photonpano import FloatArray, FrameSpan, Group, Source, VirtualExposure, capture_of
 from photonpano.compiling import compiled
 from photonpano.geometry import inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
@@ -74,9 +74,7 @@ class _Plane:
 
 def lit_counts(source: Source, span: FrameSpan) -> NDArray[np.float32]:
     """Return the sum of the frames of a span, of the flux alone: (H, W)."""
-    counts = source.counts(span)
-    lit = source.corrected(counts, len(span)) if isinstance(source, LinearlyCorrectedSource) else counts
-    return lit.astype(np.float32)
+    return capture_of(source).corrected_counts(span).astype(np.float32)
 
 
 @compiled

@@ -17,12 +17,11 @@ from photonpano import (
     FrameSpan,
     Group,
     InputError,
-    LensedSource,
-    LitSource,
     Response,
     Source,
     Trajectory,
     VirtualExposure,
+    capture_of,
 )
 from photonpano.merging import PhotonSum, divided
 from photonpano_core.configs import BurstConfig
@@ -64,9 +63,10 @@ class BurstMerger:
             InputError: the lens of the source distorts, or its light changes.
         """
         del trajectory
-        if isinstance(source, LensedSource) and source.camera.distorts:
+        capture = capture_of(source)
+        if capture.camera is not None and capture.camera.distorts:
             raise InputError("merge.use: burst does not warp through a lens that distorts; use photon-mle")
-        if isinstance(source, LitSource):
+        if capture.light is not None:
             raise InputError("merge.use: burst does not divide by light that changes; use photon-mle")
         burst = _Burst(source, group, self._config)
         photons = burst.merged(burst.motion())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FrameSpan, LinearlyCorrectedSource, Source, WeightedSource
+from photonpano import FrameSpan, Source, capture_of
 
 Image = NDArray[np.float32]
 
@@ -18,16 +18,13 @@ class WeightedFrames:
     """
 
     def __init__(self, source: Source) -> None:
-        self._source = source
-        self._corrected = source.corrected if isinstance(source, LinearlyCorrectedSource) else None
-        if isinstance(source, WeightedSource):
-            self.worth: Image = np.where(source.valid, source.weights(), np.float32(0))
+        self._capture = capture = capture_of(source)
+        if capture.weight is not None:
+            self.worth: Image = np.where(source.valid, capture.weight, np.float32(0))
         else:
             self.worth = np.zeros((0, 0), np.float32) if source.valid.all() else source.valid.astype(np.float32)
 
     def __call__(self, span: FrameSpan) -> Image:
         """Sum the frames of a span."""
-        summed = self._source.counts(span)
-        counts = self._corrected(summed, len(span)) if self._corrected else summed
-        lit = np.asarray(counts, np.float32)
+        lit = np.asarray(self._capture.corrected_counts(span), np.float32)
         return lit * self.worth if self.worth.size else lit

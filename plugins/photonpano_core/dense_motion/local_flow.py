@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import BoolArray, FrameSpan, Group, InputError, LensedSource, LitSource, Source, Trajectory, VirtualExposure
+from photonpano import BoolArray, FrameSpan, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
 from photonpano.geometry import inverse
 from photonpano.merging import PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import LocalFlowConfig
@@ -74,9 +74,10 @@ class LocalFlowMerger:
         return GhostMap(enlarged(found.significance, shape), enlarged(found.moving, shape))
 
     def _divided(self, source: Source, group: Group, trajectory: Trajectory) -> SubExposures:
-        if isinstance(source, LensedSource) and source.camera.distorts:
+        capture = capture_of(source)
+        if capture.camera is not None and capture.camera.distorts:
             raise InputError("merge.use: local-flow does not warp through a lens that distorts; use robust-merge or photon-mle")
-        if isinstance(source, LitSource):
+        if capture.light is not None:
             raise InputError("merge.use: local-flow does not divide by light that changes; use robust-merge or photon-mle")
         wanted = self._config.sub_exposures
         number = min(number_of(source, group), _USUAL) if wanted == "auto" else wanted

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import BoolArray, FluxImage, FrameSpan, Homography, LinearlyCorrectedSource, LitSource, Source, Trajectory
+from photonpano import BoolArray, Capture, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
 from photonpano.geometry import Canvas, apply, corners
 from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
@@ -71,7 +71,8 @@ def sums_on(
     source: Source, chunks: Sequence[Chunk], canvas: Canvas, advance: Callable[[int], None], pool: Executor
 ) -> PhotonSums:
     """Sum the counts and the frames of the pixels whose centres fall into each cell of a canvas."""
-    light = source.light if isinstance(source, LitSource) else None
+    capture = capture_of(source)
+    light = capture.light
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
     lit = np.zeros(canvas.shape, np.float32)
     seen = np.zeros((1 if terms is None else terms.number, *canvas.shape), np.float32)
@@ -80,7 +81,7 @@ def sums_on(
     adding: Iterable[None] = ()
     for first in range(0, len(chunks), _BATCH):
         batch = chunks[first : first + _BATCH]
-        summed = list(pool.map(partial(_summed, source, terms), batch))
+        summed = list(pool.map(partial(_summed, capture, terms), batch))
         deque(adding, maxlen=0)
         to_grid = [np.ascontiguousarray(canvas.transform @ chunk.homography) for chunk in batch]
         adding = pool.map(partial(_add, summed, to_grid, usable, lit, seen), parts)
@@ -91,13 +92,10 @@ def sums_on(
     return _photons(source, lit, seen[0], lit_frames)
 
 
-def _summed(source: Source, terms: LightTerms | None, chunk: Chunk) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the counts of a chunk, (h, w), and what a pixel adds to each image of frames and gains, (P,)."""
-    counts, n_frames = source.counts(chunk.span), len(chunk.span)
-    amounts = np.array([n_frames], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
-    if isinstance(source, LinearlyCorrectedSource):
-        return np.ascontiguousarray(source.corrected(counts, n_frames), np.float32), amounts
-    return np.ascontiguousarray(counts, np.float32), amounts
+    amounts = np.array([len(chunk.span)], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
+    return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts
 
 
 def _add(

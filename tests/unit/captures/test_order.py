@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonpano.captures.order import order_warning
+from photonpano.captures.obstacles import order_warning
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource
 from photonpano.testing import MemorySource
 

@@ -21,7 +21,7 @@ from photonpano import (
     run,
     simulate,
 )
-from photonpano.captures.part import part_of
+from photonpano.capture import part_of
 from photonpano.captures.writing import truth_path
 from photonpano.pipeline.components import build_source
 from photonpano.testing import MemorySource

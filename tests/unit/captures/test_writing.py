@@ -100,7 +100,7 @@ from photonpano import OutputError, StreamInfo
 from photonpano.captures.writing import write_packed
 
 class Source:
-    info = StreamInfo(4000, 64, 64, None)
+    info, valid, response = StreamInfo(4000, 64, 64, None), np.ones((64, 64), bool), None
     def frames(self, span):
         return np.ones((len(span), 64, 64), np.uint8)
     def truth(self):

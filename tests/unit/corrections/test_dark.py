@@ -65,7 +65,7 @@ def test_pixels_with_more_than_the_limit_are_masked_and_counted(corrections: Cal
         assert np.argwhere(~source.valid).tolist() == [[3, 4], [5, 6]]
         assert np.isfinite(source.corrected(source.counts(SPAN), N)).all()
         reason = "pixels with more than limit = 0.1 dark counts a frame are masked"
-        assert source.decisions == [Decision("dark_counts_masked", 2, reason)]
+        assert source.decisions == (Decision("dark_counts_masked", 2, reason),)
 
 
 def test_measure_dark_returns_the_rate_of_the_photons(tmp_path: Path) -> None:

@@ -80,14 +80,15 @@ def test_masked_pixels_are_not_used_as_neighbours(every: int, corrections: Calla
     assert (source.valid[~bad & hot].mean() < 0.2) == (every == 2)
 
 
-def test_no_frame_is_read_before_valid(corrections: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_read_once_and_not_at_all_for_a_check(corrections: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     frames = exposed(np.full(SHAPE, 0.1), n=50)
     read: list[FrameSpan] = []
     counts = MemorySource.counts
     monkeypatch.setattr(MemorySource, "counts", lambda self, span: read.append(span) or counts(self, span))
-    source = corrected_source(MemorySource(frames), corrections("hot-pixels"))
-    assert source.info.frame_shape == SHAPE
+    checked = corrected_source(MemorySource(frames), corrections("hot-pixels"), look=False)
+    assert checked.info.frame_shape == SHAPE
     assert read == []
+    source = corrected_source(MemorySource(frames), corrections("hot-pixels"))
     assert [source.valid.all() for _ in range(3)] == [True] * 3
     assert read == [FrameSpan(0, 50)]
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano.corrections import CorrectedSource, corrected_source
+from photonpano import Capture
+from photonpano.corrections import corrected_source
 from photonpano.geometry import translation
 from photonpano.testing import MemorySource
 
@@ -27,14 +28,14 @@ def panned(street: np.ndarray) -> Callable[..., np.ndarray]:
     return panned
 
 
-def found_in(chances: np.ndarray, corrections: Callable, seed: int = 0) -> CorrectedSource:
+def found_in(chances: np.ndarray, corrections: Callable, seed: int = 0) -> Capture:
     frames = (np.random.default_rng(seed).random(chances.shape, np.float32) < chances).astype(np.uint8)
     source = corrected_source(MemorySource(frames), corrections("still-pixels"))
     assert source.valid.shape == SHAPE
     return source
 
 
-def decided(source: CorrectedSource) -> dict[str, float]:
+def decided(source: Capture) -> dict[str, float]:
     return {each.what: float(each.value) for each in source.decisions}
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.corrections import divided_by, estimate_vignette
-from photonpano.corrections.vignette import Vignette
+from photonpano.corrections import Vignette, divided_by, estimate_vignette
 from photonpano.geometry import translation
 from photonpano.testing import KnownMotion, MemorySource
 

@@ -13,16 +13,13 @@ import pytest
 
 import photonpano.pipeline.run as run_module
 from photonpano import FrameSpan, InputError, Light, PluginError, parse_spec, run
-from photonpano.captures.part import part_of
-from photonpano.corrections import ColourFilter, HotPixels, corrected_source, divided_by
-from photonpano.corrections.vignette import Vignette
+from photonpano.capture import Capture, capture_of, part_of, seen_through
+from photonpano.corrections import ColourFilter, HotPixels, Vignette, corrected_source, divided_by
 from photonpano.execution.packing import packed, unpacked
 from photonpano.geometry import Camera
 from photonpano.lighting import in_light
-from photonpano.motion.attributed_source import AttributedSource, attributed
 from photonpano.pipeline.executors import CaptureOpener, as_read, met_elsewhere
 from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
-from photonpano.source_wrapper import seen_through
 from photonpano.testing import MemorySource
 
 SHAPE, N = (24, 32), 60
@@ -38,16 +35,16 @@ WRAPPERS: dict[str, Callable[[Source], Source]] = {
 }
 
 
-def capture() -> AttributedSource:
-    return attributed(MemorySource(np.random.default_rng(0).random((N, *SHAPE)) < 0.3), "a source of this test")
+def capture() -> Capture:
+    return capture_of(MemorySource(np.random.default_rng(0).random((N, *SHAPE)) < 0.3), "a source of this test")
 
 
 @pytest.mark.parametrize("name", WRAPPERS)
 def test_sources_arrive_as_they_left(name: str) -> None:
     here, there = capture(), capture()
     sent = WRAPPERS[name](here)
-    data = packed(sent, here)
-    arrived: Source = unpacked(data, there)
+    data = packed(sent, as_read(here))
+    arrived: Source = unpacked(data, as_read(there))
     np.testing.assert_array_equal(arrived.counts(SPAN), sent.counts(SPAN))
     np.testing.assert_array_equal(arrived.valid, sent.valid)
     assert arrived.info == sent.info
@@ -65,8 +62,8 @@ def test_sources_arrive_as_they_left(name: str) -> None:
 
 
 def test_frames_do_not_travel() -> None:
-    here = attributed(MemorySource(np.zeros((5000, *SHAPE), bool)), "a source of this test")
-    assert len(packed(part_of(here, FrameSpan(0, 4000)), here)) < 2000
+    here = capture_of(MemorySource(np.zeros((5000, *SHAPE), bool)), "a source of this test")
+    assert len(packed(part_of(here, FrameSpan(0, 4000)), as_read(here))) < 2000
 
 
 def test_what_cannot_travel_is_named() -> None:

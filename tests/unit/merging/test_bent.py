@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from photonpano.capture import seen_through
 from photonpano.geometry import (
     Camera,
     Canvas,
@@ -17,7 +18,6 @@ from photonpano.geometry import (
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.averaging import Averaging
 from photonpano.merging.bent import BentGrid, laid
-from photonpano.source_wrapper import seen_through
 from photonpano.testing.captures import MemorySource
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 

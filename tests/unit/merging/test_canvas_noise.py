@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.corrections.colours import filtered
+from photonpano.corrections.colours import with_colours
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.photometry import BinaryResponse, flux_std
@@ -56,7 +56,7 @@ def test_noise_of_colours_is_that_of_their_pixels(pan: Callable, even: bool) -> 
     """The grey source that all colours make multiplies counts by the gains of the colours, which must not count."""
     rates = np.full((8, 12), 0.2) if even else np.linspace(0.01, 0.5, 96).reshape(8, 12)
     colour = np.tile(np.int8([[0, 1], [1, 2]]), (4, 6))
-    noise = CanvasNoise.of(filtered(DarkCounts(rates), lambda: colour, []), pan(0), SPAN, CANVAS)
+    noise = CanvasNoise.of(with_colours(DarkCounts(rates), colour), pan(0), SPAN, CANVAS)
     std = noise.std(image(0.1, (8, 12, 3)), image(1e6, (8, 12, 3)))
     own = np.take_along_axis(std, colour[..., None].astype(int), axis=-1)[..., 0]
     np.testing.assert_allclose(own, np.sqrt(np.expm1(0.1 + rates) / 1e6), rtol=0.01)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, KnowsSharpViews, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
-from photonpano.motion.attributed_source import attributed
+from photonpano.capture import capture_of
 from photonpano.motion.attribution import AttributedTrajectory
 from photonpano.protocols import ColouredSource
 
@@ -30,7 +30,7 @@ def raising(error: BaseException) -> Callable[..., Any]:
 
 
 def test_attributed_source_reads_what_the_source_reads(source: Any) -> None:
-    named = attributed(source, ORIGIN)
+    named = capture_of(source, ORIGIN)
     assert (named.info, named.response) == (source.info, source.response)
     assert named.valid is source.valid
     np.testing.assert_array_equal(named.counts(SPAN), source.counts(SPAN))
@@ -38,11 +38,11 @@ def test_attributed_source_reads_what_the_source_reads(source: Any) -> None:
 
 
 def test_attributed_source_has_the_optional_methods_of_the_source(source: Any) -> None:
-    assert not isinstance(attributed(source, ORIGIN), PackedSource | LinearlyCorrectedSource | KnowsTruth)
+    assert not isinstance(capture_of(source, ORIGIN), PackedSource | LinearlyCorrectedSource | KnowsTruth)
     source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
     source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
     source.truth = lambda: {"scene": np.ones((4, 6))}
-    named = attributed(source, ORIGIN)
+    named = capture_of(source, ORIGIN)
     assert isinstance(named, KnowsTruth)
     assert set(named.truth()) == {"scene"}
     assert isinstance(named, PackedSource)
@@ -51,18 +51,18 @@ def test_attributed_source_has_the_optional_methods_of_the_source(source: Any) -
     np.testing.assert_array_equal(named.corrected(source.counts(SPAN), 3), source.counts(SPAN) - np.float32(3))
     source.packed = raising(OSError("gone"))
     with pytest.raises(PluginError, match=r"failed at frames 2 to 4: OSError: gone"):
-        attributed(source, ORIGIN).packed(SPAN)
+        capture_of(source, ORIGIN).packed(SPAN)
 
 
 def test_attributed_source_names_the_plugin_of_sharp_views(source: Any) -> None:
     source.truth = dict
     source.sharp_view = lambda frame: source.frames(FrameSpan(frame, frame + 1))[0].astype(np.float32)
-    named = attributed(source, ORIGIN)
+    named = capture_of(source, ORIGIN)
     assert isinstance(named, KnowsSharpViews)
     np.testing.assert_array_equal(named.sharp_view(2), source.sharp_view(2))
     source.sharp_view = lambda _: np.zeros((2, 2), np.float32)
     with pytest.raises(PluginError, match=r"sharp_view\(\) returns \(4, 6\) of float32, got"):
-        attributed(source, ORIGIN).sharp_view(2)
+        capture_of(source, ORIGIN).sharp_view(2)
 
 
 def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type) -> None:
@@ -70,7 +70,7 @@ def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type
     red.counts = raising(OSError("gone"))
     source.colours = lambda: {"red": red}
     source.clear_mix = lambda: np.ones(3)
-    named = attributed(source, ORIGIN)
+    named = capture_of(source, ORIGIN)
     assert isinstance(named, ColouredSource)
     with pytest.raises(PluginError, match=r"toys 1\.0.* failed at frames 2 to 4: OSError: gone"):
         named.colours()["red"].counts(SPAN)
@@ -79,14 +79,14 @@ def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type
 def test_attributed_source_closes_the_source(source: Any) -> None:
     closed: list[bool] = []
     source.close = lambda: closed.append(True)
-    with attributed(source, ORIGIN):
+    with capture_of(source, ORIGIN):
         assert not closed
     assert closed
 
 
 @pytest.mark.parametrize("method", ["counts", "frames"])
 def test_attributed_source_names_plugin_on_exception_or_wrong_shape(source: Any, method: str) -> None:
-    named = attributed(source, ORIGIN)
+    named = capture_of(source, ORIGIN)
     setattr(source, method, raising(OSError("gone")))
     with pytest.raises(PluginError) as caught:
         getattr(named, method)(SPAN)
@@ -102,7 +102,7 @@ def test_attributed_source_passes_errors_written_for_users(source: Any) -> None:
     error = InputError("the disk was pulled out")
     source.counts = raising(error)
     with pytest.raises(InputError) as caught:
-        attributed(source, ORIGIN).counts(SPAN)
+        capture_of(source, ORIGIN).counts(SPAN)
     assert caught.value is error
 
 
@@ -149,7 +149,7 @@ def test_array_that_changes_after_it_was_returned_is_refused(source: Any, method
 
     setattr(source, method, reusing)
     with pytest.raises(PluginError) as caught:
-        getattr(attributed(source, ORIGIN), method)(SPAN)
+        getattr(capture_of(source, ORIGIN), method)(SPAN)
     assert str(caught.value) == (
         f"{ORIGIN} broke its contract at frames 2 to 4: "
         f"the array that {method}() returned changed when other frames were read; return a new array"
@@ -159,7 +159,7 @@ def test_array_that_changes_after_it_was_returned_is_refused(source: Any, method
 def test_corrected_sums_and_truth_are_checked(source: Any) -> None:
     source.corrected = lambda counts, _: counts
     source.truth = lambda: [1]
-    named = attributed(source, ORIGIN)
+    named = capture_of(source, ORIGIN)
     with pytest.raises(PluginError) as caught:
         named.corrected(source.counts(SPAN), 3)
     assert str(caught.value) == (
@@ -173,7 +173,7 @@ def test_corrected_sums_and_truth_are_checked(source: Any) -> None:
 
 
 def test_values_of_later_reads_are_checked_now_and_then(source: Any) -> None:
-    named, good = attributed(source, ORIGIN), source.counts(SPAN)
+    named, good = capture_of(source, ORIGIN), source.counts(SPAN)
     for _ in range(20):
         named.counts(SPAN)
     source.counts = lambda _: good + np.uint32(9)

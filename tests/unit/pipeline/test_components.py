@@ -74,7 +74,7 @@ def plan(levels: Any = 1, **changes: Any) -> Plan:
 def test_components_receive_their_config_and_context() -> None:
     made = plan()
     source = build_source(made)
-    assert source.wrapped.context == SourceContext(seed=7, threads=3)
+    assert source.source.given.context == SourceContext(seed=7, threads=3)
     (level,) = build_levels(made, source, [])
     assert level.locators[0].component.context == StageContext(source.info, source.response, seed=7, threads=3)
     assert level.locators[0].origin == "locator 'toy' of toys 1.0"

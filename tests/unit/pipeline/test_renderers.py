@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
+from photonpano.capture import seen_through
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
 from photonpano.pipeline.renderers import AttributedRenderer
 from photonpano.protocols import Renderer
-from photonpano.source_wrapper import seen_through
 from photonpano.testing.captures import MemorySource
 
 SHAPE = (40, 60)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
+from photonpano.capture import seen_through
 from photonpano.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices
 from photonpano.merging.canvas_plan import View, plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.source_wrapper import seen_through
 from photonpano.testing.captures import MemorySource
 from photonpano.values import FloatArray
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.captures.part import part_of
+from photonpano.capture import part_of
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
 from photonpano.motion.level import Level

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from photonpano.capture import Capture, capture_of
 from photonpano.corrections import without_still_pixels
-from photonpano.motion.attributed_source import attributed
 from photonpano.pipeline.components import require_suitable, with_corrections
 from photonpano.protocols import Source
-from photonpano.source_wrapper import SourceWrapper, capabilities_of, with_capabilities
 from photonpano.specs.plan import Plan
 from photonpano.values import BoolArray
 
@@ -24,7 +23,7 @@ class ArrivedFrames:
         self._valid: BoolArray | None = None
         self._found_at = 0
 
-    def of(self, arrived: Source, promised: int | None) -> Source:
+    def of(self, arrived: Source, promised: int | None) -> Capture:
         """Return a capture with its corrections.
 
         Raises:
@@ -32,7 +31,7 @@ class ArrivedFrames:
             PluginError: the source broke its contract.
             SpecError: a stage does not suit it.
         """
-        source = with_corrections(self._plan, attributed(arrived, self._plan.source.label))
+        source = with_corrections(self._plan, capture_of(arrived, self._plan.source.label))
         if not self._found_at:
             require_suitable(self._plan, source, replace(source.info, n_frames=promised or _LONG))
             self._found_at = 1
@@ -40,17 +39,4 @@ class ArrivedFrames:
             return source
         if self._valid is None or source.info.n_frames >= 2 * self._found_at:
             self._valid, self._found_at = without_still_pixels(source).valid, source.info.n_frames
-        return with_capabilities(_Masked, capabilities_of(source))(source, self._valid)
-
-
-class _Masked(SourceWrapper):
-    """A capture with another mask."""
-
-    def __init__(self, wrapped: Source, valid: BoolArray) -> None:
-        super().__init__(wrapped)
-        self._valid = valid
-
-    @property
-    def valid(self) -> BoolArray:
-        """(H, W) mask."""
-        return self._valid
+        return replace(source, valid=self._valid)

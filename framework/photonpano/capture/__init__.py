@@ -1,0 +1,21 @@
+"""One record of a capture as a run sees it: what its source gives, and what was found about it."""
+
+from photonpano.capture.capture import Capture, Colours
+from photonpano.capture.door import capture_of, in_light, part_of, seen_through
+from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, numbered
+from photonpano.capture.plugin_source import PluginSource
+
+__all__ = [
+    "MISSING",
+    "Capture",
+    "Colours",
+    "Gather",
+    "Index",
+    "LinearCorrection",
+    "PluginSource",
+    "capture_of",
+    "in_light",
+    "numbered",
+    "part_of",
+    "seen_through",
+]

@@ -1,0 +1,202 @@
+"""The record of a capture: what its source gives, and what was found about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.capture.pixels import Gather
+from photonpano.values import BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
+
+if TYPE_CHECKING:
+    from photonpano.capture.plugin_source import PluginSource
+    from photonpano.geometry import Camera
+    from photonpano.values import FloatArray, Response
+
+_PER_FRAME = ("homographies", "rotations", "camera_from_world", "light", "taken")  # arrays of a truth, one entry a frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Colours:
+    """The colours of a capture behind a filter array.
+
+    Attributes:
+        parts: a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order:
+            the same frames, in which only the pixels behind filters of this colour are valid.
+        clear_mix: (3,) the flux of a clear pixel is the sum of these factors times the flux of red, green and blue ones.
+    """
+
+    parts: Mapping[str, Capture]
+    clear_mix: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """A capture as components see it. It is a `photonpano.Source`; methods may be called from several threads at once.
+
+    A correction, a light, a camera or a part makes another record, with `dataclasses.replace`. A capture in colour is grey by
+    itself: motion is estimated from the grey capture, and the panorama is rendered from those of `colours()`.
+
+    It can be pickled for another process, where the source is opened anew: see `photonpano.execution`.
+
+    Attributes:
+        source: the source as its plugin gives it.
+        info: frames, size, rate; of the frames as they are seen here.
+        valid: (H, W) mask, False for pixels that must not be used.
+        first: the frame of the source that is frame 0 here.
+        gather: rearranges the pixels of frames; None for frames as they are read.
+        steps: take everything but the flux out of sums of frames, one after the other.
+        weight: (H, W) float32, not negative: how many frames of an ordinary pixel a frame of each pixel is worth; None for 1.
+            Ordinary is the best pixel behind a filter, and a pixel of gain 1 of a sensor whose pixels differ in gain.
+        light: the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
+        camera: frames are warped through its lens, and homographies map ideal pixels; None if it is not known.
+        colour: what the filters of a filter array show; None for a grey capture.
+        decisions: what was decided because of what the frames show.
+    """
+
+    source: PluginSource
+    info: StreamInfo
+    valid: BoolArray
+    first: int = 0
+    gather: Gather | None = None
+    steps: tuple[Callable[[Any, int], FluxImage], ...] = ()
+    weight: FluxImage | None = None
+    light: Light | None = None
+    camera: Camera | None = None
+    colour: Colours | None = None
+    decisions: tuple[Decision, ...] = ()
+
+    @property
+    def response(self) -> Response:
+        """How flux becomes counts."""
+        return self.source.response
+
+    @property
+    def is_packed(self) -> bool:
+        """Whether the source gives packed frames, so that `packed` costs little."""
+        return self.source.offers("packed")
+
+    @property
+    def corrects_sums(self) -> bool:
+        """Whether sums of frames contain more than the flux, such as dark counts."""
+        return bool(self.steps)
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        counts: Counts = self._gathered(self.source.counts(self._read(span)))
+        return counts
+
+    def chunks(self, spans: Iterable[FrameSpan]) -> Iterator[Counts]:
+        """Yield the sum of the frames of each span: (H, W) uint32. Reads a span when its sum is asked for."""
+        return map(self.counts, spans)
+
+    def frames(self, span: FrameSpan) -> Frames:
+        """Return the frames of a span one by one: (n, H, W)."""
+        frames: Frames = self._gathered(self.source.frames(self._read(span)))
+        return frames
+
+    def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the binary frames of a span, eight pixels to a byte, as `numpy.packbits` does: (n, H, ceil(W / 8))."""
+        if self.is_packed and self.gather is None:
+            return self.source.packed(self._read(span))
+        return np.packbits(self.frames(span), axis=-1)
+
+    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
+        """Correct a sum of frames, so that on average it is the sum of frames of the flux alone.
+
+        The correction is linear, so that the average is right; the result may be negative.
+
+        Args:
+            counts: (H, W), from `counts`.
+            n_frames: number of frames in the sum.
+
+        Returns:
+            (H, W) float32; `counts` itself, uint32, if there is nothing to correct.
+        """
+        summed: Any = counts
+        for step in self.steps:
+            summed = step(summed, n_frames)
+        corrected: FluxImage = summed
+        return corrected
+
+    def corrected_counts(self, span: FrameSpan) -> FluxImage:
+        """Return the corrected sum of the frames of a span: see `corrected`."""
+        return self.corrected(self.counts(span), len(span))
+
+    def weights(self) -> FluxImage:
+        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32."""
+        return np.ones(self.info.frame_shape, np.float32) if self.weight is None else self.weight
+
+    def colours(self) -> Mapping[str, Capture]:
+        """Return a capture for each colour, see `Colours`; none for a grey capture."""
+        parts = {} if self.colour is None else self.colour.parts
+        seen = {"info": self.info, "first": self.first, "light": self.light, "camera": self.camera}
+        return {name: replace(part, **seen) for name, part in parts.items()}  # type: ignore[arg-type]  # mixed values
+
+    def clear_mix(self) -> FloatArray:
+        """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
+        return np.ones(3) if self.colour is None else self.colour.clear_mix
+
+    def truth(self) -> Mapping[str, NDArray[np.generic]] | None:
+        """Return the ground truth of a simulated capture, see `photonpano.KnowsTruth`; None if it is not known."""
+        if not self._offers("truth"):
+            return None
+        truth = self.source.truth()
+        frames = slice(self.first, self.first + self.info.n_frames)
+        return {**truth, **{name: truth[name][frames] for name in _PER_FRAME if name in truth and self._is_part}}
+
+    @property
+    def has_sharp_views(self) -> bool:
+        """Whether `sharp_view` returns frames without noise."""
+        return self._offers("sharp_view")
+
+    def sharp_view(self, frame: int) -> FluxImage:
+        """Return the flux of a frame of a simulated capture without noise, see `photonpano.KnowsSharpViews`.
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        return self.source.sharp_view(self._read(FrameSpan(frame, frame + 1)).start)
+
+    def close(self) -> None:
+        """Close the source; it is not used afterwards."""
+        self.source.close()
+
+    def __enter__(self) -> Capture:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    @property
+    def _is_part(self) -> bool:
+        return self.info.n_frames != self.source.info.n_frames
+
+    def _read(self, span: FrameSpan) -> FrameSpan:
+        """Return the frames of the source that are a span of this capture."""
+        if not self._is_part:
+            return span
+        self.info.require(span)
+        return FrameSpan(self.first + span.start, self.first + span.stop)
+
+    def _gathered(self, frames: Any) -> Any:
+        return frames if self.gather is None else self.gather(frames)
+
+    def _offers(self, member: str) -> bool:
+        """Return whether a member that only some sources have applies here: `isinstance` with their protocols asks."""
+        offered = {
+            "packed": self.is_packed,
+            "corrected": self.corrects_sums,
+            "weights": self.weight is not None,
+            "colours": self.colour is not None,
+            "clear_mix": self.colour is not None,
+            "light": self.light is not None,
+            "camera": self.camera is not None,
+            "truth": self.gather is None and self.source.offers("truth"),
+            "sharp_view": self.gather is None and self.colour is None and self.source.offers("sharp_view"),
+        }
+        return offered[member]
