@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 from photonpano.context import Context
 from photonpano.geometry import corners, steps_px
 from photonpano.protocols import LinearlyCorrectedSource, Source
-from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
+from photonpano.residuals.block_sums import (
+    BLOCK_PX,
+    GX_R,
+    GXX,
+    GXY,
+    GY_R,
+    GYY,
+    N_SUMS,
+    add_block_sums,
+    add_pixel_sums,
+    fold,
+    n_blocks,
+)
 from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
@@ -99,6 +111,19 @@ class Residuals:
         covariance = np.linalg.inv(information)
         solved = np.einsum("sij,sj->si", covariance, self.gradient)
         return solved[:, N_STEPS], np.sqrt(covariance[:, N_STEPS, N_STEPS])
+
+    def block_shifts(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean shift of each block of the sensor against the panorama, and its information.
+
+        Returns:
+            (h, w, 2) in px, and (h, w, 2, 2) inverse covariances by photon noise, 0 where a block carries no shift.
+        """
+        information = np.stack([self.blocks[..., [GXX, GXY]], self.blocks[..., [GXY, GYY]]], axis=-2)
+        right = self.blocks[..., [GX_R, GY_R]]
+        determined = np.linalg.det(information) > 1e-6 * np.trace(information, axis1=-2, axis2=-1) ** 2
+        information = np.where(determined[..., None, None], information, 0)
+        field = np.linalg.solve(np.where(determined[..., None, None], information, np.eye(2)), right[..., None])[..., 0]
+        return np.where(determined[..., None], field, 0), information
 
 
 def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Residuals:
