@@ -22,6 +22,7 @@ from photonpano.residuals.block_sums import (
     GY_R,
     GYY,
     N_SUMS,
+    Totals,
     add_block_sums,
     add_pixel_sums,
     fold,
@@ -148,11 +149,11 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
         homographies = np.add.reduceat(gain[:, None, None] * of_frames, starts) / np.add.reduceat(gain, starts)[:, None, None]
     batches = [slice(first, first + _BATCH) for first in range(0, len(spans), _BATCH)]
     work = partial(_measured, predictions, spans, homographies)
-    total: _Batch | None = None
+    total: Totals | None = None
     results: list[tuple[FloatArray, ...]] = []
     with context.progress.stage("residuals", len(span), "frames") as advance:
-        for batch, part in zip(batches, context.in_order(work, batches), strict=True):
-            results.append((part.normal, part.gradient, part.misfit))
+        for batch, (of_spans, part) in zip(batches, context.in_order(work, batches), strict=True):
+            results.append(of_spans)
             total = part if total is None else total.plus(part)
             advance(sum(map(len, spans[batch])))
     assert total is not None
@@ -226,39 +227,6 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Batch:
-    """The sums of some spans; see `Residuals`. The counts are numbers of blocks."""
-
-    normal: FloatArray
-    gradient: FloatArray
-    misfit: FloatArray
-    blocks: FloatArray
-    block_misfit: FloatArray
-    block_count: FloatArray
-    pixel_residual: FluxImage
-    pixel_mean: FluxImage
-    cell_misfit: FloatArray
-    cell_count: FloatArray
-    cell_noise: FloatArray
-
-    def plus(self, other: _Batch) -> _Batch:
-        """Return the sums over both; `normal`, `gradient` and `misfit` are kept apart, and not used here."""
-        return _Batch(
-            self.normal,
-            self.gradient,
-            self.misfit,
-            self.blocks + other.blocks,
-            self.block_misfit + other.block_misfit,
-            self.block_count + other.block_count,
-            self.pixel_residual + other.pixel_residual,
-            self.pixel_mean + other.pixel_mean,
-            self.cell_misfit + other.cell_misfit,
-            self.cell_count + other.cell_count,
-            self.cell_noise + other.cell_noise,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Colour:
     """What is compared in one colour of the capture.
 
@@ -307,10 +275,13 @@ class _Colour:
         return np.asarray(np.maximum(self.slope**2 * lit * (1 - lit) - mean * (1 - mean), 0), np.float32)
 
 
-def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice) -> _Batch:
+def _measured(
+    predictions: Predictions, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice
+) -> tuple[tuple[FloatArray, FloatArray, FloatArray], Totals]:
+    """Return the equations and the reduced chi-square of a batch of spans, and the sums over them."""
     first = predictions.first
     shape = first.frame_shape
-    grid, cells = n_blocks(shape), n_blocks(first.canvas.shape)
+    grid = n_blocks(shape)
     spans, homographies = spans[batch], homographies[batch]
     height, width = shape
     row, column = np.mgrid[: grid[0], : grid[1]]
@@ -318,19 +289,8 @@ def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies
     lever = middle - corners(shape).mean(axis=0)
     colours = [_Colour.of(source, prediction) for source, prediction in predictions.parts]
     source = colours[0].source
-    total = _Batch(
-        np.zeros((len(spans), 5, 5)),
-        np.zeros((len(spans), 5)),
-        np.zeros(len(spans)),
-        np.zeros((*grid, N_SUMS)),
-        np.zeros(grid),
-        np.zeros(grid),
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros(cells),
-        np.zeros(cells),
-        np.zeros(cells),
-    )
+    normal, gradient, misfit = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
+    total = Totals.zeros(shape, first.canvas.shape)
     # A pixel adds to the image of its colour, which fewer frames have seen.
     frames_seen = max(predictions.frames_seen / len(colours), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
@@ -345,21 +305,9 @@ def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies
                 add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
-        total.misfit[index] = fold(
-            sums,
-            lever,
-            *first.cells(homography, middle),
-            1 - own,
-            total.normal[index],
-            total.gradient[index],
-            total.blocks,
-            total.block_misfit,
-            total.block_count,
-            total.cell_misfit,
-            total.cell_count,
-            total.cell_noise,
-        )
-    return total
+        cells = first.cells(homography, middle)
+        misfit[index] = fold(sums, lever, *cells, 1 - own, normal[index], gradient[index], total)
+    return (normal, gradient, misfit), total
 
 
 def _middles(index: np.ndarray, length: int) -> FloatArray:
