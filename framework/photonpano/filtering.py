@@ -9,15 +9,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from photonpano.values import FloatArray
 
-WINDOW = 128
-"""Longest window of the spectra, in steps: a tremor may change from one window to the next."""
+WINDOW = 128  # longest window of the spectra, in steps: a tremor may change from one window to the next
+# A frequency is kept if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies.
 SIGNIFICANT = 3.0
-"""A frequency is kept if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies."""
+# Steps are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel.
 SYSTEMATIC_PX = 0.015
-"""Steps are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
+# Number of the lowest frequencies of a window that must exceed an error of a size, too, and this size in px: what steps are
+# measured against follows a slow motion, and is no better itself.
 SLOW = 2, 0.04
-"""Number of the lowest frequencies of a window that must exceed an error of a size, too, and this size in px: what steps are
-measured against follows a slow motion, and is no better itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,23 +18,18 @@ from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
 
-_PLACES = 12
-"""The speed is measured at 12 places, evenly spaced over the capture."""
+_PLACES = 12  # the speed is measured at 12 places, evenly spaced over the capture
+# Lengths of the spans that are summed, in frames, from the shortest to the longest that is tried.
 _SPANS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-"""Lengths of the spans that are summed, in frames, from the shortest to the longest that is tried."""
-_SHORTEST = {"binary": 4, "intensity": 1}
-"""The shortest span, in frames: sums of fewer binary frames are mostly noise."""
-_SPANS_IN_CAPTURE = 6
-"""A span is at most a sixth of the capture."""
-_LARGE_SHIFT_PX = 2.0
-"""Stop lengthening the span once the shift is at least 2 binned pixels."""
-_PEAK_PX = 1.5
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_SHORTEST = {"binary": 4, "intensity": 1}  # the shortest span, in frames: sums of fewer binary frames are mostly noise
+_SPANS_IN_CAPTURE = 6  # a span is at most a sixth of the capture
+_LARGE_SHIFT_PX = 2.0  # stop lengthening the span once the shift is at least 2 binned pixels
+_PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
+# The three shifts of a place agree within 1.5 binned pixels. Shifts of pure noise agree by chance at fewer than 1 in 100
+# places.
 _TOLERANCE_PX = 1.5
-"""The three shifts of a place agree within 1.5 binned pixels. Shifts of pure noise agree by chance at fewer than 1 in 100
-places."""
+# To find a capture without light, or a saturated one, 16 frames at each of 16 places are summed.
 _CHECKED_PLACES, _CHECKED_FRAMES = 16, 16
-"""To find a capture without light, or a saturated one, 16 frames at each of 16 places are summed."""
 
 
 @dataclass(frozen=True, slots=True)

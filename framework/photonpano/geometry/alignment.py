@@ -9,12 +9,11 @@ from photonpano.geometry.rotations import nearest_rotations
 from photonpano.geometry.steps import unit_coordinates
 from photonpano.values import FloatArray, Homography
 
+# Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
+# gives eight equations.
 FIT_FRAMES = 300
-"""Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
-gives eight equations."""
 
-_FAR_PX = 1e6
-"""Residual of points mapped to infinity."""
+_FAR_PX = 1e6  # residual of points mapped to infinity
 
 
 def align_planes(

@@ -11,10 +11,9 @@ from photonpano.geometry.homographies import BLOCK_FRAMES, apply, corners, resca
 from photonpano.geometry.projections import PROJECTIONS, Projection
 from photonpano.values import FloatArray, Homography
 
+# x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1.
 Box: TypeAlias = tuple[int, int, int, int]
-"""x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1."""
-Extent: TypeAlias = Literal["panorama", "reference"] | Box
-"""What a canvas holds: every frame, the reference frame, or a box."""
+Extent: TypeAlias = Literal["panorama", "reference"] | Box  # what a canvas holds: every frame, the reference frame, or a box
 
 
 @dataclass(frozen=True, slots=True, eq=False)

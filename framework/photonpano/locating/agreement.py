@@ -9,18 +9,14 @@ from scipy.special import bdtrc
 from photonpano.geometry import Camera, apply, nearest_rotations
 from photonpano.values import BoolArray, FloatArray, Homography
 
+# Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are.
 _MOST_PAIRS = 5000
-"""Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are."""
-_MOST_SCORED = 500_000
-"""Rotations are scored until they have mapped this many points."""
-_BASELINE = 10.0
-"""Two matches determine a rotation if they are further apart than this, in units of the threshold."""
-_ROUNDS = 3
-"""How often the best rotation is fitted to the matches that agree with it."""
+_MOST_SCORED = 500_000  # rotations are scored until they have mapped this many points
+_BASELINE = 10.0  # two matches determine a rotation if they are further apart than this, in units of the threshold
+_ROUNDS = 3  # how often the best rotation is fitted to the matches that agree with it
+# Expected number of rotations, of all that two matches determine, on which as many matches agree by chance.
 _FALSE_ALARMS = 1e-4
-"""Expected number of rotations, of all that two matches determine, on which as many matches agree by chance."""
-_FAR_PX = 1e6
-"""Points that are mapped further away are taken to lie there."""
+_FAR_PX = 1e6  # points that are mapped further away are taken to lie there
 
 
 def distinct(moving: FloatArray, fixed: FloatArray, threshold_px: float) -> BoolArray:

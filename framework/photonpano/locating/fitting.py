@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
 from photonpano.values import FloatArray, Homography
 
+# Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error.
 REWEIGHTINGS = 4
-"""Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error."""
+# Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance.
 MIN_NOISE_PX = 0.02
-"""Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

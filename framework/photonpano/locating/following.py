@@ -10,25 +10,18 @@ from numpy.typing import NDArray
 
 from photonpano.values import BoolArray
 
-_SIDE_PX = 7
-"""Side of the square in which two images are compared, px."""
+_SIDE_PX = 7  # side of the square in which two images are compared, px
+# Least variance of the difference of two aligned images, relative to the sum of their variances, where they show different
+# things; it is 0 for the same thing and 1 for unrelated ones.
 _DIFFERENT = 0.5
-"""Least variance of the difference of two aligned images, relative to the sum of their variances, where they show different
-things; it is 0 for the same thing and 1 for unrelated ones."""
-_SURE = 4.0
-"""Standard errors by which the variances must exceed those of noise."""
-_ALIKE = 0.25
-"""Largest such difference of a part that is aligned by itself."""
-_BORDER_PX = 2
-"""Width of the border around what moves otherwise in which a little of it may be seen, px."""
-_REST_PX = 4.0
-"""Standard deviation of the Gaussian that smooths the weights of what does not follow, px."""
-_SUSPECT = 0.12
-"""Mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less."""
+_SURE = 4.0  # standard errors by which the variances must exceed those of noise
+_ALIKE = 0.25  # largest such difference of a part that is aligned by itself
+_BORDER_PX = 2  # width of the border around what moves otherwise in which a little of it may be seen, px
+_REST_PX = 4.0  # standard deviation of the Gaussian that smooths the weights of what does not follow, px
+_SUSPECT = 0.12  # mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less
+# Share of the image from which on a part that shows something different may move otherwise: noise leaves no such part.
 _SUSPECT_SHARE = 0.03
-"""Share of the image from which on a part that shows something different may move otherwise: noise leaves no such part."""
-_CLEARLY = 0.5
-"""A pixel clearly follows the motion that leaves less than half of the difference of another one."""
+_CLEARLY = 0.5  # a pixel clearly follows the motion that leaves less than half of the difference of another one
 
 
 class Follows(NamedTuple):

@@ -16,14 +16,12 @@ from photonpano.locating.points import Matches
 from photonpano.locating.turns import information_on_turn, turn_slopes
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated
 
-_SCATTER = 2.0
-"""Keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`."""
+_SCATTER = 2.0  # keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`
 _LEAST_SHARE = 0.2
+# Objects that look alike match and agree with each other in different scenes as well. So this share of the matches must agree,
+# and they must be spread: in all directions, their standard deviation is at least this share of the shorter side of the image.
 _LEAST_SPREAD = 0.1
-"""Objects that look alike match and agree with each other in different scenes as well. So this share of the matches must agree,
-and they must be spread: in all directions, their standard deviation is at least this share of the shorter side of the image."""
-_ITERATIONS = 10
-"""Steps of reweighted least squares; the last ones change the rotation by far less than its error."""
+_ITERATIONS = 10  # steps of reweighted least squares; the last ones change the rotation by far less than its error
 
 
 def turn_of(

@@ -9,8 +9,8 @@ import numpy as np
 from photonpano.geometry import ROTATION_AXES, corners, jacobian, parameters
 from photonpano.values import FloatArray, Homography
 
+# Expected error of a corner in the directions that a turn does not reach, in sides of the image: as good as unknown.
 _UNKNOWN = 1.0
-"""Expected error of a corner in the directions that a turn does not reach, in sides of the image: as good as unknown."""
 
 
 class TurnInformation(NamedTuple):

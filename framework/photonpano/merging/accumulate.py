@@ -20,12 +20,9 @@ from photonpano.protocols import LinearlyCorrectedSource, Source, WeightedSource
 from photonpano.threads import InOrder
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
-_RUN = 64
-"""Chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded."""
-_BLOCK = 4096
-"""Chunks whose footprints are known at a time."""
-MIN_WEIGHT = 1.0
-"""Pixels with less weight than this, in frames, are unknown."""
+_RUN = 64  # chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded
+_BLOCK = 4096  # chunks whose footprints are known at a time
+MIN_WEIGHT = 1.0  # pixels with less weight than this, in frames, are unknown
 
 _Visible = Sequence[tuple[Chunk, Footprint | BentFootprint]]
 

@@ -14,10 +14,9 @@ from photonpano.merging.footprints import footprints_of
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
-_INSTANTS = 512
-"""Largest number of instants at which the places of frames on the canvas are looked at."""
+_INSTANTS = 512  # largest number of instants at which the places of frames on the canvas are looked at
+# The average of a pixel counts as much as this many instants, so that a pixel that few instants show is near it.
 _EXPECTED = 2.0
-"""The average of a pixel counts as much as this many instants, so that a pixel that few instants show is near it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,15 +17,13 @@ from photonpano.geometry import Camera, Canvas, corners, outline_of, rescaling
 from photonpano.merging.warping import average_squares
 from photonpano.values import FloatArray, FluxImage, Homography
 
-_NEAR_POLE = np.radians(75)
-"""A frame that comes this near to a pole may touch any column."""
-_WIDEST = 100.0
-"""Largest radius, in focal lengths, that a lens images."""
+_NEAR_POLE = np.radians(75)  # a frame that comes this near to a pole may touch any column
+_WIDEST = 100.0  # largest radius, in focal lengths, that a lens images
+# Zeros before and after the rows and columns of an image that is warped, so that it is interpolated at its border as well.
 _PADDING = 1, 2
-"""Zeros before and after the rows and columns of an image that is warped, so that it is interpolated at its border as well."""
 
+# p and s of the columns of a grid, q and r of its rows: see `Canvas`.
 Rays: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""p and s of the columns of a grid, q and r of its rows: see `Canvas`."""
 
 
 class Lens(NamedTuple):

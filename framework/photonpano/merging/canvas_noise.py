@@ -15,16 +15,11 @@ from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range,
 from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, Source, Trajectory, WeightedSource, camera_of
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
-_INSTANTS = 64
-"""Largest number of instants at which the corrections of the sensor are laid on the canvas."""
-_LARGEST_PX = 1024
-"""Longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels."""
-_BLOCK = 2**18
-"""Values of a tile that are looked at at once."""
-_EVEN = 1e-4
-"""Corrections that differ by less than this are one number."""
-_RGB = 3
-"""Colours of a panorama; clear pixels, which come last, are none."""
+_INSTANTS = 64  # largest number of instants at which the corrections of the sensor are laid on the canvas
+_LARGEST_PX = 1024  # longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels
+_BLOCK = 2**18  # values of a tile that are looked at at once
+_EVEN = 1e-4  # corrections that differ by less than this are one number
+_RGB = 3  # colours of a panorama; clear pixels, which come last, are none
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,14 +24,13 @@ from photonpano.geometry import (
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, FrameSpan
 
-BYTES_PER_PIXEL = 40
-"""Peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests."""
+BYTES_PER_PIXEL = 40  # peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests
+# A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time.
 MAX_EXCESS = 16
-"""A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time."""
+# Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused.
 _PLANAR_DEGREES, _WIDEST_PLANE_DEGREES = 90, 100
-"""Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused."""
+# Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused.
 _CYLINDER_DEGREES, _TALLEST_CYLINDER_DEGREES = 45, 80
-"""Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused."""
 _TURN = 360
 
 

@@ -12,16 +12,13 @@ from photonpano.merging.shared_detail import noise_of_a_frame, with_shared_detai
 from photonpano.protocols import ColouredSource, Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
+# The colours of a panorama, in the order of its third axis; the images of a filter array may have a fourth one, clear.
 COLOURS = ("red", "green", "blue")
-"""The colours of a panorama, in the order of its third axis; the images of a filter array may have a fourth one, clear."""
+# A colour is thin where it was seen in less than this part of the frames that are its due; its neighbours count there, too.
 _THIN = 0.1
-"""A colour is thin where it was seen in less than this part of the frames that are its due; its neighbours count there, too."""
-_ENOUGH = 0.2
-"""A neighbourhood is large enough if each colour has this part of its share of the frames in it."""
-_LARGEST = 8
-"""Neighbourhoods are doubled at most this many times."""
-_ROUNDS = 3
-"""Times that the sum of the colours, and their ratios to it, follow from each other."""
+_ENOUGH = 0.2  # a neighbourhood is large enough if each colour has this part of its share of the frames in it
+_LARGEST = 8  # neighbourhoods are doubled at most this many times
+_ROUNDS = 3  # times that the sum of the colours, and their ratios to it, follow from each other
 
 
 def in_colours(source: Source, render: Callable[[Source], Panorama]) -> Panorama:

@@ -9,8 +9,7 @@ import numpy as np
 from photonpano.geometry import apply, corners, inverse, rescaling
 from photonpano.values import FloatArray, Homography
 
-_LONG_RUN_PX = 96
-"""From this length of runs on, the compiled warp along runs is faster than OpenCV's warp, pixel by pixel."""
+_LONG_RUN_PX = 96  # from this length of runs on, the compiled warp along runs is faster than OpenCV's warp, pixel by pixel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

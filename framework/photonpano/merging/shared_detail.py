@@ -7,12 +7,9 @@ import numpy as np
 
 from photonpano.values import FluxImage, Response
 
-_RATIO_PX = 1.5
-"""Standard deviation of the Gaussian over which the ratio of a colour to the sum of all is averaged."""
-_WINDOW_PX = 1.5
-"""Standard deviation of the Gaussian over which the detail of a colour's own is measured."""
-_RELATIVE_STEP = 0.02
-"""Relative step of numerical derivatives."""
+_RATIO_PX = 1.5  # standard deviation of the Gaussian over which the ratio of a colour to the sum of all is averaged
+_WINDOW_PX = 1.5  # standard deviation of the Gaussian over which the detail of a colour's own is measured
+_RELATIVE_STEP = 0.02  # relative step of numerical derivatives
 _MANY_FRAMES = 1e4
 _FEWEST_FRAMES = 1e-3
 

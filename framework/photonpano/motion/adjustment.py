@@ -17,24 +17,17 @@ from photonpano.geometry import apply, corners, from_parameters, generators, inv
 from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
-CONVERGED_PX = 1e-3
-"""A step that moves no corner by more than about this has converged."""
-MAX_HALVINGS = 8
-"""A step that raises the cost is halved up to this many times."""
-NO_WORSE = 1e-6
-"""Rounding errors may raise the cost by this share."""
+CONVERGED_PX = 1e-3  # a step that moves no corner by more than about this has converged
+MAX_HALVINGS = 8  # a step that raises the cost is halved up to this many times
+NO_WORSE = 1e-6  # rounding errors may raise the cost by this share
+# Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise).
 CAUCHY = 2.385
-"""Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise)."""
-OUTLIER = 8.0
-"""An edge whose residual exceeds this many scales is an outlier."""
-MEDIAN_NORM = 0.958
-"""The median of the root mean square of eight Gaussian numbers of unit variance."""
+OUTLIER = 8.0  # an edge whose residual exceeds this many scales is an outlier
+MEDIAN_NORM = 0.958  # the median of the root mean square of eight Gaussian numbers of unit variance
+# Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by.
 _DAMPING, _TINY = 1e-10, 1e-200
-"""Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by."""
-SAMPLES = 64
-"""Solutions drawn to estimate the expected error of each node, to a few per cent."""
-_DRAWN_ROWS = 8192
-"""Equations that are drawn at a time."""
+SAMPLES = 64  # solutions drawn to estimate the expected error of each node, to a few per cent
+_DRAWN_ROWS = 8192  # equations that are drawn at a time
 
 StateT = TypeVar("StateT")
 

@@ -15,20 +15,17 @@ from photonpano.motion.pairs import instants_of, lengths_of
 from photonpano.photometry import noise_free_correlation
 from photonpano.values import FloatArray, FluxImage, Group, VirtualExposure
 
+# Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5.
 MIN_SIMILARITY = 0.7
-"""Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5."""
-_GRID = 8
-"""The overlap of two fields of view is counted on a grid of this many points along each axis."""
-_MIN_SKIP = 2.0
-"""The exposures of a loop closure are at least this many times as far apart in time as the longest skip."""
+_GRID = 8  # the overlap of two fields of view is counted on a grid of this many points along each axis
+_MIN_SKIP = 2.0  # the exposures of a loop closure are at least this many times as far apart in time as the longest skip
+# Between two visits of a place the overlap falls by at least this share, two columns of the grid; a tremor does not count.
 _PROMINENCE = 0.25
-"""Between two visits of a place the overlap falls by at least this share, two columns of the grid; a tremor does not count."""
-_MAX_CLOSURES = 3
-"""Most loop closures of an exposure with earlier ones; those of the largest overlap are taken."""
+_MAX_CLOSURES = 3  # most loop closures of an exposure with earlier ones; those of the largest overlap are taken
+# Most exposures of a level with loop closures to earlier ones, spread over the capture. Neighbours tie the others to them.
 _MAX_EXPOSURES = 64
-"""Most exposures of a level with loop closures to earlier ones, spread over the capture. Neighbours tie the others to them."""
+# Exposures are compared by averages of blocks of this side, px: these have less noise, and hide differences of motion blur.
 _BLOCK = 4
-"""Exposures are compared by averages of blocks of this side, px: these have less noise, and hide differences of motion blur."""
 
 
 def closure_candidates(

@@ -19,9 +19,9 @@ from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.motion.rotation_graph import RotationAdjustment, Turns
 from photonpano.values import BoolArray, Edge, FloatArray, Located
 
+# A camera only turns if five unknowns more for each exposure lower the squared residuals by less than this for each of them, in
+# units of those that remain. Noise alone lowers them by 1, and noise that pairs have in common by some more.
 _EXPLAINED = 20.0
-"""A camera only turns if five unknowns more for each exposure lower the squared residuals by less than this for each of them,
-in units of those that remain. Noise alone lowers them by 1, and noise that pairs have in common by some more."""
 
 
 class GraphOptions(Protocol):

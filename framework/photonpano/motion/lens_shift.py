@@ -9,8 +9,7 @@ import numpy as np
 from photonpano.geometry import Camera, apply, corners, generators, slopes
 from photonpano.values import BoolArray, FloatArray
 
-_GRID = 7
-"""Points of a frame along each axis to which a homography is fitted."""
+_GRID = 7  # points of a frame along each axis to which a homography is fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,16 +13,12 @@ from photonpano.motion.adjustment import Adjustment
 from photonpano.motion.lens_shift import LensShift
 from photonpano.values import FloatArray, Located
 
-_FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)
-"""Focal lengths that are tried first, in sides of a frame."""
+_FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # focal lengths that are tried first, in sides of a frame
+# What is known of the focal length before: its logarithm is that of 3 sides of a frame, give or take 2.
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
-"""What is known of the focal length before: its logarithm is that of 3 sides of a frame, give or take 2."""
-_PRIOR_DISTORTION = 1.0
-"""What is known of the lens before: it moves the corners of a frame by up to about its half diagonal."""
-_STEP = 1e-5
-"""Change of an unknown by which derivatives are taken."""
-_MOST_TRIED = 400
-"""Edges by which the first focal length is chosen."""
+_PRIOR_DISTORTION = 1.0  # what is known of the lens before: it moves the corners of a frame by up to about its half diagonal
+_STEP = 1e-5  # change of an unknown by which derivatives are taken
+_MOST_TRIED = 400  # edges by which the first focal length is chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,34 +22,22 @@ from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FrameSpan, Group
 
-_SPANS = 16
-"""A window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur."""
-_SHORTEST = {"binary": 4, "intensity": 1}
-"""Frames of the shortest span: sums of fewer binary frames are mostly noise."""
-_PEAK_PX = 1.0
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_SPANS = 16  # a window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur
+_SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of fewer binary frames are mostly noise
+_PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
+# Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
 _SIGNIFICANT = 7.0
-"""Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5."""
-_STD_PER_MEDIAN = 1.4826
-"""Standard deviation of Gaussian numbers over the median of their magnitudes."""
-_RIVAL = 0.6
-"""Peaks of at least this share of the highest one are kept as hypotheses."""
-_LEAST_EXTENT = 0.05
-"""A part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's."""
-_DISTINCT_PX = 4.0
-"""Two motions are told apart if they differ by this many binned pixels over a window."""
+_STD_PER_MEDIAN = 1.4826  # standard deviation of Gaussian numbers over the median of their magnitudes
+_RIVAL = 0.6  # peaks of at least this share of the highest one are kept as hypotheses
+_LEAST_EXTENT = 0.05  # a part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's
+_DISTINCT_PX = 4.0  # two motions are told apart if they differ by this many binned pixels over a window
+# Spans are doubled until the image moves by this many binned pixels from one to the next, which determines the speed.
 _EXACT_PX = 4.0
-"""Spans are doubled until the image moves by this many binned pixels from one to the next, which determines the speed."""
-_TRACKED_PX = 2.0
-"""A peak of doubled spans lies within this many binned pixels of twice the shift of single ones."""
-_CONTINUITY_PX = 1.0
-"""Standard deviation of the change of a shift, in binned pixels, from one window to the next."""
-_CONTINUITY_SHARE = 0.3
-"""It is at most this share of the difference of two hypotheses: the motions of scene and object go on."""
-_SLOWER = 3.0
-"""A motion is taken for granted, and one that is this many times as fast is not considered."""
-_TIE = 4.0
-"""Hypotheses whose log likelihoods differ by less than this cannot be told apart."""
+_TRACKED_PX = 2.0  # a peak of doubled spans lies within this many binned pixels of twice the shift of single ones
+_CONTINUITY_PX = 1.0  # standard deviation of the change of a shift, in binned pixels, from one window to the next
+_CONTINUITY_SHARE = 0.3  # it is at most this share of the difference of two hypotheses: the motions of scene and object go on
+_SLOWER = 3.0  # a motion is taken for granted, and one that is this many times as fast is not considered
+_TIE = 4.0  # hypotheses whose log likelihoods differ by less than this cannot be told apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,10 +12,9 @@ from photonpano.motion.rotation_graph import Turns
 from photonpano.protocols import InterpolatesTurns, Interpolator, Trajectory
 from photonpano.values import FloatArray
 
+# Angle between the knots of the coarse path. Up to this angle, rotation vectors add up well enough for splines.
 _STEP_RAD = np.deg2rad(30)
-"""Angle between the knots of the coarse path. Up to this angle, rotation vectors add up well enough for splines."""
-_HOLD = 2.0
-"""Mean distances of the knots for which the coarse path goes on beyond its ends."""
+_HOLD = 2.0  # mean distances of the knots for which the coarse path goes on beyond its ends
 
 
 class TurningTrajectory:

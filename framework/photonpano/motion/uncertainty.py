@@ -12,12 +12,10 @@ from photonpano.motion.turning import TurningTrajectory
 from photonpano.protocols import Trajectory, camera_of_motion
 from photonpano.values import FloatArray
 
-_COMPARED = 1000
-"""Number of frames at which two levels are compared."""
+_COMPARED = 1000  # number of frames at which two levels are compared
+# Error after a level, as a share of the change it made: each level removes at least three quarters of the error.
 _REMAINING_SHARE = 0.25
-"""Error after a level, as a share of the change it made: each level removes at least three quarters of the error."""
-_BLUR_SHARE = 0.02
-"""Error after the first level, as a share of the motion within a group, by which its exposures are blurred."""
+_BLUR_SHARE = 0.02  # error after the first level, as a share of the motion within a group, by which its exposures are blurred
 
 
 class Uncertainty:

@@ -22,28 +22,22 @@ from photonpano.motion.velocity import Velocity, mean_shift
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FrameSpan
 
-_SPANS = 128
-"""A capture is divided into at most this many spans."""
+_SPANS = 128  # a capture is divided into at most this many spans
 _FEWEST_SPANS = 8
-_LAGS = 4
-"""Spans that are up to this many apart are compared in the search over all velocities."""
-_FASTEST = np.radians(20)
-"""Fastest turn that is considered, in radians from span to span."""
-_FASTEST_SHIFT = 8.0
-"""Fastest shift that is considered, in binned pixels from span to span."""
+_LAGS = 4  # spans that are up to this many apart are compared in the search over all velocities
+_FASTEST = np.radians(20)  # fastest turn that is considered, in radians from span to span
+_FASTEST_SHIFT = 8.0  # fastest shift that is considered, in binned pixels from span to span
+# Standard deviations of the Gaussians between whose scales structure is compared, in binned pixels. Brightness that varies over
+# longer distances is light rather than scene, and has no sharp optimum.
 _FINE, _COARSE = 1.0, 4.0
-"""Standard deviations of the Gaussians between whose scales structure is compared, in binned pixels. Brightness that varies
-over longer distances is light rather than scene, and has no sharp optimum."""
+# Steps of the search, in binned pixels between the two farthest spans that are compared, at the border of the frame.
 _STEP_PX = 1.0
-"""Steps of the search, in binned pixels between the two farthest spans that are compared, at the border of the frame."""
+# Least height of the peak, in standard deviations over all velocities: of noise alone, the highest reaches 5 to 6.5.
 _SIGNIFICANT = 8.0
-"""Least height of the peak, in standard deviations over all velocities: of noise alone, the highest reaches 5 to 6.5."""
-_STD_PER_MEDIAN = 1.4826
-"""Standard deviation of Gaussian numbers over the median of their magnitudes."""
+_STD_PER_MEDIAN = 1.4826  # standard deviation of Gaussian numbers over the median of their magnitudes
+# Contrast over its noise falls to 0.71 when windows double, if the photons of their halves do not fit together at all.
 _STEADY = 0.8
-"""Contrast over its noise falls to 0.71 when windows double, if the photons of their halves do not fit together at all."""
-_LEAST_PX = 1.0
-"""What moves by less over the whole capture, in binned pixels, stands still."""
+_LEAST_PX = 1.0  # what moves by less over the whole capture, in binned pixels, stands still
 _WITHOUT = "; if the velocity is not constant, leave out motion.start"
 
 Images = NDArray[np.float32]

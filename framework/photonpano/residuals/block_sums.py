@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, sample_run, visible_columns
 
-BLOCK_PX = 16
-"""Side of a block, px."""
+BLOCK_PX = 16  # side of a block, px
+# Sums of a block. With residual r, predicted count m, its gradient (gx, gy) along x and y, and the variance v of r: gx gx / v,
+# gx gy / v, gy gy / v, gx r / v, gy r / v, gx m / v, gy m / v, m m / v, m r / v, r, v, m.
 GXX, GXY, GYY, GX_R, GY_R, GX_M, GY_M, M_M, M_R, R, V, M = range(12)
-"""Sums of a block. With residual r, predicted count m, its gradient (gx, gy) along x and y, and the variance v of r: gx gx / v,
-gx gy / v, gy gy / v, gx r / v, gy r / v, gx m / v, gy m / v, m m / v, m r / v, r, v, m."""
 N_SUMS = 12
+# A block with a smaller variance than this, in counts squared, is left out of the misfit: it is not normally distributed.
 _FEWEST_PHOTONS = 1.0
-"""A block with a smaller variance than this, in counts squared, is left out of the misfit: it is not normally distributed."""
 
 
 def n_blocks(shape: tuple[int, ...]) -> tuple[int, int]:

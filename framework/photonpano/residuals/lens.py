@@ -11,10 +11,8 @@ from photonpano.geometry import apply, corners
 from photonpano.residuals.block_sums import BLOCK_PX
 from photonpano.values import FloatArray
 
-_INSTANTS = 64
-"""Instants of the motion at which the effect of a lens is computed."""
-_SYSTEMATIC_PX = 0.015
-"""Error of the shift of a block beside photon noise."""
+_INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
+_SYSTEMATIC_PX = 0.015  # error of the shift of a block beside photon noise
 
 
 @dataclass(frozen=True, slots=True)

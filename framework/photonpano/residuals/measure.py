@@ -31,29 +31,21 @@ from photonpano.residuals.block_sums import (
 from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
-N_STEPS = 4
-"""Steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span."""
+N_STEPS = 4  # steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span
+# Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it.
 _NOISE_PX = 0.025
-"""Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it."""
-_SHORTEST, _LONGEST = 12, 64
-"""Fewest and most frames of a span, if the motion is slow."""
-_MAX_MOTION_PX = 2.0
-"""A span is short enough that the image moves by no more than this."""
+_SHORTEST, _LONGEST = 12, 64  # fewest and most frames of a span, if the motion is slow
+_MAX_MOTION_PX = 2.0  # a span is short enough that the image moves by no more than this
+# Spans are divided where the motion jumps from one frame to the next: by this much, and this many times the usual step.
 _JUMP_PX, _JUMP_RATIO = 1.0, 5.0
-"""Spans are divided where the motion jumps from one frame to the next: by this much, and this many times the usual step."""
-_FEWEST_SPANS = 64
-"""A capture is divided into at least this many spans, if it has the frames."""
-_BATCH = 64
-"""Spans that a thread measures at a time."""
-_PIXEL_STRIDE = 4
-"""One span in 4 is added to the sums of single pixels, which no other sum needs."""
-_DARK = 1e-6
-"""Least weight of a frame in the mean motion of a span."""
-_PROBES = 8
-"""Instants at which the noise of a shift is predicted."""
+_FEWEST_SPANS = 64  # a capture is divided into at least this many spans, if it has the frames
+_BATCH = 64  # spans that a thread measures at a time
+_PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
+_DARK = 1e-6  # least weight of a frame in the mean motion of a span
+_PROBES = 8  # instants at which the noise of a shift is predicted
+# Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
+# changes by less than a factor of 10.
 _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
-"""Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
-changes by less than a factor of 10."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,16 +14,11 @@ from photonpano.protocols import ColouredSource, Source, Trajectory, camera_of, 
 from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
-_BLUR_PX = 0.7
-"""Standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture."""
-_INTERPOLATION_PX2 = 1 / 6
-"""Variance of the kernel of one linear interpolation, averaged over the fractions of a pixel."""
-_MANY_FRAMES = 1e4
-"""Frames for which the variance of a count is derived; it is then divided by them."""
-_MARGIN = 4
-"""Columns with which a full turn is continued on each side: more than the smoothing reaches."""
-_STRAIGHT_RUN_PX = 64
-"""From this length of straight runs on, the compiled interpolation is faster than OpenCV's."""
+_BLUR_PX = 0.7  # standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture
+_INTERPOLATION_PX2 = 1 / 6  # variance of the kernel of one linear interpolation, averaged over the fractions of a pixel
+_MANY_FRAMES = 1e4  # frames for which the variance of a count is derived; it is then divided by them
+_MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
+_STRAIGHT_RUN_PX = 64  # from this length of straight runs on, the compiled interpolation is faster than OpenCV's
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,14 +17,10 @@ from photonpano.photometry import tapered
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
-_PEAK_PX = 1.5
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
-_FEWEST = 6
-"""Fewer sums are not tracked."""
-DARK = 0.2
-"""Sums, and frames, with less than this share of the usual light show nothing."""
-_BLOCK = 32
-"""Sums that are tracked in one task."""
+_PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
+_FEWEST = 6  # fewer sums are not tracked
+DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
+_BLOCK = 32  # sums that are tracked in one task
 
 
 @dataclass(frozen=True, slots=True, eq=False)

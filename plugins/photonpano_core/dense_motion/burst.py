@@ -33,16 +33,11 @@ from photonpano_core.dense_motion.rescaled import rescaled
 from photonpano_core.dense_motion.sub_exposures import smoothed
 from photonpano_core.photon_mle import exposure_of
 
-_DETAIL_PX = 1.0
-"""Blur of blocks before they are compared, in px."""
-_LEVELS = 4
-"""Levels of the pyramid, each of half the size of the one before."""
-_RADIUS = 4, 2
-"""Search around the start, in px: at the coarsest level, and at each other."""
-_RESTS = 2.5
-"""A block rests if no patch agrees better elsewhere by this much, in units of the photon noise."""
-_TOLERANCE = 8.0
-"""Squared difference of a frequency that costs half of its weight, in units of its photon noise."""
+_DETAIL_PX = 1.0  # blur of blocks before they are compared, in px
+_LEVELS = 4  # levels of the pyramid, each of half the size of the one before
+_RADIUS = 4, 2  # search around the start, in px: at the coarsest level, and at each other
+_RESTS = 2.5  # a block rests if no patch agrees better elsewhere by this much, in units of the photon noise
+_TOLERANCE = 8.0  # squared difference of a frequency that costs half of its weight, in units of its photon noise
 
 
 class BurstMerger:

@@ -22,20 +22,14 @@ from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures
 from photonpano_core.dense_motion.warping import add_along
 from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
+# Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have.
 _NUMBERS = {33: 8.0, 17: 8.0, 9: 2.0, 5: 2.0, 3: 2.0}
-"""Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have."""
-_USUAL = 17
-"""Sub-exposures, at most, unless something moves fast."""
-_COMPARED = 9
-"""Sub-exposures, at most, whose differences show what moves: fewer have more light each."""
-_SAMPLED = 16
-"""Frames from which the light of a group is measured."""
-_AROUND_PX = 6
-"""Surroundings of what moves that are merged along the field as well, in px of a frame."""
-_SWEPT_PX = 6.0
-"""Way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted."""
-_MARGIN_PX = 32
-"""Surroundings of these in which flow is estimated, in px of a frame."""
+_USUAL = 17  # sub-exposures, at most, unless something moves fast
+_COMPARED = 9  # sub-exposures, at most, whose differences show what moves: fewer have more light each
+_SAMPLED = 16  # frames from which the light of a group is measured
+_AROUND_PX = 6  # surroundings of what moves that are merged along the field as well, in px of a frame
+_SWEPT_PX = 6.0  # way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted
+_MARGIN_PX = 32  # surroundings of these in which flow is estimated, in px of a frame
 
 
 class LocalFlowMerger:

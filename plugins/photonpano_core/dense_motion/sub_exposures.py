@@ -19,24 +19,16 @@ from photonpano_core.dense_motion.frames import WeightedFrames
 from photonpano_core.dense_motion.warping import add_along, mean_of_seen
 from photonpano_core.photon_mle import to_exposure
 
-SCALE = 0.5
-"""Pixels of the grid per pixel of a frame."""
-_TOLERANCE_PX = 1.5
-"""Motion within which frames are summed before they are warped, in px of a frame."""
-_PLACES = 5
-"""Places along an axis, about, at which the blur of interpolation is looked at."""
-_CACHE_BYTES = 64 * 1024**2
-"""Memory for halved sums of frames, which are warped again in each round."""
+SCALE = 0.5  # pixels of the grid per pixel of a frame
+_TOLERANCE_PX = 1.5  # motion within which frames are summed before they are warped, in px of a frame
+_PLACES = 5  # places along an axis, about, at which the blur of interpolation is looked at
+_CACHE_BYTES = 64 * 1024**2  # memory for halved sums of frames, which are warped again in each round
+# Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale.
 _SHIFT_PX = 0.2
-"""Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale."""
-_MOST = 95.0
-"""Percentile of the speeds of a field by which frames are summed."""
-_SAMPLED = 3
-"""Step, along each axis, of the pixels whose speeds are compared."""
-_REACH = 4
-"""Standard deviations at which a Gaussian ends."""
-_SEEN = 0.1
-"""A pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it."""
+_MOST = 95.0  # percentile of the speeds of a field by which frames are summed
+_SAMPLED = 3  # step, along each axis, of the pixels whose speeds are compared
+_REACH = 4  # standard deviations at which a Gaussian ends
+_SEEN = 0.1  # a pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,16 +10,11 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-PATCH = 8
-"""Side of a patch, px."""
-GROUP = 16
-"""Similar patches that are filtered together; a power of 2."""
-SEARCH = 10
-"""Similar patches are looked for at this distance at most along x and y, px."""
-STEP = 4
-"""Distance of reference patches, px."""
-_THRESHOLD = np.float32(2.7)
-"""Coefficients below this many standard deviations of the noise are set to 0."""
+PATCH = 8  # side of a patch, px
+GROUP = 16  # similar patches that are filtered together; a power of 2
+SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
+STEP = 4  # distance of reference patches, px
+_THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
 
 
 def _dct_matrix() -> NDArray[np.float32]:

@@ -12,20 +12,14 @@ from photonpano.merging import LitFrames
 from photonpano_core.super_resolution.collaborative import GROUP, PATCH, filter_groups, find_similar, places_of
 from photonpano_core.super_resolution.observing import counts_in_light, expected, log_likelihood, photon_ratio
 
+# Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round.
 STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
-"""Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round."""
-_STEPS = 6
-"""Steps of expectation-maximisation in a round."""
-_MATCHED_ROUNDS = 3
-"""Rounds for which similar patches are looked for once."""
-_FEWEST_FRAMES = 0.25
-"""Frames of a cell, smoothed, below which its noise grows no more."""
-_KEPT_PX = 8.0
-"""Denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian."""
-_DARKEST = 1e-5
-"""The flux stays above this share of its mean: expectation-maximisation cannot leave 0."""
-_BRIGHTEST = 1.55
-"""Largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame."""
+_STEPS = 6  # steps of expectation-maximisation in a round
+_MATCHED_ROUNDS = 3  # rounds for which similar patches are looked for once
+_FEWEST_FRAMES = 0.25  # frames of a cell, smoothed, below which its noise grows no more
+_KEPT_PX = 8.0  # denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian
+_DARKEST = 1e-5  # the flux stays above this share of its mean: expectation-maximisation cannot leave 0
+_BRIGHTEST = 1.55  # largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,30 +22,21 @@ from photonpano_core.super_resolution.sums import PhotonSums, pieces_of, sums_on
 
 Decide = Callable[[str, int | bool, str], None]
 
-Box = tuple[slice, slice]
-"""Rows and columns of an image."""
+Box = tuple[slice, slice]  # rows and columns of an image
 
 logger = logging.getLogger("photonpano.super_resolution")
 
-_BLOCK_PX = 320
-"""Side of the blocks that are estimated one by one; all pixels of a block see with the same area."""
-_HALO_PX = 24
-"""Width of the margin around a block: what lies beyond has no influence that counts."""
-_PROBE_PX = 160
-"""Side of the squares on which frames are held out, without their margins."""
-_PROBES = (0.25, 0.5, 0.75)
-"""Where these squares lie: in the middles of the frames at these shares of the span."""
-_HELD_OUT = 8
-"""One chunk of frames in 8 is held out."""
-_FEWEST_FRAMES = 1.0
-"""Pixels that fewer frames saw are unknown."""
-_GATHERING = 5
-"""One part in 5 of the time is spent on sorting photons, about."""
+_BLOCK_PX = 320  # side of the blocks that are estimated one by one; all pixels of a block see with the same area
+_HALO_PX = 24  # width of the margin around a block: what lies beyond has no influence that counts
+_PROBE_PX = 160  # side of the squares on which frames are held out, without their margins
+_PROBES = (0.25, 0.5, 0.75)  # where these squares lie: in the middles of the frames at these shares of the span
+_HELD_OUT = 8  # one chunk of frames in 8 is held out
+_FEWEST_FRAMES = 1.0  # pixels that fewer frames saw are unknown
+_GATHERING = 5  # one part in 5 of the time is spent on sorting photons, about
+# The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
+# from frames held out, so that the most likely round is a noisy one.
 _ENOUGH = 0.93
-"""The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
-from frames held out, so that the most likely round is a noisy one."""
-_SIGNIFICANT = 2.0
-"""Held-out frames show detail if they are likelier with it than without by this many standard errors."""
+_SIGNIFICANT = 2.0  # held-out frames show detail if they are likelier with it than without by this many standard errors
 
 
 @dataclass(frozen=True, slots=True)

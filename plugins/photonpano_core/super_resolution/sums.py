@@ -17,12 +17,9 @@ from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.super_resolution.observing import add_observations
 
-_BATCH = 16
-"""Chunks that are summed before they are added to the grid."""
-_PART_ROWS = 64
-"""Rows of the grid, about, that a thread adds to at a time."""
-_MANY_PIECES = 64
-"""A span is divided into at least this many chunks, if it has the frames: some of them are held out."""
+_BATCH = 16  # chunks that are summed before they are added to the grid
+_PART_ROWS = 64  # rows of the grid, about, that a thread adds to at a time
+_MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
