@@ -14,6 +14,7 @@ from photonpano.locating.configs import MatchingConfig
 from photonpano.locating.fitting import MIN_NOISE_PX
 from photonpano.locating.points import Matches
 from photonpano.locating.turns import information_on_turn, turn_slopes
+from photonpano.robust import robust_std, soft_l1_weights
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated
 
 _SCATTER = 2.0  # keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`
@@ -141,7 +142,7 @@ def _fit(moving: FloatArray, fixed: FloatArray, start: Homography, camera: Camer
     homography = start
     for _ in range(_ITERATIONS):
         agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
-        root = np.sqrt(_weights(residuals, scale))[:, None]
+        root = np.sqrt(soft_l1_weights(np.linalg.norm(residuals, axis=1), scale))[:, None]
         slopes = jacobian(homography, moving[agrees]) @ turn_slopes(homography, camera.matrix)
         step = np.linalg.lstsq((slopes * root[..., None]).reshape(-1, 3), -(residuals * root).ravel(), rcond=None)[0]
         homography = normalised(homography @ camera.homographies(rotation_matrices(step)))
@@ -159,13 +160,7 @@ def _residuals(
     residuals = apply(homography, moving) - fixed
     agrees = np.linalg.norm(residuals, axis=1) < threshold_px
     residuals = residuals[agrees]
-    spread = 1.4826 * float(np.median(np.abs(residuals))) if residuals.size else 0.0
-    return agrees, residuals, max(spread, MIN_NOISE_PX)
-
-
-def _weights(residuals: FloatArray, scale: float) -> FloatArray:
-    """Return the weights of the soft L1 loss of (..., 2) residuals: (...)."""
-    return np.asarray(1 / np.sqrt(1 + (residuals**2).sum(axis=-1) / scale**2))
+    return agrees, residuals, max(robust_std(residuals), MIN_NOISE_PX)
 
 
 def _information(lengths: FloatArray, scale: float, threshold_px: float) -> float:
@@ -184,7 +179,7 @@ def _information(lengths: FloatArray, scale: float, threshold_px: float) -> floa
         return 0.0
     # The ring has the area of the circle within the threshold. One match more keeps few matches from seeming exact.
     ring = 1 + np.count_nonzero((lengths > threshold_px * np.sqrt(0.5)) & (lengths < threshold_px * np.sqrt(1.5)))
-    weights = 1 / np.sqrt(1 + (inner / scale) ** 2)
+    weights = soft_l1_weights(inner, scale)
     slope = (weights - weights**3 * (inner / scale) ** 2 / 2).sum() - ring / np.sqrt(1 + (threshold_px / scale) ** 2)
     square = ((weights * inner) ** 2 + MIN_NOISE_PX**2).sum() / max(1, 2 * len(inner) - 3)
     return float(max(slope, 0.0) / len(inner)) ** 2 / float(square)

@@ -14,6 +14,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from photonpano.geometry import apply, corners, from_parameters, generators, inverse, slopes
+from photonpano.robust import cauchy_weights
 from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
@@ -49,6 +50,28 @@ class Assessment:
     std_camera: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A connected graph whose nodes are to be found.
+
+    Attributes:
+        pairs: (E, 2) the moving and the fixed node of each edge.
+        anchor: the node that does not change.
+        motions: the motions of the edges, with their information.
+        frame_shape: (height, width) of a frame.
+    """
+
+    pairs: NDArray[np.integer]
+    anchor: int
+    motions: Sequence[Located]
+    frame_shape: tuple[int, int]
+
+    @property
+    def observed(self) -> FloatArray:
+        """The homographies of the edges: (E, 3, 3), pixels of the moving frame to pixels of the fixed one."""
+        return np.array([motion.homography for motion in self.motions])
+
+
 class Adjustment(ABC, Generic[StateT]):
     """The least-squares problem of a connected graph.
 
@@ -58,35 +81,18 @@ class Adjustment(ABC, Generic[StateT]):
     Subclasses say what a state is, such as the homographies of the nodes, and how it changes.
     """
 
-    def __init__(
-        self,
-        pairs: NDArray[np.integer],
-        anchor: int,
-        observed: FloatArray,
-        motions: Sequence[Located],
-        frame_shape: tuple[int, int],
-        n_shared: int = 0,
-    ) -> None:
-        """Set up the problem.
-
-        Args:
-            pairs: (E, 2) the moving and the fixed node of each edge.
-            anchor: the node that does not change.
-            observed: (E, 3, 3) homographies of the edges, pixels of the moving frame to pixels of the fixed one.
-            motions: the motions of the edges, with their information.
-            frame_shape: (height, width) of a frame.
-            n_shared: unknowns that all nodes share.
-        """
-        self._moving, self._fixed = pairs.T
-        self._anchor = anchor
-        self._n_nodes = int(pairs.max()) + 1
+    def __init__(self, problem: Problem, n_shared: int = 0) -> None:
+        """Set up the problem; all nodes share `n_shared` unknowns."""
+        self._moving, self._fixed = problem.pairs.T
+        self._anchor = problem.anchor
+        self._n_nodes = int(problem.pairs.max()) + 1
         self._n_shared = n_shared
-        self._corners = corners(frame_shape)
+        self._frame_shape = problem.frame_shape
+        self._half = max(problem.frame_shape) / 2
+        self._corners = corners(problem.frame_shape)
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
-        self._targets = apply(observed, self._corners)
-        self._whitening = _whitening(motions, self._rows)
-        self._half = max(frame_shape) / 2
-        self._frame_shape = frame_shape
+        self._targets = apply(problem.observed, self._corners)
+        self._whitening = _whitening(problem.motions, self._rows)
 
     @abstractmethod
     def homographies(self, state: StateT) -> FloatArray:
@@ -247,7 +253,7 @@ class Adjustment(ABC, Generic[StateT]):
     def _robust_weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
         """Return the Cauchy weights of the edges, 0 for those that are not kept: (E,)."""
         scale = self._residual_scale(norms, kept) * CAUCHY
-        return np.asarray(np.where(kept, 1 / (1 + (norms / scale) ** 2), 0.0))
+        return np.asarray(np.where(kept, cauchy_weights(norms, scale), 0.0))
 
     def mapped_corners(self, state: StateT) -> FloatArray:
         """Return where a state expects the corners that each edge maps: (E, 4, 2) px."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import inverse, nearest_rotations, normalised, scaled_ahead
-from photonpano.motion.adjustment import Adjustment, Assessment
+from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.homography_graph import HomographyAdjustment
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
@@ -210,18 +210,14 @@ class _Tied:
         return int(self.order[0])
 
     @property
-    def observed(self) -> FloatArray:
-        """The homographies of the edges: (E, 3, 3)."""
-        return np.array([motion.homography for motion in self.motions])
-
-    @property
     def compact_pairs(self) -> NDArray[np.integer]:
         """The nodes of the edges, numbered without those that are not tied: (E, 2)."""
         return np.asarray((np.cumsum(self.located) - 1)[self.pairs])
 
-    def problem(self) -> tuple[NDArray[np.integer], int, FloatArray, Sequence[Located], tuple[int, int]]:
-        """Return the arguments of an `Adjustment`."""
-        return self.compact_pairs, int(self.located[: self.anchor].sum()), self.observed, self.motions, self.frame_shape
+    @property
+    def problem(self) -> Problem:
+        """The least-squares problem, without nodes that are not tied."""
+        return Problem(self.compact_pairs, int(self.located[: self.anchor].sum()), self.motions, self.frame_shape)
 
     def composed(self, observed: FloatArray) -> FloatArray:
         """Return the maps of the tied nodes to the anchor, each composed from its parent's along one edge: (L, 3, 3)."""
@@ -266,20 +262,20 @@ class _Tied:
 
 
 def _homographies(tied: _Tied, start: FloatArray | None) -> _Fit:
-    state = tied.composed(tied.observed)
+    problem = tied.problem
+    state = tied.composed(problem.observed)
     if start is not None:
         state = normalised(inverse(start[tied.anchor]) @ start[tied.located])
-    return tied.fit(HomographyAdjustment(*tied.problem()), state)
+    return tied.fit(HomographyAdjustment(problem), state)
 
 
 def _turns(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
-    problem = tied.problem()
-    camera = model.camera(tied.frame_shape)
-    adjustment = RotationAdjustment(*problem, model.seen_by(tied.frame_shape), model.unknown)
+    problem, camera = tied.problem, model.camera(tied.frame_shape)
+    adjustment = RotationAdjustment(problem, model.seen_by(tied.frame_shape), model.unknown)
     if model.focal_px is None and model.known is None:
         camera = adjustment.likeliest_camera(camera)
     if start is None:
-        turns = tied.composed(nearest_rotations(camera.rotations(tied.observed)))
+        turns = tied.composed(nearest_rotations(camera.rotations(problem.observed)))
     else:
         turns = camera.rotations(inverse(start[tied.anchor]) @ start[tied.located])
     return tied.fit(adjustment, Turns(nearest_rotations(turns), camera))

@@ -1,4 +1,4 @@
-"""How a lens that distorts otherwise than was thought moves the homographies of pairs."""
+"""Change of the homographies of pairs caused by undistorting pixels with the wrong lens."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _GRID = 7  # points of a frame along each axis to which a homography is fitted
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensShift:
-    """The difference between the homography of ideal pixels and that of pixels that are not quite ideal.
+    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens.
 
     Attributes:
         frame_shape: (height, width) of a frame.
@@ -38,16 +38,16 @@ class LensShift:
         seen[seen.sum(axis=1) < _GRID] = True
         return cls(frame_shape, points, seen)
 
-    def of_corners(self, relative: FloatArray, camera: Camera, seen_by: Camera) -> FloatArray:
-        """Return by how much the best homography between not quite ideal pixels moves the corners further: (E, 4, 2).
+    def of_corners(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
+        """Return the change of corner displacement caused by undistorting with the wrong lens: (E, 4, 2) px.
 
         Args:
             relative: (E, 3, 3) homographies of the ideal pixels of the camera.
-            camera: as it is.
-            seen_by: by whose distortion the pixels were taken for ideal.
+            camera: the true one.
+            assumed: camera used to undistort the pixels.
         """
-        ideal = camera.ideal(seen_by.distorted(self.points))
-        there = seen_by.ideal(camera.distorted(apply(relative, ideal)))
+        ideal = camera.ideal(assumed.distorted(self.points))
+        there = assumed.ideal(camera.distorted(apply(relative, ideal)))
         shift = there - apply(relative, self.points)
         weights = (self.seen & np.isfinite(shift).all(axis=-1)).astype(float)
         by_points = self._slopes(relative, self.points)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano.geometry import ROTATION_AXES, Camera, apply, camera_matrix, nearest_rotations, rotation_matrices, slopes
-from photonpano.motion.adjustment import Adjustment
+from photonpano.motion.adjustment import Adjustment, Problem
 from photonpano.motion.lens_shift import LensShift
-from photonpano.values import FloatArray, Located
+from photonpano.values import FloatArray
 
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # focal lengths that are tried first, in sides of a frame
 # What is known of the focal length before: its logarithm is that of 3 sides of a frame, give or take 2.
@@ -47,31 +45,17 @@ class RotationAdjustment(Adjustment[Turns]):
 
     _n_node = 3
 
-    def __init__(
-        self,
-        pairs: NDArray[np.integer],
-        anchor: int,
-        observed: FloatArray,
-        motions: Sequence[Located],
-        frame_shape: tuple[int, int],
-        seen_by: Camera,
-        unknown: tuple[int, ...],
-    ) -> None:
-        """Set up the problem: see `Adjustment`.
+    def __init__(self, problem: Problem, assumed: Camera, unknown: tuple[int, ...]) -> None:
+        """Set up the problem.
 
         Args:
-            pairs: (E, 2).
-            anchor: the node that does not turn.
-            observed: (E, 3, 3) homographies of ideal pixels of `seen_by`.
-            motions: of the edges.
-            frame_shape: (height, width) of a frame.
-            seen_by: the camera by whose distortion the exposures were merged.
+            problem: its homographies are those of ideal pixels of `assumed`.
+            assumed: camera used to undistort the pixels.
             unknown: what is to be found of the camera: 0 for the focal length, 1 to 4 for k1, k2, p1, p2.
         """
-        super().__init__(pairs, anchor, observed, motions, frame_shape, n_shared=len(unknown))
-        self._seen_by = seen_by
-        self._unknown = unknown
-        self._lens = LensShift.of(frame_shape, observed)
+        super().__init__(problem, n_shared=len(unknown))
+        self._assumed, self._unknown = assumed, unknown
+        self._lens = LensShift.of(problem.frame_shape, problem.observed)
 
     def homographies(self, state: Turns) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
@@ -93,13 +77,13 @@ class RotationAdjustment(Adjustment[Turns]):
     def mapped_corners(self, state: Turns) -> FloatArray:
         """Return where the corners are seen: (E, 4, 2) px.
 
-        Where the lens distorts otherwise than was known when the exposures were merged, no homography holds exactly; it is the
-        one that fits best where both exposures see the scene.
+        If pixels were undistorted with the wrong lens, no homography holds exactly; it is the one that fits best where both
+        exposures see the scene.
         """
         mapped = super().mapped_corners(state)
-        if not (state.camera.distorts or self._seen_by.distorts):
+        if not (state.camera.distorts or self._assumed.distorts):
             return mapped
-        return mapped + self._lens.of_corners(self.relative(state), state.camera, self._seen_by)
+        return mapped + self._lens.of_corners(self.relative(state), state.camera, self._assumed)
 
     def generators(self, state: Turns) -> FloatArray:
         """Return the derivatives by rotations that move the middle of the frame by about half its side: (3, 3, 3)."""
@@ -147,10 +131,6 @@ class RotationAdjustment(Adjustment[Turns]):
         found[list(self._unknown)] = std_shared * self._units(state.camera)
         found[0] *= state.camera.focal_px
         return found
-
-    def start(self, homographies: FloatArray, camera: Camera) -> Turns:
-        """Return the rotations nearest to the homographies of the nodes: (N, 3, 3)."""
-        return Turns(nearest_rotations(camera.rotations(homographies)), camera)
 
     def likeliest_camera(self, camera: Camera) -> Camera:
         """Return the camera with the focal length that explains the edges best, each by itself."""

@@ -20,7 +20,7 @@ _LAGS = 4  # the largest lag of an autocorrelation is the side of the image over
 _MIN_SCORE = 5.5
 
 
-def tapered(shape: tuple[int, ...]) -> NDArray[np.float32]:
+def hann_window(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Return the Hann window of OpenCV: (H, W), 0 at the edges of an image; along sides of 1 or 2 px it is constant."""
     import cv2
 
@@ -30,6 +30,9 @@ def tapered(shape: tuple[int, ...]) -> NDArray[np.float32]:
         if side < 3:
             window = np.repeat(window.take([1], axis), side, axis)
     return np.asarray(window)
+
+
+tapered = hann_window  # deprecated: use `hann_window`
 
 
 class Similarity(NamedTuple):

@@ -20,8 +20,7 @@ from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
-from photonpano.motion.velocity import ConstantVelocity
-from photonpano.motion.velocity_search import find_velocity
+from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.run_steps import require_centre
 from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of

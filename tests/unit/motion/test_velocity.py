@@ -13,8 +13,7 @@ import pytest
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
 from photonpano.geometry import apply, inverse
-from photonpano.motion.velocity import ConstantVelocity, Velocity
-from photonpano.motion.velocity_search import FoundVelocity, find_velocity
+from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
 
 SHAPE = (64, 96)
 MIDDLE = np.array([47.5, 31.5])

@@ -9,7 +9,7 @@ import numpy as np
 
 from photonpano.geometry import apply, corners, inverse, normalised
 from photonpano.motion.level import FrameHomography
-from photonpano.motion.start import StartingMotion
+from photonpano.motion.tracking.start import StartingMotion
 from photonpano.values import FloatArray, Group, Homography
 
 
