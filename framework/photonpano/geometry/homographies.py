@@ -91,7 +91,7 @@ def rescaled(homographies: Homography, scale: float) -> Homography:
     return normalised(rescaling(scale) @ homographies @ rescaling(1 / scale))
 
 
-def apply(homographies: Homography, points: ArrayLike) -> FloatArray:
+def transform_points(homographies: Homography, points: ArrayLike) -> FloatArray:
     """Map points.
 
     Args:
@@ -108,6 +108,9 @@ def apply(homographies: Homography, points: ArrayLike) -> FloatArray:
         return np.asarray(mapped / depth)
 
 
+apply = transform_points  # deprecated: use `transform_points`
+
+
 def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
     """Return the derivatives of the mapped points with respect to p1..p8 of `parameters`: (N, 2, 8).
 
@@ -118,7 +121,7 @@ def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
     points = np.asarray(points, dtype=np.float64)
     depth = points @ homography[2, :2] + homography[2, 2]
     x, y = points.T / depth
-    u, v = apply(homography, points).T
+    u, v = transform_points(homography, points).T
     zero, one = np.zeros_like(x), 1 / depth
     return np.stack(
         [
@@ -141,7 +144,7 @@ def corners(shape: tuple[int, int]) -> FloatArray:
 def corner_displacements(first: Homography, second: Homography, shape: tuple[int, int]) -> FloatArray:
     """Return the distances, in pixels, between the four corners of an image under one map and under another: (..., 4)."""
     frame = corners(shape)
-    return np.asarray(np.linalg.norm(apply(first, frame) - apply(second, frame), axis=-1))
+    return np.asarray(np.linalg.norm(transform_points(first, frame) - transform_points(second, frame), axis=-1))
 
 
 def steps_px(homographies: Homography, shape: tuple[int, int]) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from photonpano.geometry import Camera, apply, nearest_rotations
+from photonpano.geometry import Camera, nearest_rotations, transform_points
 from photonpano.values import BoolArray, FloatArray, Homography
 
 # Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are.
@@ -54,7 +54,7 @@ def rotation_of_most(moving: FloatArray, fixed: FloatArray, camera: Camera, thre
     rotations = _frames(partners[first], partners[second]) @ np.swapaxes(_frames(rays[first], rays[second]), -1, -2)
 
     def squares(rotations: FloatArray) -> FloatArray:
-        left = np.square(apply(camera.homographies(rotations), moving) - fixed).sum(axis=-1)
+        left = np.square(transform_points(camera.homographies(rotations), moving) - fixed).sum(axis=-1)
         return np.asarray(np.fmin(left, threshold_px**2))
 
     costs = squares(rotations).sum(axis=1)
@@ -89,7 +89,7 @@ def agreeing_by_chance(
     if np.isfinite(search_px):
         share = min(1.0, (threshold_px / search_px) ** 2)
     else:
-        mapped = np.clip(np.nan_to_num(apply(homography, moving)), -_FAR_PX, _FAR_PX)
+        mapped = np.clip(np.nan_to_num(transform_points(homography, moving)), -_FAR_PX, _FAR_PX)
         near = cKDTree(mapped).sparse_distance_matrix(cKDTree(fixed), threshold_px, output_type="ndarray")
         exchanged = int(np.count_nonzero(near["i"] != near["j"]))
         share = max(exchanged, 1) / (count * (count - 1))

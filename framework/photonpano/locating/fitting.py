@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
+from photonpano.geometry import corners, from_parameters, jacobian, parameters, transform_points
 from photonpano.robust import robust_std, soft_l1_weights
 from photonpano.values import FloatArray, Homography
 
@@ -85,7 +85,7 @@ def fit_homography(
 
 def _residuals(p: FloatArray, here: FloatArray, there: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the weighted residuals along x and y: (2 N,)."""
-    return ((apply(from_parameters(p), here) - there) * weights[:, None]).ravel()
+    return ((transform_points(from_parameters(p), here) - there) * weights[:, None]).ravel()
 
 
 def _derivatives(p: FloatArray, here: FloatArray, there: FloatArray, weights: FloatArray) -> FloatArray:

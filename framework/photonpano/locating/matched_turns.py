@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry import Camera, apply, jacobian, normalised, rotation_matrices, why_implausible
+from photonpano.geometry import Camera, jacobian, normalised, rotation_matrices, transform_points, why_implausible
 from photonpano.locating.agreement import agreeing_by_chance, distinct, rotation_of_most
 from photonpano.locating.configs import MatchingConfig
 from photonpano.locating.fitting import MIN_NOISE_PX
@@ -149,7 +149,7 @@ def _fit(moving: FloatArray, fixed: FloatArray, start: Homography, camera: Camer
     agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
     slopes = jacobian(homography, moving[agrees]).reshape(-1, 8)
     residual_px = float(np.sqrt((residuals**2).sum() / max(1, residuals.size - 3)))
-    each = _information(np.linalg.norm(apply(homography, moving) - fixed, axis=1), scale, threshold_px)
+    each = _information(np.linalg.norm(transform_points(homography, moving) - fixed, axis=1), scale, threshold_px)
     return _Fit(homography, agrees, residual_px, slopes.T @ slopes * each)
 
 
@@ -157,7 +157,7 @@ def _residuals(
     moving: FloatArray, fixed: FloatArray, homography: Homography, threshold_px: float
 ) -> tuple[BoolArray, FloatArray, float]:
     """Return which matches agree, their (M, 2) residuals, and the robust standard deviation of these."""
-    residuals = apply(homography, moving) - fixed
+    residuals = transform_points(homography, moving) - fixed
     agrees = np.linalg.norm(residuals, axis=1) < threshold_px
     residuals = residuals[agrees]
     return agrees, residuals, max(robust_std(residuals), MIN_NOISE_PX)

@@ -12,7 +12,6 @@ from photonpano.geometry import (
     Canvas,
     Covered,
     Extent,
-    apply,
     canvas_around,
     canvas_of,
     canvas_of_box,
@@ -20,6 +19,7 @@ from photonpano.geometry import (
     inverse,
     level_horizon,
     outline_of,
+    transform_points,
 )
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, FrameSpan
@@ -185,7 +185,7 @@ def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Can
     """
     part = canvas_of_box(box, scale)
     ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
-    (left, top), (right, bottom) = np.rint(apply(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
+    (left, top), (right, bottom) = np.rint(transform_points(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
     x0, y0, x1, y1 = box
     if x1 <= left or x0 > right or y1 <= top or y0 > bottom:
         raise ExtentError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from photonpano.geometry import apply, corners, from_parameters, generators, inverse, slopes
+from photonpano.geometry import corners, from_parameters, generators, inverse, slopes, transform_points
 from photonpano.robust import cauchy_weights
 from photonpano.values import BoolArray, FloatArray, Located
 
@@ -91,7 +91,7 @@ class Adjustment(ABC, Generic[StateT]):
         self._half = max(problem.frame_shape) / 2
         self._corners = corners(problem.frame_shape)
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
-        self._targets = apply(problem.observed, self._corners)
+        self._targets = transform_points(problem.observed, self._corners)
         self._whitening = _whitening(problem.motions, self._rows)
 
     @abstractmethod
@@ -257,7 +257,7 @@ class Adjustment(ABC, Generic[StateT]):
 
     def mapped_corners(self, state: StateT) -> FloatArray:
         """Return where a state expects the corners that each edge maps: (E, 4, 2) px."""
-        return apply(self.relative(state), self._corners)
+        return transform_points(self.relative(state), self._corners)
 
     def _residuals(self, state: StateT) -> FloatArray:
         return self.mapped_corners(state) - self._targets

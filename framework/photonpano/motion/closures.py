@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import apply, corners, inverse, rescaled, rescaling, translation
+from photonpano.geometry import corners, inverse, rescaled, rescaling, transform_points, translation
 from photonpano.motion.graph import GraphOptions, GraphSolution
 from photonpano.motion.level import FrameHomography
 from photonpano.motion.pairs import instants_of, lengths_of
@@ -137,7 +137,7 @@ def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int
     x, y = (low[axis] + (high[axis] - low[axis]) * (np.arange(_GRID) + 0.5) / _GRID for axis in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     between = inverse(fixed) @ moving
-    seen = apply(between, points)
+    seen = transform_points(between, points)
     ahead = points @ between[:, 2, :2, None] + between[:, 2:, 2, None] > 0
     with np.errstate(invalid="ignore"):
         inside = np.all((seen >= low) & (seen <= high), axis=-1) & ahead[..., 0]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry import Camera, apply, corners, generators, slopes
+from photonpano.geometry import Camera, corners, generators, slopes, transform_points
 from photonpano.values import BoolArray, FloatArray
 
 _GRID = 7  # points of a frame along each axis to which a homography is fitted
@@ -32,7 +32,7 @@ class LensShift:
         height, width = frame_shape
         x, y = ((np.arange(_GRID) + 0.5) / _GRID * side - 0.5 for side in (width, height))
         points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        mapped = apply(observed, points)
+        mapped = transform_points(observed, points)
         seen = np.all((mapped >= 0) & (mapped <= [width - 1, height - 1]), axis=-1)
         # Four points at least determine a homography; a pair that hardly overlaps takes all.
         seen[seen.sum(axis=1) < _GRID] = True
@@ -47,8 +47,8 @@ class LensShift:
             assumed: camera used to undistort the pixels.
         """
         ideal = camera.ideal(assumed.distorted(self.points))
-        there = assumed.ideal(camera.distorted(apply(relative, ideal)))
-        shift = there - apply(relative, self.points)
+        there = assumed.ideal(camera.distorted(transform_points(relative, ideal)))
+        shift = there - transform_points(relative, self.points)
         weights = (self.seen & np.isfinite(shift).all(axis=-1)).astype(float)
         by_points = self._slopes(relative, self.points)
         weighted = by_points * np.repeat(weights, 2, axis=1)[..., None]

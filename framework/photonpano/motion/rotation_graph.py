@@ -6,7 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photonpano.geometry import ROTATION_AXES, Camera, apply, camera_matrix, nearest_rotations, rotation_matrices, slopes
+from photonpano.geometry import (
+    ROTATION_AXES,
+    Camera,
+    camera_matrix,
+    nearest_rotations,
+    rotation_matrices,
+    slopes,
+    transform_points,
+)
 from photonpano.motion.adjustment import Adjustment, Problem
 from photonpano.motion.lens_shift import LensShift
 from photonpano.values import FloatArray
@@ -148,13 +156,13 @@ class RotationAdjustment(Adjustment[Turns]):
         for _ in range(2):
             mapped = camera.homographies(rotations)
             by_turn = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
-            residuals = np.einsum("eij,ej->ei", whitening, (apply(mapped, self._corners) - targets).reshape(-1, 8))
+            residuals = np.einsum("eij,ej->ei", whitening, (transform_points(mapped, self._corners) - targets).reshape(-1, 8))
             step = -np.linalg.solve(
                 np.swapaxes(by_turn, -1, -2) @ by_turn, np.einsum("eij,ei->ej", by_turn, residuals)[..., None]
             )
             rotations = rotations @ rotation_matrices(step[..., 0])
         residuals = np.einsum(
-            "eij,ej->ei", whitening, (apply(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
+            "eij,ej->ei", whitening, (transform_points(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
         )
         squares = (residuals**2).sum(axis=1)
         return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)

@@ -90,8 +90,8 @@ class Prediction:
         precision = np.asarray(1 / _variance(flux, response), np.float32)
         precision[~inside] = 0
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
-        bent = not canvas.planar or (camera is not None and camera.distorts)
-        ideal = _ideal(frame_shape, camera) if bent else None
+        remapped = not canvas.planar or (camera is not None and camera.distorts)
+        ideal = _ideal(frame_shape, camera) if remapped else None
         return cls(canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light, ideal, margin)
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, Response, Source, Trajectory
-from photonpano.geometry import apply, inverse, rescaling, translation
+from photonpano.geometry import inverse, rescaling, transform_points, translation
 from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
 from photonpano_core.dense_motion.field import Image, MotionField
 from photonpano_core.dense_motion.frames import WeightedFrames
@@ -224,7 +224,7 @@ def _spread(to_image: FloatArray, shape: tuple[int, int]) -> float:
         shape: (height, width) of the grid.
     """
     places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in shape[::-1])), axis=-1)
-    found = apply(to_image, places.reshape(-1, 2))
+    found = transform_points(to_image, places.reshape(-1, 2))
     fraction = found - np.floor(found)
     return float(np.mean(fraction * (1 - fraction)))
 

@@ -13,7 +13,7 @@ from threading import Lock
 import numpy as np
 
 from photonpano import FloatArray, FluxImage, FrameSpan, Homography, Panorama, Source, Trajectory
-from photonpano.geometry import Canvas, apply, corners, inverse, translation
+from photonpano.geometry import Canvas, corners, inverse, transform_points, translation
 from photonpano.merging import Chunk
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.configs import SuperResolutionConfig
@@ -284,7 +284,7 @@ def _probe(share: float, source: Source, trajectory: Trajectory, span: FrameSpan
     instant = span.start + share * (len(span) - 1)
     shape = source.info.frame_shape
     to_canvas = canvas.transform @ trajectory.at([instant])[0]
-    outline = apply(to_canvas, corners(shape))
+    outline = transform_points(to_canvas, corners(shape))
     # Even sides, so that the detail of a grid half as fine is easily found.
     width, height = (2 * int(min(_PROBE_PX, side) // 2 + _HALO_PX) for side in np.ceil(np.ptp(outline, axis=0)) + 1)
     left, top = np.rint(outline.mean(axis=0) - [width / 2, height / 2])
@@ -296,12 +296,12 @@ def _zoom_at(middle: FloatArray, canvas: Homography, chunks: Sequence[Chunk], fr
     height, width = frame_shape
     every = chunks[:: max(1, len(chunks) // 256)]
     to_canvas = canvas @ np.array([chunk.homography for chunk in every])
-    points = apply(inverse(to_canvas), middle[None])[:, 0]
+    points = transform_points(inverse(to_canvas), middle[None])[:, 0]
     outside = np.maximum(np.abs(points - [(width - 1) / 2, (height - 1) / 2]) - [width / 2, height / 2], 0).sum(axis=1)
     inside = outside <= outside.min()
     seen, at = to_canvas[inside], points[inside]
     here, right, below = (
-        np.array([apply(homography, (point + step)[None])[0] for homography, point in zip(seen, at, strict=True)])
+        np.array([transform_points(homography, (point + step)[None])[0] for homography, point in zip(seen, at, strict=True)])
         for step in ([0, 0], [1, 0], [0, 1])
     )
     a, b = (right - here).T, (below - here).T

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import BoolArray, FluxImage, FrameSpan, Homography, LinearlyCorrectedSource, LitSource, Source, Trajectory
-from photonpano.geometry import Canvas, apply, corners
+from photonpano.geometry import Canvas, corners, transform_points
 from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.super_resolution.observing import add_observations
@@ -58,7 +58,7 @@ def visible(chunks: Sequence[Chunk], canvas: Canvas, frame_shape: tuple[int, int
     """Return the chunks whose frames may reach into a canvas."""
     if not chunks:
         return []
-    outlines = apply(canvas.transform @ np.array([chunk.homography for chunk in chunks]), corners(frame_shape))
+    outlines = transform_points(canvas.transform @ np.array([chunk.homography for chunk in chunks]), corners(frame_shape))
     low, high = outlines.min(axis=1) - 1, outlines.max(axis=1) + 1
     inside = (high >= 0).all(axis=1) & (low <= [canvas.width - 1, canvas.height - 1]).all(axis=1)
     return [chunk for chunk, flag in zip(chunks, inside, strict=True) if flag]

@@ -8,7 +8,6 @@ import pytest
 from photonpano.geometry import (
     Camera,
     align_rotations,
-    apply,
     corners,
     from_parameters,
     jacobian,
@@ -16,6 +15,7 @@ from photonpano.geometry import (
     parameters,
     rotation_matrices,
     rotation_vectors,
+    transform_points,
 )
 from photonpano.motion.graph import GraphSolution, solve
 from photonpano.motion.model import MotionModel
@@ -86,7 +86,7 @@ def test_expected_errors_of_rotations_hold() -> None:
         found = solution.turns.rotations
         aligned = align_rotations(found, rotations) @ found
         away = camera.homographies(np.swapaxes(rotations, -1, -2) @ aligned)
-        errors.append(np.square(apply(away, corners(SHAPE)) - corners(SHAPE)).sum(axis=-1).mean(axis=-1))
+        errors.append(np.square(transform_points(away, corners(SHAPE)) - corners(SHAPE)).sum(axis=-1).mean(axis=-1))
         stds.append(assessed.std_px**2)
         focals.append(solution.turns.camera.focal_px / FOCAL_PX - 1)
         focal_stds.append(assessed.std_camera[0] / FOCAL_PX)

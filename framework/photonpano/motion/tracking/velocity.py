@@ -16,7 +16,7 @@ from scipy import fft, optimize
 
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
-from photonpano.geometry import apply, corners
+from photonpano.geometry import corners, transform_points
 from photonpano.merging import binned_mean, binning_of
 from photonpano.protocols import Source
 from photonpano.robust import robust_std
@@ -315,7 +315,9 @@ class _Contrast:
     def moved_px(self, velocity: FloatArray) -> float:
         """Return how far corners of the frame move within a window, at most, in binned pixels."""
         there = Velocity(float(velocity[0]), velocity[1:], self.middle).after(self._times[[0, -1]])
-        return float(np.linalg.norm(apply(there[1], self._corners) - apply(there[0], self._corners), axis=-1).max())
+        return float(
+            np.linalg.norm(transform_points(there[1], self._corners) - transform_points(there[0], self._corners), axis=-1).max()
+        )
 
     @property
     def steps(self) -> FloatArray:
