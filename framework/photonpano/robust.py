@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from photonpano.values import FloatArray
@@ -11,7 +12,7 @@ from photonpano.values import FloatArray
 _STD_PER_MEDIAN = float(1 / ndtri(0.75))
 
 
-def robust_std(residuals: FloatArray) -> float:
+def robust_std(residuals: NDArray[np.floating]) -> float:
     """Return the standard deviation of Gaussian residuals about 0 from the median of their magnitudes; 0 for none."""
     return _STD_PER_MEDIAN * float(np.median(np.abs(residuals))) if residuals.size else 0.0
 

@@ -208,7 +208,7 @@ def _summed(
     counts: FluxImage | Counts = np.ascontiguousarray(raw if corrected is None else corrected(raw, n_frames))
     seen = masked
     if masked is not None:
-        counts = counts.astype(np.float32) * masked
+        counts = np.asarray(counts.astype(np.float32) * masked, np.float32)
     elif any(side % shrink for side in counts.shape):
         seen = np.ones(counts.shape, np.float32)
     if shrink > 1:

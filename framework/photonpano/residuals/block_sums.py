@@ -195,12 +195,13 @@ class Totals(NamedTuple):
     def zeros(cls, shape: tuple[int, int], canvas_shape: tuple[int, int]) -> Totals:
         """Return no sums, for frames and a panorama of these shapes."""
         grid, cells = n_blocks(shape), n_blocks(canvas_shape)
-        pixels = (np.zeros(shape, np.float32) for _ in range(2))
-        return cls(np.zeros((*grid, N_SUMS)), *map(np.zeros, [grid] * 2 + [cells] * 3), *pixels)
+        of_blocks = np.zeros((*grid, N_SUMS)), np.zeros(grid), np.zeros(grid)
+        of_cells = np.zeros(cells), np.zeros(cells), np.zeros(cells)
+        return cls(*of_blocks, *of_cells, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
 
     def plus(self, other: Totals) -> Totals:
         """Return the sums over both."""
-        return Totals(*(one + another for one, another in zip(self, other, strict=True)))
+        return Totals(*map(np.add, self, other))
 
 
 @compiled

@@ -26,11 +26,10 @@ from photonpano import (
 )
 from photonpano.merging import PhotonSum, divided
 from photonpano_core.configs import BurstConfig
-from photonpano_core.dense_motion.frames import WeightedFrames
-from photonpano_core.dense_motion.noise import count_variance
+from photonpano_core.dense_motion.frames import WeightedFrames, count_variance, rescaled
 from photonpano_core.dense_motion.patches import Image, PatchGrid, add_patches, search
-from photonpano_core.dense_motion.rescaled import rescaled
 from photonpano_core.dense_motion.sub_exposures import smoothed
+from photonpano_core.dense_motion.warping import Frames
 from photonpano_core.photon_mle import exposure_of
 
 _DETAIL_PX = 1.0  # blur of blocks before they are compared, in px
@@ -74,7 +73,7 @@ class _Burst:
     def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
         self._source, self._group, self._config = source, group, config
         self._counts = WeightedFrames(source)
-        self._worth = self._counts.worth if self._counts.worth.size else np.ones(source.info.frame_shape, np.float32)
+        self._weights = self._counts.worth if self._counts.worth.size else np.ones(source.info.frame_shape, np.float32)
         start = group.span.start
         parts = divided(len(group.span), max(1, round(len(group.span) / config.block_frames)))
         self._spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
@@ -99,7 +98,7 @@ class _Burst:
 
     def _image(self, span: FrameSpan) -> tuple[Image, float]:
         """Return a block as it lies, on the scale of uniform noise, and its variance there."""
-        photons = PhotonSum(self._counts(span), self._worth * np.float32(len(span)))
+        photons = PhotonSum(self._counts(span), self._weights * np.float32(len(span)))
         image = smoothed(photons, self._source.response, _DETAIL_PX, 1.0, 0.0)
         seen = image.frames > 0
         values = np.where(seen, image.values, image.values[seen].mean() if seen.any() else 0).astype(np.float32)
@@ -119,9 +118,8 @@ class _Burst:
             for part in divided(len(span), max(1, math.ceil(way_px / self._config.tolerance_px))):
                 chunk = FrameSpan(span.start + part.start, span.start + part.stop)
                 shifts = at_instant(middles, motion, chunk.centre) - there
-                add_patches(
-                    self._counts(chunk), self._worth, float(len(chunk)), shifts, self._grid.step, counts[place], weight[place]
-                )
+                summed = Frames(self._counts(chunk), self._weights, float(len(chunk)))
+                add_patches(summed, shifts, self._grid.step, counts[place], weight[place])
         mean = wiener_mean(counts, weight, self._reference, self._source.response)
         frames = weight.sum(axis=0)
         return PhotonSum(self._grid.joined(mean * frames), self._grid.joined(frames))

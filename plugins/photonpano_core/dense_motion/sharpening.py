@@ -8,7 +8,7 @@ import numpy as np
 from photonpano import BoolArray, Response
 from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import Image
-from photonpano_core.dense_motion.noise import count_variance
+from photonpano_core.dense_motion.frames import count_variance
 from photonpano_core.dense_motion.sub_exposures import blurred
 
 _WINDOW_PX = 1.5  # standard deviation of the window over which the Laplacian is compared with its noise, in px

@@ -16,7 +16,7 @@ from photonpano.geometry import inverse, rescaling, transform_points, translatio
 from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
 from photonpano_core.dense_motion.field import Image, MotionField
 from photonpano_core.dense_motion.frames import WeightedFrames
-from photonpano_core.dense_motion.warping import add_along, mean_of_seen
+from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along, mean_of_seen
 from photonpano_core.photon_mle import to_exposure
 
 SCALE = 0.5  # pixels of the grid per pixel of a frame
@@ -89,7 +89,7 @@ class SubExposures:
         """
         self._group, self._trajectory = group, trajectory
         self._frames = WeightedFrames(source)
-        self._worth = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
+        self._weights = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
         self._onto = to_exposure(group, trajectory, SCALE)
         height, width = source.info.frame_shape
         self.shape, self.response = (height // 2, width // 2), source.response
@@ -159,11 +159,11 @@ class SubExposures:
         fastest_px = self.fastest_px(field, where)
         for span, other in zip(self.spans, others or self.sums, strict=True):
             counts, weight = (np.where(where, np.float32(0), each) for each in (other.counts, other.weight))
+            sums = Sums(counts, weight, unwanted)
             for chunk, motion in self.moving(clipped(self._chunks, span, self._trajectory), field, fastest_px, _TOLERANCE_PX):
                 to_image = self._to_image(chunk.homography)
-                lit, n_frames = self._halved(chunk.span), float(len(chunk.span))
-                cells = (1.0, 0, 0)
-                add_along(lit, self._worth, n_frames, to_image, where, cells, motion, self._trusted, counts, weight, unwanted)
+                summed = Frames(self._halved(chunk.span), self._weights, float(len(chunk.span)))
+                add_along(summed, to_image, Moved(where, (1.0, 0, 0), motion, self._trusted), sums)
             merged.append(PhotonSum(counts, weight))
         return merged
 
