@@ -204,9 +204,10 @@ def _summed(
 ) -> _Summed:
     n_frames, shrink = len(chunk.span), footprint.shrink
     amounts = np.array([float(n_frames)]) if terms is None else terms.amounts(chunk.span)
-    raw = counts_of(chunk.span)
-    counts: FluxImage | Counts = np.ascontiguousarray(raw if corrected is None else corrected(raw, n_frames))
-    seen = masked
+    raw, seen = counts_of(chunk.span), masked
+    counts: FluxImage | Counts = np.ascontiguousarray(raw)
+    if corrected is not None:
+        counts = np.ascontiguousarray(corrected(raw, n_frames))
     if masked is not None:
         counts = np.asarray(counts.astype(np.float32) * masked, np.float32)
     elif any(side % shrink for side in counts.shape):

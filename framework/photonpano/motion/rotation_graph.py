@@ -1,4 +1,4 @@
-"""The motion graph of a camera that only turns: three unknowns a node, and a camera that all share."""
+"""The motion graph of a rotating camera: three unknowns a node, and a camera that all share."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MOST_TRIED = 400  # edges by which the first focal length is chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turns:
+class Rotations:
     """The rotations of a camera.
 
     Attributes:
@@ -39,12 +39,12 @@ class Turns:
     rotations: FloatArray
     camera: Camera
 
-    def of(self, nodes: slice) -> Turns:
+    def of(self, nodes: slice) -> Rotations:
         """Return the rotations of some nodes."""
-        return Turns(self.rotations[nodes], self.camera)
+        return Rotations(self.rotations[nodes], self.camera)
 
 
-class RotationAdjustment(Adjustment[Turns]):
+class RotationAdjustment(Adjustment[Rotations]):
     """The least-squares problem of a graph whose nodes are rotations of one camera.
 
     The unknowns of a node are a rotation vector in its own frame. Those of the camera that are not given are shared: the
@@ -65,24 +65,24 @@ class RotationAdjustment(Adjustment[Turns]):
         self._assumed, self._unknown = assumed, unknown
         self._lens = LensShift.of(problem.frame_shape, problem.observed)
 
-    def homographies(self, state: Turns) -> FloatArray:
+    def homographies(self, state: Rotations) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
         return state.camera.homographies(state.rotations)
 
-    def relative(self, state: Turns) -> FloatArray:
+    def relative(self, state: Rotations) -> FloatArray:
         """Return K R K^-1 of the rotation between the nodes of each edge: (E, 3, 3)."""
         between = np.swapaxes(state.rotations[self._fixed], -1, -2) @ state.rotations[self._moving]
         return state.camera.homographies(between)
 
-    def changed(self, state: Turns, nodes: FloatArray, shared: FloatArray) -> Turns:
-        """Turn each node, and change the camera."""
-        turned = state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px))
+    def changed(self, state: Rotations, nodes: FloatArray, shared: FloatArray) -> Rotations:
+        """Rotate each node, and change the camera."""
+        rotated = state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px))
         camera = state.camera
         for index, step in zip(self._unknown, shared * self._units(camera), strict=True):
             camera = _changed(camera, index, float(step))
-        return Turns(turned, camera)
+        return Rotations(rotated, camera)
 
-    def mapped_corners(self, state: Turns) -> FloatArray:
+    def mapped_corners(self, state: Rotations) -> FloatArray:
         """Return where the corners are seen: (E, 4, 2) px.
 
         If pixels were undistorted with the wrong lens, no homography holds exactly; it is the one that fits best where both
@@ -93,23 +93,23 @@ class RotationAdjustment(Adjustment[Turns]):
             return mapped
         return mapped + self._lens.of_corners(self.relative(state), state.camera, self._assumed)
 
-    def generators(self, state: Turns) -> FloatArray:
+    def generators(self, state: Rotations) -> FloatArray:
         """Return the derivatives by rotations that move the middle of the frame by about half its side: (3, 3, 3)."""
         return state.camera.homographies(ROTATION_AXES) * (self._half / state.camera.focal_px)
 
-    def information(self, state: Turns, blocks: FloatArray) -> FloatArray:
+    def information(self, state: Rotations, blocks: FloatArray) -> FloatArray:
         """Convert to information on rotation vectors, in radians: (N, 3, 3)."""
         return blocks * (state.camera.focal_px / self._half) ** 2
 
-    def shared_slopes(self, state: Turns) -> FloatArray:
+    def shared_slopes(self, state: Rotations) -> FloatArray:
         """Return the derivatives of the corners by what is unknown of the camera: (E, 8, s)."""
         here, found = self.mapped_corners(state), []
         for index, unit in zip(self._unknown, self._units(state.camera), strict=True):
-            there = self.mapped_corners(Turns(state.rotations, _changed(state.camera, index, _STEP * unit)))
+            there = self.mapped_corners(Rotations(state.rotations, _changed(state.camera, index, _STEP * unit)))
             found.append((there - here).reshape(len(here), 8) / _STEP)
         return np.stack(found, axis=-1)
 
-    def shared_errors(self, state: Turns) -> FloatArray:
+    def shared_errors(self, state: Rotations) -> FloatArray:
         """Return how the corners of each frame move on the plane of the anchor by what is unknown of the camera: (N, 8, s)."""
         homographies, zoom = self.homographies(state), _zoom(state.camera)
         moved = (np.linalg.solve(homographies, zoom @ homographies) - zoom) @ self._rows
@@ -121,7 +121,7 @@ class RotationAdjustment(Adjustment[Turns]):
             found.append(by_focal if index == 0 else np.broadcast_to(by_lens, by_focal.shape))
         return np.concatenate(found, axis=-1)
 
-    def prior(self, state: Turns) -> tuple[FloatArray, FloatArray]:
+    def prior(self, state: Rotations) -> tuple[FloatArray, FloatArray]:
         """Return what is known before: a focal length of some sides of a frame, and a lens that distorts by less than that."""
         units = self._units(state.camera)
         away = [_away(state.camera, index, 2 * self._half) for index in self._unknown]
@@ -133,7 +133,7 @@ class RotationAdjustment(Adjustment[Turns]):
         end = float(np.hypot(*self._frame_shape)) / 2 / camera.focal_px
         return np.array([1.0, end**-2, end**-4, end**-1, end**-1])[list(self._unknown)]
 
-    def std_camera(self, state: Turns, std_shared: FloatArray) -> FloatArray:
+    def std_camera(self, state: Rotations, std_shared: FloatArray) -> FloatArray:
         """Return the expected errors of the focal length, in px, and of k1, k2, p1 and p2: (5,), 0 for what is given."""
         found = np.zeros(5)
         found[list(self._unknown)] = std_shared * self._units(state.camera)
@@ -143,9 +143,9 @@ class RotationAdjustment(Adjustment[Turns]):
     def likeliest_camera(self, camera: Camera) -> Camera:
         """Return the camera with the focal length that explains the edges best, each by itself."""
         candidates = [_with_focal(camera, length * 2 * self._half) for length in _FOCAL_LENGTHS]
-        return min(candidates, key=self._misfit)
+        return min(candidates, key=self._cost_of)
 
-    def _misfit(self, camera: Camera) -> float:
+    def _cost_of(self, camera: Camera) -> float:
         chosen = np.unique(np.linspace(0, len(self._moving) - 1, _MOST_TRIED).astype(int))
         whitening, targets = self._whitening[chosen], self._targets[chosen]
         here = np.broadcast_to(self._corners, targets.shape)
@@ -155,10 +155,10 @@ class RotationAdjustment(Adjustment[Turns]):
         moves = camera.homographies(ROTATION_AXES)
         for _ in range(2):
             mapped = camera.homographies(rotations)
-            by_turn = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
+            by_rotation = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
             residuals = np.einsum("eij,ej->ei", whitening, (transform_points(mapped, self._corners) - targets).reshape(-1, 8))
             step = -np.linalg.solve(
-                np.swapaxes(by_turn, -1, -2) @ by_turn, np.einsum("eij,ei->ej", by_turn, residuals)[..., None]
+                np.swapaxes(by_rotation, -1, -2) @ by_rotation, np.einsum("eij,ei->ej", by_rotation, residuals)[..., None]
             )
             rotations = rotations @ rotation_matrices(step[..., 0])
         residuals = np.einsum(

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from photonpano.geometry import Camera, align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
+from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import TurningTrajectory
 from photonpano.protocols import Trajectory, camera_of_motion
 from photonpano.values import FloatArray
 
@@ -85,17 +85,17 @@ class Uncertainty:
 
 
 def _std_camera(located: LocatedLevel, before: Camera | None) -> FloatArray | None:
-    if located.solution.turns is None:
+    if located.solution.rotations is None:
         return None
     if before is None:
         return located.std_camera
-    change = located.solution.turns.camera.numbers - before.numbers
+    change = located.solution.rotations.camera.numbers - before.numbers
     return np.asarray(np.hypot(located.std_camera, _REMAINING_SHARE * change))
 
 
 def _aligned(after: Trajectory, before: Trajectory, frames: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
     """Return the best map from the reference plane of one trajectory to that of another: (3, 3)."""
-    if isinstance(after, TurningTrajectory) and isinstance(before, TurningTrajectory):
+    if isinstance(after, RotationTrajectory) and isinstance(before, RotationTrajectory):
         turned = align_rotations(after.rotations(frames), before.rotations(frames))
         start = before.camera.homographies(turned)
         return align_planes(after.at(frames), before.at(frames), frame_shape, start)

@@ -280,7 +280,7 @@ def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decisio
     located = results[-1].located
     if plan.motion.model != "auto":
         return []
-    taken = "homography" if located.solution.turns is None else "rotation"
+    taken = "homography" if located.solution.rotations is None else "rotation"
     if located.evidence is None:
         return [Decision("motion_model", taken, "the camera turns too far for homographies to one plane")]
     gain = located.evidence.gain

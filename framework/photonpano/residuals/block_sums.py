@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,7 +202,8 @@ class Totals(NamedTuple):
 
     def plus(self, other: Totals) -> Totals:
         """Return the sums over both."""
-        return Totals(*map(np.add, self, other))
+        both: Iterable[tuple[Any, Any]] = zip(self, other, strict=True)
+        return Totals._make(one + another for one, another in both)
 
 
 @compiled

@@ -291,14 +291,14 @@ def _contradicting(dropped: int, pairs: int) -> _Found:
 
 @_doubtful_above(3.0, NO_TURN, "write motion: {model: homography}, or find the lens with camera: {distortion: {k1: find}}")
 def _no_turn(run: _Run) -> _Found | None:
-    if not run.levels or run.levels[-1].located.solution.turns is None:
+    if not run.levels or run.levels[-1].located.solution.rotations is None:
         return None
     evidence = run.levels[-1].located.evidence
     if evidence is None:
         return None
     residual, free = np.sqrt([evidence.rotation, evidence.homography]).tolist()
     where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
-    return _Found(residual, where, doubtful=not evidence.turns_only)
+    return _Found(residual, where, doubtful=not evidence.rotations_suffice)
 
 
 @_doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")

@@ -175,11 +175,11 @@ def test_uncertain_motion_is_doubtful(explained: Explained, change: Callable[...
     assert np.isfinite(reason.figure)
 
 
-def level_with(turns: object | None = None, evidence: Evidence | None = None, n_ambiguous: int = 0) -> Any:
+def level_with(rotations: object | None = None, evidence: Evidence | None = None, n_ambiguous: int = 0) -> Any:
     """A level of 30 pairs."""
     pairs = tuple((index + 1, index) for index in range(n_ambiguous))
     ambiguity = Ambiguity(1, pairs, 40.0) if pairs else None
-    solution = SimpleNamespace(turns=turns, outliers=())
+    solution = SimpleNamespace(rotations=rotations, outliers=())
     located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=(None,) * 30, solution=solution)
     return SimpleNamespace(level=SimpleNamespace(number=1), located=located)
 
