@@ -22,11 +22,11 @@ from photonpano.motion.tracking.spans import (
 from photonpano.protocols import Source
 from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
 
-_PLACES = 12  # the speed is measured at 12 places, evenly spaced over the capture
+_PLACES = 12  # where the speed is measured, evenly spaced over the capture
 # Lengths of the spans that are summed, in frames, from the shortest to the longest that is tried.
 _SPANS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-_SPANS_IN_CAPTURE = 6  # a span is at most a sixth of the capture
-_LARGE_SHIFT_PX = 2.0  # stop lengthening the span once the shift is at least 2 binned pixels
+_SPANS_IN_CAPTURE = 6  # at least
+_LARGE_SHIFT_PX = 2.0  # shift that is exact enough, in binned pixels
 # The three shifts of a place agree within 1.5 binned pixels. Shifts of pure noise agree by chance at fewer than 1 in 100
 # places.
 _TOLERANCE_PX = 1.5

@@ -31,7 +31,7 @@ def normalised(matrices: ArrayLike) -> Homography:
 
 
 def scaled_ahead(matrices: ArrayLike) -> Homography:
-    """Scale (..., 3, 3) matrices so that h33 = 1 where it is positive; others stay: their sign tells what lies behind a camera.
+    """Scale (..., 3, 3) matrices so that h33 = 1 where it is positive; others keep their sign: it is negative behind a camera.
 
     Raises:
         ValueError: a matrix is not finite.

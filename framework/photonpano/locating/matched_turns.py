@@ -19,8 +19,8 @@ from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLoc
 
 _SCATTER = 2.0  # keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`
 _LEAST_SHARE = 0.2
-# Objects that look alike match and agree with each other in different scenes as well. So this share of the matches must agree,
-# and they must be spread: in all directions, their standard deviation is at least this share of the shorter side of the image.
+# Similar objects match and agree in different scenes, too. So a minimum share of the matches must agree, and their standard
+# deviation in every direction must be a minimum share of the shorter side of the image.
 _LEAST_SPREAD = 0.1
 _ITERATIONS = 10  # steps of reweighted least squares; the last ones change the rotation by far less than its error
 
@@ -167,7 +167,7 @@ def _information(lengths: FloatArray, scale: float, threshold_px: float) -> floa
     """Return the information of a match on each coordinate of its position, in px^-2: that of an M-estimator (Huber 1981).
 
     A match beyond the threshold has no influence. So a shift of the fit gains matches on one side and loses them on the other,
-    which cancels what the others say where matches are spread evenly, as chance spreads them.
+    which cancels the information of the others where matches are spread evenly, as chance spreads them.
 
     Args:
         lengths: (N,) of the residuals of all matches, the same in all directions.

@@ -1,4 +1,4 @@
-"""What a pair of exposures says of a camera that only turns: three of the eight parameters of a homography."""
+"""Information of a pair of exposures on a rotation of the camera: three of the eight parameters of a homography."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _UNKNOWN = 1.0
 
 
 class TurnInformation(NamedTuple):
-    """What a pair of exposures says of a turn between them.
+    """Information of a pair of exposures on the rotation between them.
 
     Attributes:
         information: (8, 8) inverse covariance of p1..p8 of the homography. Only a turn is known: what else could have happened

@@ -171,7 +171,7 @@ def _sum_on(
 
 
 def weights_of(source: Source) -> FluxImage | None:
-    """Return what a frame of each pixel is worth, 0 for a masked one: (H, W); None if it is 1 for all."""
+    """Return the weight of a frame of each pixel, 0 for a masked one: (H, W); None if it is 1 for all."""
     if isinstance(source, WeightedSource):
         return np.where(source.valid, source.weights(), np.float32(0))
     return None if source.valid.all() else source.valid.astype(np.float32)

@@ -24,7 +24,7 @@ _RGB = 3  # colours of a panorama; clear pixels, which come last, are none
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CanvasNoise:
-    """What the noise on a canvas depends on, beside flux and weight.
+    """Noise model of a canvas: all that its noise depends on beside flux and weight.
 
     A correction multiplies the counts of a pixel by `slope` and adds `offset` for each frame: see `flux_std`.
 
@@ -71,8 +71,8 @@ class CanvasNoise:
         valid = source.valid
         if isinstance(source, WeightedSource):
             # A count of weight w adds w to the weight and w^2 times its variance: in frames of weight 1, w times its variance.
-            worth = source.weights()
-            slope, offset = slope * worth, offset * worth
+            weights = source.weights()
+            slope, offset = slope * weights, offset * weights
         means = float(slope[valid].mean()), float(offset[valid].mean())
         if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
             return cls(source.response, *means)

@@ -18,12 +18,12 @@ from photonpano.robust import cauchy_weights
 from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
-CONVERGED_PX = 1e-3  # a step that moves no corner by more than about this has converged
-MAX_HALVINGS = 8  # a step that raises the cost is halved up to this many times
-NO_WORSE = 1e-6  # rounding errors may raise the cost by this share
-# Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise).
+CONVERGED_PX = 1e-3  # largest motion of a corner in the last step
+MAX_HALVINGS = 8  # of a step that raises the cost
+NO_WORSE = 1e-6  # relative increase of the cost by rounding errors
+# Tuning constant of the Cauchy weights, in scales of the residuals: 95 % efficiency for Gaussian noise.
 CAUCHY = 2.385
-OUTLIER = 8.0  # an edge whose residual exceeds this many scales is an outlier
+OUTLIER = 8.0  # residual of an outlier, in scales of the residuals
 MEDIAN_NORM = 0.958  # the median of the root mean square of eight Gaussian numbers of unit variance
 # Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by.
 _DAMPING, _TINY = 1e-10, 1e-200
@@ -78,7 +78,7 @@ class Adjustment(ABC, Generic[StateT]):
     Each node has k unknowns, which move it a little in its own frame; all nodes may share some more. Unknowns have about unit
     size: a change by one moves the ends of a frame by about half its side, wherever the frame lies.
 
-    Subclasses say what a state is, such as the homographies of the nodes, and how it changes.
+    Subclasses define the state, such as the homographies of the nodes, and its change by a step.
     """
 
     def __init__(self, problem: Problem, n_shared: int = 0) -> None:

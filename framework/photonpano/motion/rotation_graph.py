@@ -19,11 +19,11 @@ from photonpano.motion.adjustment import Adjustment, Problem
 from photonpano.motion.lens_shift import LensShift
 from photonpano.values import FloatArray
 
-_FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # focal lengths that are tried first, in sides of a frame
-# What is known of the focal length before: its logarithm is that of 3 sides of a frame, give or take 2.
+_FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
+# Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
-_PRIOR_DISTORTION = 1.0  # what is known of the lens before: it moves the corners of a frame by up to about its half diagonal
-_STEP = 1e-5  # change of an unknown by which derivatives are taken
+_PRIOR_DISTORTION = 1.0  # prior standard deviation of the displacement of a corner by the lens, in half diagonals
+_STEP = 1e-5  # step of numerical derivatives
 _MOST_TRIED = 400  # edges by which the first focal length is chosen
 
 

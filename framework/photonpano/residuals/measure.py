@@ -220,7 +220,7 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Colour:
-    """What is compared in one colour of the capture.
+    """Counts and prediction in one colour of the capture.
 
     Attributes:
         source: its pixels.

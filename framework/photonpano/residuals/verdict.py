@@ -20,7 +20,7 @@ from photonpano.values import BoolArray, Decision
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
-# Reasons that need the pairs, or their alternatives, which a run folder does not hold.
+# These need the pairs of the loop, which a run folder does not hold.
 MAX_CONTRAST = 0.02  # of residuals, as a share of the light, beyond which a large misfit counts
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
@@ -66,7 +66,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """What the tests look at: see `judge`; and the contradicting pairs of the last level, and all of them."""
+    """Data of a run that is tested: see `judge`."""
 
     explained: Explained
     levels: Sequence[LevelResult]
@@ -74,6 +74,7 @@ class _Run:
 
     @property
     def pairs(self) -> tuple[int, int] | None:
+        """Number of contradicting pairs of the last level, and of all its pairs."""
         if not self.levels:
             return None
         located = self.levels[-1].located
@@ -81,7 +82,7 @@ class _Run:
 
 
 class _Found(NamedTuple):
-    """What a test found: its figure, where, and whether the run is doubtful whatever the figure."""
+    """Figure of a test and where it occurs; `doubtful` overrides the threshold."""
 
     figure: float
     where: str

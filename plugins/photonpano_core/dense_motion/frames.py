@@ -14,10 +14,10 @@ _SHARE = np.float32(0.01)  # relative step of the numerical derivative
 
 
 class WeightedFrames:
-    """Returns the sum of the frames of a span: (H, W) float32, corrected, and multiplied by what each pixel is worth.
+    """Returns the sum of the frames of a span: (H, W) float32, corrected, and multiplied by the weight of each pixel.
 
     Attributes:
-        worth: (H, W) float32, what a frame of each pixel is worth, from 0, for a masked one, to 1; (0, 0) if it is 1 for all.
+        worth: (H, W) float32, weight of a frame of each pixel, from 0, for a masked one, to 1; (0, 0) if it is 1 for all.
     """
 
     def __init__(self, source: Source) -> None:

@@ -34,21 +34,21 @@ _SPANS = 16  # a window is divided into 16 spans: between two of them the image 
 _PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
 # Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
 _SIGNIFICANT = 7.0
-_RIVAL = 0.6  # peaks of at least this share of the highest one are kept as hypotheses
+_RIVAL = 0.6  # least height of the peak of a hypothesis, relative to the highest
 _LEAST_EXTENT = 0.05  # a part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's
-_DISTINCT_PX = 4.0  # two motions are told apart if they differ by this many binned pixels over a window
-# Spans are doubled until the image moves by this many binned pixels from one to the next, which determines the speed.
+_DISTINCT_PX = 4.0  # least difference of two motions over a window, in binned pixels
+# Shift between spans that is exact enough, in binned pixels; spans are doubled until then.
 _EXACT_PX = 4.0
 _TRACKED_PX = 2.0  # a peak of doubled spans lies within this many binned pixels of twice the shift of single ones
 _CONTINUITY_PX = 1.0  # standard deviation of the change of a shift, in binned pixels, from one window to the next
-_CONTINUITY_SHARE = 0.3  # it is at most this share of the difference of two hypotheses: the motions of scene and object go on
-_SLOWER = 3.0  # a motion is taken for granted, and one that is this many times as fast is not considered
-_TIE = 4.0  # hypotheses whose log likelihoods differ by less than this cannot be told apart
+_CONTINUITY_SHARE = 0.3  # its largest value, relative to the difference of two hypotheses
+_SLOWER = 3.0  # motions that are faster than the slowest by this factor are left out
+_TIE = 4.0  # difference of the log likelihoods of hypotheses below which both are kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """What the image may do within one window.
+    """Possible velocities of the image within one window.
 
     Attributes:
         velocities: (P, 2) in px of a frame per frame period, likeliest first.
