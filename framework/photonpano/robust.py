@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from photonpano.values import FloatArray
 
-# `scipy.stats.median_abs_deviation(scale="normal")` for residuals about 0, whose import takes a second.
-_STD_PER_MEDIAN = float(1 / ndtri(0.75))
+# As `scipy.stats.median_abs_deviation(scale="normal")`, whose import takes a second, for residuals about 0.
+_STD_PER_MEDIAN = 1 / NormalDist().inv_cdf(0.75)
 
 
 def robust_std(residuals: NDArray[np.floating]) -> float:

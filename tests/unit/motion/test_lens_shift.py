@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from photonpano.geometry import Camera, corners, rotation_matrices, transform_points
-from photonpano.motion.lens_shift import LensShift
+from photonpano.motion.rotation_graph import LensShift
 
 SHAPE = (254, 496)
 LENS = (-0.1, 0.0, 0.0, 0.0)
