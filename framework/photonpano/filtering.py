@@ -1,4 +1,4 @@
-"""What of a series of measured steps exceeds their noise: a Wiener filter whose spectrum is that of the series itself."""
+"""Denoise a series of steps with an empirical Wiener filter, whose spectrum is estimated from the series itself."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from photonpano.values import FloatArray
 
-WINDOW = 128
-"""Longest window of the spectra, in steps: a tremor may change from one window to the next."""
+WINDOW = 128  # longest window of the spectra, in steps: a tremor may change from one window to the next
+# Minimum power of a frequency that is kept, relative to the noise, averaged over 3 windows by 3 frequencies.
 SIGNIFICANT = 3.0
-"""A frequency is kept if its power exceeds that of the noise by this factor, on the mean of 3 windows by 3 frequencies."""
+# Systematic error of a step: frames and panorama are interpolated at different fractions of a pixel.
 SYSTEMATIC_PX = 0.015
-"""Steps are wrong by about this much where frames and panorama are interpolated at different fractions of a pixel."""
+# Number of lowest frequencies with an additional error, and its size in px: the reference itself follows slow motion.
 SLOW = 2, 0.04
-"""Number of the lowest frequencies of a window that must exceed an error of a size, too, and this size in px: what steps are
-measured against follows a slow motion, and is no better itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +32,7 @@ class Filtered:
 
 
 def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
-    """Filter a series of steps by its own spectrum, window by window.
+    """Denoise a series of steps with an empirical Wiener filter, window by window.
 
     Args:
         steps: (S,) in px.

@@ -18,7 +18,7 @@ from photonpano.locating import (
     free_parameters,
     turn_slopes,
 )
-from photonpano.photometry import Similarity, tapered
+from photonpano.photometry import Similarity, hann_window
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.layers import Layer
@@ -278,7 +278,7 @@ class _Alignment:
 def _hypotheses(moving: Layer, fixed: Layer, n_layers: int) -> list[Homography]:
     """Return the shifts at which the phase correlation of the coarsest layers peaks, in pixels of the finest layer."""
     height, width = moving.image.shape
-    window = tapered((height, width))
+    window = hann_window((height, width))
     flat = [np.where(layer.weight > 0, layer.image - layer.image[layer.weight > 0].mean(), 0) for layer in (moving, fixed)]
     spectra = [np.fft.rfft2(window * image) for image in flat]
     surface = correlation_surface(spectra[1] * spectra[0].conj(), (height, width), _PEAK_PX)

@@ -29,9 +29,8 @@ from photonpano.context import Context
 from photonpano.corrections.colours import with_colours
 from photonpano.evaluation import covered, image_score, true_panorama, white_flux
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of, inverse, normalised
-from photonpano.merging.colour import composed, filled
+from photonpano.merging.colour import composed, filled, with_shared_detail
 from photonpano.merging.panorama import render
-from photonpano.merging.shared_detail import with_shared_detail
 from photonpano.photometry import BinaryResponse, linear_to_srgb
 from photonpano.reading import bayer_array
 from photonpano.testing import MemorySource

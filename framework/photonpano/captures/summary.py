@@ -6,35 +6,32 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.geometry import translation
-from photonpano.locating import Follows, follows, shift_by_phase
 from photonpano.merging import binned_mean, binning_of
-from photonpano.photometry import tapered
+from photonpano.motion.tracking.spans import (
+    SHORTEST,
+    following,
+    noise_of_difference,
+    shifted,
+    shifts_between,
+    spectra_of,
+    stabilised,
+)
 from photonpano.protocols import Source
 from photonpano.values import CaptureSummary, FloatArray, FluxImage, FrameSpan
 
-_PLACES = 12
-"""The speed is measured at 12 places, evenly spaced over the capture."""
+_PLACES = 12  # where the speed is measured, evenly spaced over the capture
+# Lengths of the spans that are summed, in frames, from the shortest to the longest that is tried.
 _SPANS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-"""Lengths of the spans that are summed, in frames, from the shortest to the longest that is tried."""
-_SHORTEST = {"binary": 4, "intensity": 1}
-"""The shortest span, in frames: sums of fewer binary frames are mostly noise."""
-_SPANS_IN_CAPTURE = 6
-"""A span is at most a sixth of the capture."""
-_LARGE_SHIFT_PX = 2.0
-"""Stop lengthening the span once the shift is at least 2 binned pixels."""
-_PEAK_PX = 1.5
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_SPANS_IN_CAPTURE = 6  # at least
+_LARGE_SHIFT_PX = 2.0  # shift that is exact enough, in binned pixels
+# The three shifts of a place agree within 1.5 binned pixels. Shifts of pure noise agree by chance at fewer than 1 in 100
+# places.
 _TOLERANCE_PX = 1.5
-"""The three shifts of a place agree within 1.5 binned pixels. Shifts of pure noise agree by chance at fewer than 1 in 100
-places."""
+# To find a capture without light, or a saturated one, 16 frames at each of 16 places are summed.
 _CHECKED_PLACES, _CHECKED_FRAMES = 16, 16
-"""To find a capture without light, or a saturated one, 16 frames at each of 16 places are summed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +54,7 @@ def summarise(source: Source, threads: int = 1) -> CaptureSummary:
         threads: how many places are measured at once; the result does not depend on it.
     """
     n_frames = source.info.n_frames
-    lengths = [length for length in _SPANS if _SHORTEST[source.info.kind] <= length <= n_frames // _SPANS_IN_CAPTURE]
+    lengths = [length for length in _SPANS if SHORTEST[source.info.kind] <= length <= n_frames // _SPANS_IN_CAPTURE]
     if not lengths:
         flux = _mean_flux(source, [binned_mean(source, source.info.span)], n_frames)
         return CaptureSummary(flux, None, f"{n_frames} frames are too few to estimate a motion")
@@ -81,8 +78,9 @@ def _measure(source: Source, centre: float, lengths: Sequence[int]) -> tuple[flo
         start = int(np.clip(centre - 1.5 * length, 0, n_frames - 3 * length))
         spans = (FrameSpan(first, first + length) for first in range(start, start + 3 * length, length))
         means = [binned_mean(source, span) for span in spans]
-        noise = 2 * float(source.response.stabilised_std(float(length * binning**2))) ** 2
-        shift = _majority_shift([_stabilised(source, mean, length) for mean in means], noise)
+        images = [stabilised(source, mean, length) for mean in means]
+        centred = [np.nan_to_num(image - np.nanmean(image)) for image in images]
+        shift = _majority_shift(centred, noise_of_difference(source, length))
         if shift is not None:
             speed = _Speed(float(np.linalg.norm(shift)) * binning / length, length)
             if np.linalg.norm(shift) >= _LARGE_SHIFT_PX:
@@ -103,39 +101,26 @@ def _majority_shift(images: Sequence[FluxImage], noise: float) -> FloatArray | N
     shift = _common_shift(images)
     if shift is None:
         return None
-    part = _following(images, shift, noise)
+    part = following(images[0], shifted(images[1], shift), noise)
     if not part.suspect:
         return shift
     other = _common_shift(images, part.rest)
     if other is None or np.linalg.norm(other - shift) < _TOLERANCE_PX:
         return shift
-    return other if _following(images, other, noise).more_than(part) else shift
+    return other if following(images[0], shifted(images[1], other), noise).more_than(part) else shift
 
 
-def _following(images: Sequence[FluxImage], shift: FloatArray, noise: float) -> Follows:
-    """Find the part of the first two of three images that follows a shift."""
-    height, width = images[0].shape
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    fixed = cv2.warpAffine(images[1], translation(*shift)[:2], (width, height), flags=flags, borderValue=np.nan)
-    seen = np.isfinite(fixed)
-    return follows(images[0], np.nan_to_num(fixed), np.where(seen, np.float32(noise), np.float32(np.inf)))
-
-
-def _common_shift(images: Sequence[FluxImage], weight: NDArray[np.float32] | None = None) -> FloatArray | None:
+def _common_shift(images: Sequence[FluxImage], weight: FluxImage | None = None) -> FloatArray | None:
     """Return the shift (x, y) from each of three images to the next, in their pixels; None if the shifts do not agree.
 
     Args:
-        images: of mean 0.
-        weight: (H, W) of their pixels, 1 by default.
+        images: (h, w) each.
+        weight: (h, w) of their pixels, 1 by default.
     """
     if not all(np.ptp(image) for image in images):
         return None
-    window = tapered(images[0].shape)
-    if weight is not None:
-        window = window * weight
-        images = [image - np.float32(np.average(image, weights=window)) for image in images]
-    pairs = ((images[0], images[1]), (images[1], images[2]), (images[0], images[2]))
-    first, second, both = (shift_by_phase(a * window, b * window, _PEAK_PX, gaussian_peak=False) for a, b in pairs)
+    spectra = spectra_of(images, weight)
+    first, second, both = shifts_between(spectra[[0, 1, 0]], spectra[[1, 2, 2]], images[0].shape)
     if first is None or second is None or both is None:
         return None
     if max(np.linalg.norm(second - first), np.linalg.norm(both - first - second)) > _TOLERANCE_PX:
@@ -147,13 +132,6 @@ def _mean_flux(source: Source, means: Sequence[FluxImage], n_frames: int) -> flo
     """Return the flux, averaged over the pixels, of mean counts that `n_frames` frames were summed for."""
     flux = source.response.flux(np.mean(means, axis=0), float(n_frames * binning_of(source) ** 2))
     return float(np.nanmean(flux))
-
-
-def _stabilised(source: Source, mean_count: FluxImage, n_frames: int) -> FluxImage:
-    """Return an image on the scale on which its noise is uniform, with mean 0; 0 where no pixel is valid."""
-    frames = float(n_frames * binning_of(source) ** 2)
-    image = source.response.stabilised(source.response.flux(mean_count, frames), frames)
-    return np.nan_to_num(image - np.nanmean(image))
 
 
 def require_photons(source: Source) -> None:

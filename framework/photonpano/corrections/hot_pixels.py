@@ -11,6 +11,7 @@ from pydantic import Field
 from photonpano.contributions import SpecPath
 from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
+from photonpano.robust import robust_std
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,8 +35,6 @@ makes at least 1/6 of them bright, at the border of the frame as well. Where man
 neighbours that are hot by chance, and two standard deviations of it."""
 _MIN_KNOWN = 6
 """A pixel with fewer known neighbours than this is not compared."""
-_TO_STD = 1.4826
-"""Standard deviation of a normal distribution divided by its median absolute deviation."""
 
 
 class HotPixels(Correction):
@@ -89,7 +88,7 @@ def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tup
     if not rates.size:
         return np.zeros(valid.shape, np.bool_), np.inf
     median = float(np.median(rates))
-    std = _TO_STD * float(np.median(np.abs(rates - median)))
+    std = robust_std(rates - median)
     if dark.n_frames is not None:
         # One count by chance must not make a pixel hot.
         std = max(std, float(np.sqrt(max(median, 1 / dark.n_frames) / dark.n_frames)))
@@ -126,7 +125,7 @@ def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
     known = differences[np.isfinite(differences)]
     if not known.size:
         return np.zeros(image.shape, np.bool_)
-    limit = threshold * max(_TO_STD * float(np.median(known)), noise_std)
+    limit = threshold * max(robust_std(known), noise_std)
     by_chance = float(np.mean(known > limit))
     share = max(_LINE_SHARE, by_chance + 2 * np.sqrt(by_chance * (1 - by_chance) / around.shape[-1]))
     outside = np.fmax(image - brightest(around, share), darkest(around, share) - image)

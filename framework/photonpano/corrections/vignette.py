@@ -10,6 +10,7 @@ import numpy as np
 from photonpano.capture import Capture, capture_of
 from photonpano.corrections.flat_field import Vignette
 from photonpano.geometry import apply, corner_displacements, inverse
+from photonpano.robust import huber_weights, robust_std
 from photonpano.values import FrameSpan, Homography
 
 if TYPE_CHECKING:
@@ -153,8 +154,8 @@ def _solved(
             return None
         brightness = solution[n_shape:][times]
         left = (target - within @ solution[:n_shape] - centred(brightness)) * np.sqrt(weight)
-        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-        robust = 1 / np.maximum(1, np.abs(left) / (_OUTLIER * scale))
+        scale = max(robust_std(left), 1e-9)
+        robust = huber_weights(left, _OUTLIER * scale)
     found, covariance = solution[:n_shape], inverted[:n_shape, :n_shape] * scale**2
     certain = float(found @ np.linalg.solve(covariance, found))
     return found if certain > n_shape * _SURE**2 else None

@@ -22,6 +22,7 @@ from .homographies import rescaling as rescaling
 from .homographies import scaled_ahead as scaled_ahead
 from .homographies import step_motions as step_motions
 from .homographies import steps_px as steps_px
+from .homographies import transform_points as transform_points
 from .homographies import translation as translation
 from .plausibility import why_implausible as why_implausible
 from .projections import PROJECTIONS as PROJECTIONS

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from photonpano.geometry.homographies import apply, corners, from_parameters, normalised
+from photonpano.geometry.homographies import corners, from_parameters, normalised, transform_points
 from photonpano.geometry.rotations import nearest_rotations
 from photonpano.geometry.steps import unit_coordinates
 from photonpano.values import FloatArray, Homography
 
+# Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
+# gives eight equations.
 FIT_FRAMES = 300
-"""Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
-gives eight equations."""
 
-_FAR_PX = 1e6
-"""Residual of points mapped to infinity."""
+_FAR_PX = 1e6  # residual of points mapped to infinity
 
 
 def align_planes(
@@ -51,11 +50,11 @@ def align_planes(
         )
     chosen = np.unique(np.linspace(0, len(true) - 1, FIT_FRAMES).round().astype(int))
     frame = corners(frame_shape)
-    from_points, to_points = apply(estimated[chosen], frame), apply(true[chosen], frame)
+    from_points, to_points = transform_points(estimated[chosen], frame), transform_points(true[chosen], frame)
     to_frame = np.linalg.inv(true[chosen])
     if start is None:
         condition, target_condition = _conditioning(from_points), _conditioning(to_points)
-        linear = _direct_linear(apply(condition, from_points), apply(target_condition, to_points))
+        linear = _direct_linear(transform_points(condition, from_points), transform_points(target_condition, to_points))
         left = np.linalg.inv(target_condition) @ linear
     else:
         condition = unit_coordinates(frame_shape)
@@ -67,9 +66,9 @@ def align_planes(
 
     def residuals(p: FloatArray) -> FloatArray:
         if start is None:
-            residual = apply(to_frame @ plane(p), from_points) - frame
+            residual = transform_points(to_frame @ plane(p), from_points) - frame
         else:  # points of the plane may lie behind the camera, or at infinity
-            residual = apply(to_frame @ plane(p) @ estimated[chosen], frame) - frame
+            residual = transform_points(to_frame @ plane(p) @ estimated[chosen], frame) - frame
         return np.nan_to_num(residual, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
 
     fit = least_squares(residuals, np.zeros(8), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)

@@ -11,8 +11,7 @@ from photonpano.geometry.homographies import rescaling
 from photonpano.values import FloatArray, Homography
 
 _ITERATIONS = 30
-_EXACT = 1e-13
-"""The inverse of the distortion has converged when its last step was below this, in focal lengths."""
+_EXACT = 1e-13  # the inverse of the distortion has converged when its last step was below this, in focal lengths
 
 
 @dataclass(frozen=True, slots=True, eq=False)

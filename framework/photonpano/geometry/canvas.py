@@ -7,14 +7,13 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from photonpano.geometry.homographies import BLOCK_FRAMES, apply, corners, rescaling, translation
+from photonpano.geometry.homographies import BLOCK_FRAMES, corners, rescaling, transform_points, translation
 from photonpano.geometry.projections import PROJECTIONS, Projection
 from photonpano.values import FloatArray, Homography
 
+# x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1.
 Box: TypeAlias = tuple[int, int, int, int]
-"""x0, y0, x1, y1 in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1."""
-Extent: TypeAlias = Literal["panorama", "reference"] | Box
-"""What a canvas holds: every frame, the reference frame, or a box."""
+Extent: TypeAlias = Literal["panorama", "reference"] | Box  # what a canvas holds: every frame, the reference frame, or a box
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +146,7 @@ def canvas_of(
         raise ValueError(f"homography {index} of {len(homographies)} sends part of its frame behind the reference plane")
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for start in range(0, len(homographies), BLOCK_FRAMES):
-        points = apply(homographies[start : start + BLOCK_FRAMES], frame).reshape(-1, 2)
+        points = transform_points(homographies[start : start + BLOCK_FRAMES], frame).reshape(-1, 2)
         low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     # Whole reference pixels, so that the canvas of scale 1 samples the reference frame without interpolation.
     low, high = np.floor(low + 1e-6), np.ceil(high - 1e-6)

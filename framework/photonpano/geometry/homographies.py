@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from photonpano.values import FloatArray, Homography
 
-BLOCK_FRAMES = 8192
-"""What is computed of all frames of a capture is computed for this many at a time, which bounds the memory."""
+BLOCK_FRAMES = 8192  # what is computed of all frames of a capture is computed for this many at a time, which bounds the memory
 
 
 def normalised(matrices: ArrayLike) -> Homography:
@@ -32,7 +31,7 @@ def normalised(matrices: ArrayLike) -> Homography:
 
 
 def scaled_ahead(matrices: ArrayLike) -> Homography:
-    """Scale (..., 3, 3) matrices so that h33 = 1 where it is positive; others stay: their sign tells what lies behind a camera.
+    """Scale (..., 3, 3) matrices so that h33 = 1 where it is positive; others keep their sign: it is negative behind a camera.
 
     Raises:
         ValueError: a matrix is not finite.
@@ -92,7 +91,7 @@ def rescaled(homographies: Homography, scale: float) -> Homography:
     return normalised(rescaling(scale) @ homographies @ rescaling(1 / scale))
 
 
-def apply(homographies: Homography, points: ArrayLike) -> FloatArray:
+def transform_points(homographies: Homography, points: ArrayLike) -> FloatArray:
     """Map points.
 
     Args:
@@ -109,6 +108,9 @@ def apply(homographies: Homography, points: ArrayLike) -> FloatArray:
         return np.asarray(mapped / depth)
 
 
+apply = transform_points  # deprecated: use `transform_points`
+
+
 def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
     """Return the derivatives of the mapped points with respect to p1..p8 of `parameters`: (N, 2, 8).
 
@@ -119,7 +121,7 @@ def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
     points = np.asarray(points, dtype=np.float64)
     depth = points @ homography[2, :2] + homography[2, 2]
     x, y = points.T / depth
-    u, v = apply(homography, points).T
+    u, v = transform_points(homography, points).T
     zero, one = np.zeros_like(x), 1 / depth
     return np.stack(
         [
@@ -142,7 +144,7 @@ def corners(shape: tuple[int, int]) -> FloatArray:
 def corner_displacements(first: Homography, second: Homography, shape: tuple[int, int]) -> FloatArray:
     """Return the distances, in pixels, between the four corners of an image under one map and under another: (..., 4)."""
     frame = corners(shape)
-    return np.asarray(np.linalg.norm(apply(first, frame) - apply(second, frame), axis=-1))
+    return np.asarray(np.linalg.norm(transform_points(first, frame) - transform_points(second, frame), axis=-1))
 
 
 def steps_px(homographies: Homography, shape: tuple[int, int]) -> FloatArray:
@@ -177,5 +179,4 @@ def from_parameters(p: ArrayLike) -> Homography:
     return h
 
 
-_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))
-"""Row and column of p1..p8."""
+_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  # row and column of p1..p8

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from photonpano.geometry.homographies import apply, corners
+from photonpano.geometry.homographies import corners, transform_points
 from photonpano.values import Homography
 
 
@@ -32,7 +32,7 @@ def why_implausible(homography: Homography, shape: tuple[int, int], min_overlap:
             shapes.SIDES: f"the homography makes opposite sides of the image differ by a factor of {number:.2g} "
             f"(at most {shapes.MAX_SIDE_CHANGE:g} is plausible)",
         }[kind]
-    quad = apply(homography, corners(shape)).tolist()
+    quad = transform_points(homography, corners(shape)).tolist()
     overlap = _overlap(quad, shape)
     if overlap < min_overlap:
         return f"the images overlap by {overlap:.0%} (at least {min_overlap:.0%} is needed)"

@@ -64,9 +64,9 @@ def _on_sphere(rays: FloatArray) -> FloatArray:
     return np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
 
 
+# The projections by name. The rays of "planar" are homogeneous pixels of the reference frame, not directions.
 PROJECTIONS: dict[str, Projection] = {
     "planar": Projection(_straight, _straight, _on_plane),
     "cylindrical": Projection(_round, _straight, _on_cylinder),
     "spherical": Projection(_round, _round, _on_sphere),
 }
-"""The projections by name. The rays of "planar" are homogeneous pixels of the reference frame, not directions."""

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from photonpano.geometry.homographies import BLOCK_FRAMES
 from photonpano.values import FloatArray
 
+# Derivatives of a small rotation by its rotation vector: (3, 3, 3).
 ROTATION_AXES = np.array(
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
 )
-"""Derivatives of a small rotation by its rotation vector: (3, 3, 3)."""
 ROTATION_AXES.flags.writeable = False
 
 

@@ -16,12 +16,11 @@ from photonpano.values import Homography
 
 Pixels: TypeAlias = NDArray[np.float32] | NDArray[np.uint32]
 
-LONGEST_RUN = 512
-"""Largest size of a run, so that float32 is exact enough."""
+LONGEST_RUN = 512  # largest size of a run, so that float32 is exact enough
+# Fractions of a pixel that are outside of 0 to 1 by less than this are inside: a still image lies on whole pixels.
 _ROUNDING = 1e-6
-"""Fractions of a pixel that are outside of 0 to 1 by less than this are inside: a still image lies on whole pixels."""
+# Precomputed float32 indices: an int-to-float conversion in the loop would dominate it.
 _STEPS = np.arange(LONGEST_RUN, dtype=np.float32)
-"""Precomputed float32 indices: an int-to-float conversion in the loop would dominate it."""
 
 
 class Run(NamedTuple):

@@ -7,13 +7,11 @@ import numpy as np
 from photonpano.compiling import compiled
 from photonpano.values import Homography
 
-MAX_AREA_CHANGE = 2.0
-"""Largest ratio of the areas of two overlapping images of one camera."""
-MAX_SIDE_CHANGE = 1.5
-"""Largest ratio of opposite sides, which perspective changes."""
+MAX_AREA_CHANGE = 2.0  # largest ratio of the areas of two overlapping images of one camera
+MAX_SIDE_CHANGE = 1.5  # largest ratio of opposite sides, which perspective changes
+# Results of `violation`: possible, not finite, points behind the camera, mirrored or folded, implausible change of the area or
+# of the ratio of opposite sides.
 PLAUSIBLE, INFINITE, BEHIND, FOLDED, AREA, SIDES = range(6)
-"""Results of `violation`: possible, not finite, points behind the camera, mirrored or folded, implausible change of the area or
-of the ratio of opposite sides."""
 
 
 @compiled

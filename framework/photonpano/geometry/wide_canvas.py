@@ -13,17 +13,13 @@ from photonpano.geometry.projections import PROJECTIONS
 from photonpano.geometry.rotations import nearest_rotations
 from photonpano.values import FloatArray
 
-_SIDE_POINTS = 16
-"""Points of an outline along each side of a frame."""
-_BLOCK_FRAMES = 4096
-"""The outlines of this many frames are mapped at a time, which bounds the memory."""
-_GAP = 0.02
-"""A gap of less than this, in radians, in what frames cover of a turn is none."""
+_SIDE_POINTS = 16  # points of an outline along each side of a frame
+_BLOCK_FRAMES = 4096  # the outlines of this many frames are mapped at a time, which bounds the memory
+_GAP = 0.02  # a gap of less than this, in radians, in what frames cover of a turn is none
 
-_PRIOR = 1e-3
-"""How much the mean of what is down counts, beside the directions of rows."""
+_PRIOR = 1e-3  # how much the mean of what is down counts, beside the directions of rows
+# Where the reference camera looks straight up or down, it looks at no a; the horizon is then not levelled.
 _STRAIGHT_DOWN = 1e-6
-"""Where the reference camera looks straight up or down, it looks at no a; the horizon is then not levelled."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by, de
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
 from photonpano.protocols import Source, Trajectory, camera_of_motion
+from photonpano.robust import huber_weights, robust_std
 from photonpano.values import FloatArray, FrameSpan, Homography
 
 _CELLS = 24
@@ -219,10 +220,10 @@ def solve_gains(seen: SeenCells) -> Gains:
         left = step - change[seen.times] - of_cells[seen.cells]
         shifted += _shifted(seen, brightness, weight, left)
         left *= np.sqrt(weight / np.maximum(robust, 1e-9))
-        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        scale = max(robust_std(left), 1e-9)
         # Smoothed squares share photons: their residuals are small, and correlated.
         noise = scale * SMOOTHING
-        robust = 1 / np.maximum(1, np.abs(left) / (_OUTLIER * scale))
+        robust = huber_weights(left, _OUTLIER * scale)
     difference = light[:, None] - light
     covariance *= noise**2
     expected = np.diag(covariance)[:, None] + np.diag(covariance) - 2 * covariance

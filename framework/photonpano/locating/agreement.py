@@ -6,21 +6,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from photonpano.geometry import Camera, apply, nearest_rotations
+from photonpano.geometry import Camera, nearest_rotations, transform_points
 from photonpano.values import BoolArray, FloatArray, Homography
 
+# Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are.
 _MOST_PAIRS = 5000
-"""Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are."""
-_MOST_SCORED = 500_000
-"""Rotations are scored until they have mapped this many points."""
-_BASELINE = 10.0
-"""Two matches determine a rotation if they are further apart than this, in units of the threshold."""
-_ROUNDS = 3
-"""How often the best rotation is fitted to the matches that agree with it."""
+_MOST_SCORED = 500_000  # rotations are scored until they have mapped this many points
+_BASELINE = 10.0  # two matches determine a rotation if they are further apart than this, in units of the threshold
+_ROUNDS = 3  # how often the best rotation is fitted to the matches that agree with it
+# Expected number of rotations, of all that two matches determine, on which as many matches agree by chance.
 _FALSE_ALARMS = 1e-4
-"""Expected number of rotations, of all that two matches determine, on which as many matches agree by chance."""
-_FAR_PX = 1e6
-"""Points that are mapped further away are taken to lie there."""
+_FAR_PX = 1e6  # points that are mapped further away are taken to lie there
 
 
 def distinct(moving: FloatArray, fixed: FloatArray, threshold_px: float) -> BoolArray:
@@ -58,7 +54,7 @@ def rotation_of_most(moving: FloatArray, fixed: FloatArray, camera: Camera, thre
     rotations = _frames(partners[first], partners[second]) @ np.swapaxes(_frames(rays[first], rays[second]), -1, -2)
 
     def squares(rotations: FloatArray) -> FloatArray:
-        left = np.square(apply(camera.homographies(rotations), moving) - fixed).sum(axis=-1)
+        left = np.square(transform_points(camera.homographies(rotations), moving) - fixed).sum(axis=-1)
         return np.asarray(np.fmin(left, threshold_px**2))
 
     costs = squares(rotations).sum(axis=1)
@@ -93,7 +89,7 @@ def agreeing_by_chance(
     if np.isfinite(search_px):
         share = min(1.0, (threshold_px / search_px) ** 2)
     else:
-        mapped = np.clip(np.nan_to_num(apply(homography, moving)), -_FAR_PX, _FAR_PX)
+        mapped = np.clip(np.nan_to_num(transform_points(homography, moving)), -_FAR_PX, _FAR_PX)
         near = cKDTree(mapped).sparse_distance_matrix(cKDTree(fixed), threshold_px, output_type="ndarray")
         exchanged = int(np.count_nonzero(near["i"] != near["j"]))
         share = max(exchanged, 1) / (count * (count - 1))

@@ -8,22 +8,18 @@ from photonpano.geometry import rescaled
 from photonpano.locating.viewing import View
 from photonpano.values import Homography, NotLocated
 
-ALL_PARAMETERS = (0, 1, 2, 3, 4, 5, 6, 7)
-"""Indices of p1..p8."""
-TRANSLATION = (4, 5)
-"""Indices of the parameters of a translation, p5 and p6."""
+ALL_PARAMETERS = (0, 1, 2, 3, 4, 5, 6, 7)  # indices of p1..p8
+TRANSLATION = (4, 5)  # indices of the parameters of a translation, p5 and p6
 _AFFINE = (0, 1, 2, 3, 4, 5)
+# Prior standard deviation of p1..p4, p7 and p8 in unit coordinates: between two exposures a camera rolls by 1 or 2 degrees, and
+# scale, shear and perspective change as little.
 PRIOR_STD = 0.03
-"""Prior standard deviation of p1..p4, p7 and p8 in unit coordinates: between two exposures a camera rolls by 1 or 2 degrees,
-and scale, shear and perspective change as little."""
-MIN_COMMON_CURVATURE = 1e-3
-"""Floor on the eigenvalues of the curvature that two images have in common, relative to their own."""
-SMALLEST_SIDE = 24
-"""Images are not halved to fewer pixels than this along a side."""
+MIN_COMMON_CURVATURE = 1e-3  # floor on the eigenvalues of the curvature that two images have in common, relative to their own
+SMALLEST_SIDE = 24  # images are not halved to fewer pixels than this along a side
 
+# Reasons of `NotLocated`.
 NO_TEXTURE = "the images do not overlap, or there is no texture where they do"
 NOTHING_SEEN = "all pixels are masked, or too near to masked ones"
-"""Reasons of `NotLocated`."""
 
 
 def free_parameters(depth: int, layers: int) -> tuple[int, ...]:

@@ -12,8 +12,8 @@ from pydantic import Field
 
 from photonpano.contributions import Config
 
+# A standard deviation in px, or `auto`: according to the noise of an exposure.
 BlurPx: TypeAlias = Annotated[float, Field(ge=0, le=16)] | Literal["auto"]
-"""A standard deviation in px, or `auto`: according to the noise of an exposure."""
 
 
 class BlurConfig(Config):

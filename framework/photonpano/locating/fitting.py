@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
+from photonpano.geometry import corners, from_parameters, jacobian, parameters, transform_points
+from photonpano.robust import robust_std, soft_l1_weights
 from photonpano.values import FloatArray, Homography
 
+# Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error.
 REWEIGHTINGS = 4
-"""Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error."""
+# Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance.
 MIN_NOISE_PX = 0.02
-"""Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +67,7 @@ def fit_homography(
     # Iteratively reweighted: scipy's robust losses need a decomposition that takes a hundred times as long.
     for _ in range(REWEIGHTINGS):
         lengths = np.linalg.norm(residuals.reshape(-1, 2), axis=1)
-        weights = by_size / np.sqrt(np.sqrt(1 + (lengths / _spread(residuals)) ** 2))
+        weights = by_size * np.sqrt(soft_l1_weights(lengths, max(robust_std(residuals), MIN_NOISE_PX)))
         solution = least_squares(_residuals, p, _derivatives, method="lm", x_scale="jac", args=(here, there, weights))
         p = solution.x
         residuals = _residuals(p, here, there, by_size)
@@ -84,15 +85,10 @@ def fit_homography(
 
 def _residuals(p: FloatArray, here: FloatArray, there: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the weighted residuals along x and y: (2 N,)."""
-    return ((apply(from_parameters(p), here) - there) * weights[:, None]).ravel()
+    return ((transform_points(from_parameters(p), here) - there) * weights[:, None]).ravel()
 
 
 def _derivatives(p: FloatArray, here: FloatArray, there: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the derivatives of the residuals: (2 N, 8)."""
     del there
     return (jacobian(from_parameters(p), here) * weights[:, None, None]).reshape(-1, 8)
-
-
-def _spread(residuals: FloatArray) -> float:
-    """Return the standard deviation, from the median so that it is robust against outliers."""
-    return max(1.4826 * float(np.median(np.abs(residuals))), MIN_NOISE_PX)

@@ -10,25 +10,17 @@ from numpy.typing import NDArray
 
 from photonpano.values import BoolArray
 
-_SIDE_PX = 7
-"""Side of the square in which two images are compared, px."""
+_SIDE_PX = 7  # side of the square in which two images are compared, px
+# Relative variance of the difference of two aligned images from which on they differ: 0 for equal, 1 for unrelated images.
 _DIFFERENT = 0.5
-"""Least variance of the difference of two aligned images, relative to the sum of their variances, where they show different
-things; it is 0 for the same thing and 1 for unrelated ones."""
-_SURE = 4.0
-"""Standard errors by which the variances must exceed those of noise."""
-_ALIKE = 0.25
-"""Largest such difference of a part that is aligned by itself."""
-_BORDER_PX = 2
-"""Width of the border around what moves otherwise in which a little of it may be seen, px."""
-_REST_PX = 4.0
-"""Standard deviation of the Gaussian that smooths the weights of what does not follow, px."""
-_SUSPECT = 0.12
-"""Mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less."""
+_STANDARD_ERRORS = 4.0  # by which the variances must exceed those of noise
+_ALIKE = 0.25  # largest relative variance of an aligned part
+_BORDER_PX = 2  # width of the mixed border around parts that move otherwise, px
+_REST_PX = 4.0  # standard deviation of the Gaussian that smooths the weights of what does not follow, px
+_SUSPECT = 0.12  # mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less
+# Share of the image from which on a part that shows something different may move otherwise: noise leaves no such part.
 _SUSPECT_SHARE = 0.03
-"""Share of the image from which on a part that shows something different may move otherwise: noise leaves no such part."""
-_CLEARLY = 0.5
-"""A pixel clearly follows the motion that leaves less than half of the difference of another one."""
+_CLEARLY = 0.5  # a pixel clearly follows the motion that leaves less than half of the difference of another one
 
 
 class Follows(NamedTuple):
@@ -36,14 +28,14 @@ class Follows(NamedTuple):
 
     Attributes:
         difference: (H, W) float32, local variance of the difference of the aligned images relative to the sum of their
-            variances, from 0 to 1; NaN where there is too little texture to tell.
+            variances, from 0 to 1; NaN without enough texture.
     """
 
     difference: NDArray[np.float32]
 
     @property
     def part(self) -> BoolArray:
-        """(H, W), True where the image follows, and where it has too little texture to tell."""
+        """(H, W), True where the image follows, and where it lacks texture."""
         return ~(self.difference > _ALIKE)
 
     @property
@@ -103,7 +95,7 @@ def follows(
     near = _averaged(seen)
     own = np.asarray(_averaged(np.where(seen > 0, noise, np.float32(0))) / np.maximum(near, np.float32(1e-6)), np.float32)
     difference, first, second = (_variance(image * seen, near) for image in (fixed - moving, moving, fixed))
-    chance = np.float32(_SURE * np.sqrt(2 / (_SIDE_PX**2 * noise_left))) * own
+    chance = np.float32(_STANDARD_ERRORS * np.sqrt(2 / (_SIDE_PX**2 * noise_left))) * own
     texture = first + second - own
     textured = (near > _DIFFERENT) & (seen > 0) & (texture > chance)
     relative = np.clip((difference - own) / np.maximum(texture, np.float32(1e-12)), 0, 1)

@@ -15,8 +15,7 @@ from photonpano.locating.viewing import View
 from photonpano.photometry import Similarity, autocorrelation, similarity_of, without_local_mean
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated
 
-_COMPARED_PIXEL = 4
-"""Images are compared in pixels 4 times as large, where noise is small and motion blur hardly matters."""
+_COMPARED_PIXEL = 4  # images are compared in pixels 4 times as large, where noise is small and motion blur hardly matters
 
 
 def motion_from_images(

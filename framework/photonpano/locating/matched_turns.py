@@ -8,22 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry import Camera, apply, jacobian, normalised, rotation_matrices, why_implausible
+from photonpano.geometry import Camera, jacobian, normalised, rotation_matrices, transform_points, why_implausible
 from photonpano.locating.agreement import agreeing_by_chance, distinct, rotation_of_most
 from photonpano.locating.configs import MatchingConfig
 from photonpano.locating.fitting import MIN_NOISE_PX
 from photonpano.locating.points import Matches
 from photonpano.locating.turns import information_on_turn, turn_slopes
+from photonpano.robust import robust_std, soft_l1_weights
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated
 
-_SCATTER = 2.0
-"""Keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`."""
+_SCATTER = 2.0  # keypoints of dark exposures scatter: a match agrees with a rotation within this many `threshold_px`
 _LEAST_SHARE = 0.2
+# Similar objects match and agree in different scenes, too. So a minimum share of the matches must agree, and their standard
+# deviation in every direction must be a minimum share of the shorter side of the image.
 _LEAST_SPREAD = 0.1
-"""Objects that look alike match and agree with each other in different scenes as well. So this share of the matches must agree,
-and they must be spread: in all directions, their standard deviation is at least this share of the shorter side of the image."""
-_ITERATIONS = 10
-"""Steps of reweighted least squares; the last ones change the rotation by far less than its error."""
+_ITERATIONS = 10  # steps of reweighted least squares; the last ones change the rotation by far less than its error
 
 
 def turn_of(
@@ -143,14 +142,14 @@ def _fit(moving: FloatArray, fixed: FloatArray, start: Homography, camera: Camer
     homography = start
     for _ in range(_ITERATIONS):
         agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
-        root = np.sqrt(_weights(residuals, scale))[:, None]
+        root = np.sqrt(soft_l1_weights(np.linalg.norm(residuals, axis=1), scale))[:, None]
         slopes = jacobian(homography, moving[agrees]) @ turn_slopes(homography, camera.matrix)
         step = np.linalg.lstsq((slopes * root[..., None]).reshape(-1, 3), -(residuals * root).ravel(), rcond=None)[0]
         homography = normalised(homography @ camera.homographies(rotation_matrices(step)))
     agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
     slopes = jacobian(homography, moving[agrees]).reshape(-1, 8)
     residual_px = float(np.sqrt((residuals**2).sum() / max(1, residuals.size - 3)))
-    each = _information(np.linalg.norm(apply(homography, moving) - fixed, axis=1), scale, threshold_px)
+    each = _information(np.linalg.norm(transform_points(homography, moving) - fixed, axis=1), scale, threshold_px)
     return _Fit(homography, agrees, residual_px, slopes.T @ slopes * each)
 
 
@@ -158,23 +157,17 @@ def _residuals(
     moving: FloatArray, fixed: FloatArray, homography: Homography, threshold_px: float
 ) -> tuple[BoolArray, FloatArray, float]:
     """Return which matches agree, their (M, 2) residuals, and the robust standard deviation of these."""
-    residuals = apply(homography, moving) - fixed
+    residuals = transform_points(homography, moving) - fixed
     agrees = np.linalg.norm(residuals, axis=1) < threshold_px
     residuals = residuals[agrees]
-    spread = 1.4826 * float(np.median(np.abs(residuals))) if residuals.size else 0.0
-    return agrees, residuals, max(spread, MIN_NOISE_PX)
-
-
-def _weights(residuals: FloatArray, scale: float) -> FloatArray:
-    """Return the weights of the soft L1 loss of (..., 2) residuals: (...)."""
-    return np.asarray(1 / np.sqrt(1 + (residuals**2).sum(axis=-1) / scale**2))
+    return agrees, residuals, max(robust_std(residuals), MIN_NOISE_PX)
 
 
 def _information(lengths: FloatArray, scale: float, threshold_px: float) -> float:
     """Return the information of a match on each coordinate of its position, in px^-2: that of an M-estimator (Huber 1981).
 
     A match beyond the threshold has no influence. So a shift of the fit gains matches on one side and loses them on the other,
-    which cancels what the others say where matches are spread evenly, as chance spreads them.
+    which cancels the information of the others where matches are spread evenly, as chance spreads them.
 
     Args:
         lengths: (N,) of the residuals of all matches, the same in all directions.
@@ -186,7 +179,7 @@ def _information(lengths: FloatArray, scale: float, threshold_px: float) -> floa
         return 0.0
     # The ring has the area of the circle within the threshold. One match more keeps few matches from seeming exact.
     ring = 1 + np.count_nonzero((lengths > threshold_px * np.sqrt(0.5)) & (lengths < threshold_px * np.sqrt(1.5)))
-    weights = 1 / np.sqrt(1 + (inner / scale) ** 2)
+    weights = soft_l1_weights(inner, scale)
     slope = (weights - weights**3 * (inner / scale) ** 2 / 2).sum() - ring / np.sqrt(1 + (threshold_px / scale) ** 2)
     square = ((weights * inner) ** 2 + MIN_NOISE_PX**2).sum() / max(1, 2 * len(inner) - 3)
     return float(max(slope, 0.0) / len(inner)) ** 2 / float(square)

@@ -12,8 +12,7 @@ from scipy import fft
 from photonpano.locating.viewing import View
 from photonpano.values import BoolArray, FloatArray
 
-_TAPER = 0.25
-"""The window falls to 0 at masked pixels, over this fraction of the shorter side."""
+_TAPER = 0.25  # the window falls to 0 at masked pixels, over this fraction of the shorter side
 
 
 def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray | None:

@@ -12,9 +12,9 @@ from photonpano.locating.matched_turns import turn_of
 from photonpano.locating.points import Matches
 from photonpano.values import FloatArray, Homography, Located, NotLocated
 
+# Matches that agree on a homography and determine its eight numbers: of as many, blurred against the noise of dark exposures,
+# the corners are certain to about a pixel.
 _DETERMINED = 100
-"""Matches that agree on a homography and determine its eight numbers: of as many, blurred against the noise of dark exposures,
-the corners are certain to about a pixel."""
 
 
 class PointLocator(ABC):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import apply, normalised, why_implausible
+from photonpano.geometry import normalised, transform_points, why_implausible
 from photonpano.locating.configs import PointLimits
 from photonpano.locating.fitting import fit_homography
 from photonpano.values import Homography, Located, NotLocated
@@ -59,7 +59,7 @@ def consensus_of(
             continue
         homography, agreeing = estimate(matches.moving, matches.fixed), 0
         if homography is not None:
-            distances = np.linalg.norm(apply(homography, matches.moving) - matches.fixed, axis=1)
+            distances = np.linalg.norm(transform_points(homography, matches.moving) - matches.fixed, axis=1)
             # Keypoints of blurred and dark exposures scatter more, and in the whole image fewer matches agree by chance.
             agreeing = int(np.count_nonzero(distances < limits.threshold_px * (1 if matches.guided else 2)))
         found["agreeing"] = float(agreeing)
@@ -130,7 +130,7 @@ def motion_from_points(
     sizes = np.ones(len(moving)) if sizes is None else sizes
     homography = start
     for _ in range(rounds):
-        inliers = np.linalg.norm(apply(homography, moving) - fixed, axis=1) <= limits.threshold_px
+        inliers = np.linalg.norm(transform_points(homography, moving) - fixed, axis=1) <= limits.threshold_px
         found["inliers"] = float(np.count_nonzero(inliers))
         if found["inliers"] < limits.min_inliers:
             return NotLocated(

@@ -1,4 +1,4 @@
-"""What a pair of exposures says of a camera that only turns: three of the eight parameters of a homography."""
+"""Information of a pair of exposures on a rotation of the camera: three of the eight parameters of a homography."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from photonpano.geometry import ROTATION_AXES, corners, jacobian, parameters
 from photonpano.values import FloatArray, Homography
 
+# Expected error of a corner in the directions that a turn does not reach, in sides of the image: as good as unknown.
 _UNKNOWN = 1.0
-"""Expected error of a corner in the directions that a turn does not reach, in sides of the image: as good as unknown."""
 
 
 class TurnInformation(NamedTuple):
-    """What a pair of exposures says of a turn between them.
+    """Information of a pair of exposures on the rotation between them.
 
     Attributes:
         information: (8, 8) inverse covariance of p1..p8 of the homography. Only a turn is known: what else could have happened

@@ -14,12 +14,10 @@ from photonpano.locating.configs import BlurPx
 from photonpano.photometry import signal_to_noise
 from photonpano.values import Homography, VirtualExposure
 
+# Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest.
 _CLIPPED = 0.001
-"""Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest."""
-_BORDER = 3
-"""Pixels nearer to a masked area than this, in units of the blur, are masked in a view."""
-_ALL_SEEN = 0.999
-"""An interpolated pixel is unmasked if its neighbours are, up to rounding."""
+_BORDER = 3  # pixels nearer to a masked area than this, in units of the blur, are masked in a view
+_ALL_SEEN = 0.999  # an interpolated pixel is unmasked if its neighbours are, up to rounding
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
-import cv2
 import numpy as np
 
 from photonpano.capture import Capture, capture_of
-from photonpano.geometry import Canvas, translation
-from photonpano.merging.bent import BentFootprint, BentGrid, Rays, add_bent, padded
+from photonpano.geometry import Canvas
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.light import LightTerms, LitFrames
-from photonpano.merging.warping import add_footprint, add_running_sums, add_warped, average_squares
+from photonpano.merging.warping import Grid, add_footprint, add_remapped, add_running_sums, add_warped, average_squares, padded
 from photonpano.protocols import Source
 from photonpano.threads import InOrder
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
 
-_RUN = 64
-"""Chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded."""
-_BLOCK = 4096
-"""Chunks whose footprints are known at a time."""
-MIN_WEIGHT = 1.0
-"""Pixels with less weight than this, in frames, are unknown."""
+_RUN = 64  # chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded
+_BLOCK = 4096  # chunks whose footprints are known at a time
+MIN_WEIGHT = 1.0  # pixels with less weight than this, in frames, are unknown
 
-_Visible = Sequence[tuple[Chunk, Footprint | BentFootprint]]
+_Visible = Sequence[tuple[Chunk, Footprint]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,22 +137,16 @@ def _frames(chunks: Sequence[Chunk]) -> int:
 
 def _visible(source: Capture, chunks: Sequence[Chunk], canvas: Canvas) -> _Visible:
     """Return the chunks that lie on a canvas, with their footprints."""
-    homographies, frame_shape = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3), source.info.frame_shape
-    grid = BentGrid.of(canvas, source.camera, homographies, frame_shape)
-    footprints: Sequence[Footprint | BentFootprint]
-    if grid is None:
-        footprints = footprints_of(canvas.transform @ homographies, frame_shape, canvas.shape)
-    else:
-        footprints = grid.footprints(homographies, frame_shape)
-    pairs: Iterable[tuple[Chunk, Footprint | BentFootprint]] = zip(chunks, footprints, strict=True)
-    return [(chunk, at) for chunk, at in pairs if at.rows and at.columns]
+    homographies = np.array([chunk.homography for chunk in chunks]).reshape(-1, 3, 3)
+    footprints = footprints_of(canvas, source.camera, homographies, source.info.frame_shape)
+    return [(chunk, at) for chunk, at in zip(chunks, footprints, strict=True) if at.rows and at.columns]
 
 
 def _sum_of_run(source: Capture, terms: LightTerms | None, canvas: Canvas, chunks: Sequence[Chunk]) -> _Part:
     """Sum chunks on the part of a canvas that they cover."""
     footprints = [at for _, at in _visible(source, chunks, canvas)]
     top, bottom = min(at.rows.start for at in footprints), max(at.rows.stop for at in footprints)
-    columns = [each for at in footprints for each in ([at.columns] if isinstance(at, Footprint) else at.columns)]
+    columns = [each for at in footprints for each in at.columns]
     left, right = min(each.start for each in columns), max(each.stop for each in columns)
     part = canvas.part(left, top, bottom - top, right - left)
     counts, coverages = _sum_on(source, terms, source.counts, part, _visible(source, chunks, part), lambda _: None)
@@ -175,9 +164,7 @@ def _sum_on(
     """Return the counts and the coverages of a canvas: (H, W) and (P, H, W)."""
     masked = weights_of(source)
     corrected = source.corrected if source.corrects_sums else None
-    bent = any(isinstance(at, BentFootprint) for _, at in visible)
-    rays = (*canvas.columns(), *canvas.rows()) if bent else None
-    total = _Total.zeros(canvas.shape, 1 if terms is None else terms.number, rays)
+    total = _Total.zeros(canvas, 1 if terms is None else terms.number)
     for chunk, footprint in visible:
         total.add(_summed(counts_of, corrected, masked, terms, chunk, footprint))
         advance(len(chunk.span))
@@ -185,7 +172,7 @@ def _sum_on(
 
 
 def weights_of(source: Source) -> FluxImage | None:
-    """Return what a frame of each pixel is worth, 0 for a masked one: (H, W); None if it is 1 for all."""
+    """Return the weight of a frame of each pixel, 0 for a masked one: (H, W); None if it is 1 for all."""
     capture = capture_of(source)
     if capture.weight is not None:
         return np.where(capture.valid, capture.weight, np.float32(0))
@@ -199,12 +186,11 @@ class _Summed:
     Attributes:
         footprint: where it lies on the grid.
         amounts: (P,) what each pixel adds to the coverages: the number of frames, and in changing light terms of their gains.
-        counts: (h, w) float32 or uint32; with zeros around it for a `BentFootprint`.
-        seen: (h, w) float32, the share of each pixel that was seen; None if it is 1 for all. In steady light, times the number
-            of frames, but not for a `BentFootprint`.
+        counts: (h, w) float32 or uint32; `padded` if it is remapped.
+        seen: (h, w) float32, the share of each pixel that was seen; None if it is 1 for all.
     """
 
-    footprint: Footprint | BentFootprint
+    footprint: Footprint
     amounts: FloatArray
     counts: FluxImage | Counts
     seen: FluxImage | None
@@ -216,27 +202,22 @@ def _summed(
     masked: FluxImage | None,
     terms: LightTerms | None,
     chunk: Chunk,
-    footprint: Footprint | BentFootprint,
+    footprint: Footprint,
 ) -> _Summed:
-    n_frames, shrink, bent = len(chunk.span), footprint.shrink, isinstance(footprint, BentFootprint)
+    n_frames, shrink = len(chunk.span), footprint.shrink
     amounts = np.array([float(n_frames)]) if terms is None else terms.amounts(chunk.span)
-    of_frame = n_frames if terms is None and not bent else 1
-    raw = counts_of(chunk.span)
+    raw, seen = counts_of(chunk.span), masked
     counts: FluxImage | Counts = np.ascontiguousarray(raw)
     if corrected is not None:
         counts = np.ascontiguousarray(corrected(raw, n_frames))
-    seen: FluxImage | None = None
     if masked is not None:
-        lit, seen = counts.astype(np.float32) * masked, masked * np.float32(of_frame)
-        counts, seen = average_squares(lit, shrink), average_squares(seen, shrink)
-    elif shrink > 1:
-        if any(side % shrink for side in counts.shape):
-            seen = average_squares(np.full(counts.shape, of_frame, np.float32), shrink)
-        counts = average_squares(counts, shrink)
-    if isinstance(footprint, BentFootprint):
-        return _Summed(footprint, amounts, padded(counts), None if seen is None else padded(seen))
-    if shrink == 1 and not footprint.straight:
-        counts = counts.astype(np.float32, copy=False)
+        counts = np.asarray(counts.astype(np.float32) * masked, np.float32)
+    elif any(side % shrink for side in counts.shape):
+        seen = np.ones(counts.shape, np.float32)
+    if shrink > 1:
+        counts, seen = average_squares(counts, shrink), None if seen is None else average_squares(seen, shrink)
+    if not footprint.straight:
+        counts, seen = padded(counts), None if seen is None else padded(seen)
     return _Summed(footprint, amounts, counts, seen)
 
 
@@ -245,61 +226,43 @@ class _Total:
     """The sums of a grid.
 
     Attributes:
-        counts: (H, W) float32.
-        coverages: (P, H, W) float32, coverages from the borders of frames and from masked frames.
+        grid: the sums, with coverages from the borders of frames and from masked frames.
         steps: (P, H, W + 1) float32, row-wise differences of the coverages inside of frames; `result` adds their cumulative
             sums to the coverages.
-        rays: of all columns and rows of a `BentGrid`; None if homographies map frames to the grid.
     """
 
-    counts: FluxImage
-    coverages: FluxImage
+    grid: Grid
     steps: FluxImage
-    rays: Rays | None
 
     @classmethod
-    def zeros(cls, shape: tuple[int, int], number: int, rays: Rays | None) -> _Total:
-        height, width = shape
-        coverages, steps = (np.zeros((number, height, columns), np.float32) for columns in (width, width + 1))
-        return cls(np.zeros(shape, np.float32), coverages, steps, rays)
+    def zeros(cls, canvas: Canvas, number: int) -> _Total:
+        return cls(Grid.zeros(canvas, number), np.zeros((number, canvas.height, canvas.width + 1), np.float32))
 
     def add(self, each: _Summed) -> None:
         """Add the sum of a chunk."""
-        if isinstance(each.footprint, BentFootprint):
-            assert self.rays is not None
-            image = np.asarray(each.counts, np.float32), each.seen, each.amounts
-            add_bent(*image, each.footprint, self.rays, self.counts, self.coverages)
+        to_image, coverages = each.footprint.to_image, self.grid.coverages
+        if not each.footprint.straight:
+            add_remapped(np.asarray(each.counts, np.float32), each.seen, each.amounts, each.footprint, self.grid)
             return
         if each.seen is None:
-            for amount, coverage, steps in zip(each.amounts, self.coverages, self.steps, strict=True):
+            for amount, coverage, steps in zip(each.amounts, coverages, self.steps, strict=True):
                 if amount:
-                    add_footprint(each.counts.shape, each.footprint.to_image, float(amount), steps, coverage)
+                    add_footprint(each.counts.shape, to_image, float(amount), steps, coverage)
         elif len(each.amounts) == 1:
-            self._warp(each.seen, each.footprint, self.coverages[0])
+            add_warped(each.seen * np.float32(each.amounts[0]), to_image, coverages[0])
         else:
-            seen = np.zeros_like(self.counts)
-            self._warp(each.seen, each.footprint, seen)
-            for amount, coverage in zip(each.amounts, self.coverages, strict=True):
+            seen = np.zeros_like(self.grid.total)
+            add_warped(each.seen, to_image, seen)
+            for amount, coverage in zip(each.amounts, coverages, strict=True):
                 if amount:
                     coverage += np.float32(amount) * seen
-        self._warp(each.counts, each.footprint, self.counts)
-
-    def _warp(self, image: FluxImage | Counts, footprint: Footprint, total: FluxImage) -> None:
-        if footprint.straight:
-            add_warped(image, footprint.to_image, total)
-            return
-        rows, columns = footprint.rows, footprint.columns
-        to_image = footprint.to_image @ translation(columns.start, rows.start)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        box = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
-        warped = cv2.warpPerspective(image, to_image, (len(columns), len(rows)), flags=flags, borderMode=cv2.BORDER_CONSTANT)
-        total[box] += warped
+        add_warped(each.counts, to_image, self.grid.total)
 
     def result(self) -> tuple[FluxImage, FluxImage]:
         """Return the counts, (H, W), and the coverages, (P, H, W)."""
-        for steps, coverage in zip(self.steps, self.coverages, strict=True):
+        for steps, coverage in zip(self.steps, self.grid.coverages, strict=True):
             add_running_sums(steps, coverage)
-        return self.counts, self.coverages
+        return self.grid.total, self.grid.coverages
 
 
 def divided(length: int, parts: int) -> list[range]:

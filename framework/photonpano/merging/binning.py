@@ -10,8 +10,8 @@ from photonpano.merging.accumulate import weights_of
 from photonpano.protocols import Source
 from photonpano.values import FluxImage, FrameSpan
 
+# Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable.
 _SIDE_PX = 64
-"""Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable."""
 
 
 def binning_of(source: Source) -> int:

@@ -5,32 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Camera, Canvas, rescaling
 from photonpano.merging.averaging import Averaging
-from photonpano.merging.bent import BentGrid, laid
+from photonpano.merging.footprints import footprints_of
+from photonpano.merging.warping import Grid, add_remapped, average_squares, padded
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
-_INSTANTS = 64
-"""Largest number of instants at which the corrections of the sensor are laid on the canvas."""
-_LARGEST_PX = 1024
-"""Longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels."""
-_BLOCK = 2**18
-"""Values of a tile that are looked at at once."""
-_EVEN = 1e-4
-"""Corrections that differ by less than this are one number."""
-_RGB = 3
-"""Colours of a panorama; clear pixels, which come last, are none."""
+_INSTANTS = 64  # largest number of instants at which the corrections of the sensor are laid on the canvas
+_LARGEST_PX = 1024  # longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels
+_BLOCK = 2**18  # values of a tile that are looked at at once
+_EVEN = 1e-4  # corrections that differ by less than this are one number
+_RGB = 3  # colours of a panorama; clear pixels, which come last, are none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CanvasNoise:
-    """What the noise on a canvas depends on, beside flux and weight.
+    """Noise model of a canvas: all that its noise depends on beside flux and weight.
 
     A correction multiplies the counts of a pixel by `slope` and adds `offset` for each frame: see `flux_std`.
 
@@ -86,7 +81,7 @@ class CanvasNoise:
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
         coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
-        sums, share = _laid(coarse, source.camera, trajectory.at(instants), (slope, offset), valid)
+        sums, share = laid(coarse, source.camera, trajectory.at(instants), (slope, offset), valid)
         on_slope, on_offset = (
             np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
@@ -128,22 +123,29 @@ class CanvasNoise:
         return part if part.ndim == flux.ndim else part[..., None]
 
 
-def _laid(
+def laid(
     canvas: Canvas, camera: Camera | None, homographies: FloatArray, images: Sequence[FluxImage], valid: BoolArray
 ) -> tuple[FluxImage, FluxImage]:
-    """Return the sums of images that move with a camera, and of their valid pixels: see `laid`."""
-    if BentGrid.of(canvas, camera, homographies, (valid.shape[0], valid.shape[1])) is not None:
-        return laid(canvas, camera, homographies, images, valid.astype(np.float32))
-    share, sums = np.zeros(canvas.shape, np.float32), np.zeros((len(images), *canvas.shape), np.float32)
-    for homography in homographies:
+    """Lay images that move with a camera on a canvas, and add them up.
 
-        def warped(image: FluxImage, transform: FluxImage = canvas.transform @ homography) -> FluxImage:
-            return np.asarray(cv2.warpPerspective(image, transform, canvas.shape[::-1]), np.float32)
+    Args:
+        canvas: the grid.
+        camera: of the frames; None if it is not known.
+        homographies: (N, 3, 3), (ideal) pixels of the frame to pixels of the reference plane at N instants.
+        images: K images of a frame, (h, w) each.
+        valid: (h, w), True where they are known.
 
-        share += warped(valid.astype(np.float32))
-        for total, image in zip(sums, images, strict=True):
-            total += warped(np.where(valid, image, np.float32(0)))
-    return sums, share
+    Returns:
+        The sums of the images, (K, H, W), and of what is known, (H, W).
+    """
+    sums, share = np.zeros((len(images), *canvas.shape), np.float32), np.zeros((1, *canvas.shape), np.float32)
+    grid, once, never = Grid.zeros(canvas, 1)._replace(coverages=share), np.ones(1), np.zeros(1)
+    for at in footprints_of(canvas, camera, homographies, (valid.shape[0], valid.shape[1])):
+        known = padded(average_squares(valid.astype(np.float32), at.shrink))
+        for number, (image, total) in enumerate(zip(images, sums, strict=True)):
+            counts = padded(average_squares(np.where(valid, image, np.float32(0)), at.shrink))
+            add_remapped(counts, known, never if number else once, at, grid._replace(total=total))
+    return sums, share[0]
 
 
 def _stacked(factors: list[Factor]) -> Factor:

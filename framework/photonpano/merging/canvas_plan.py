@@ -12,7 +12,6 @@ from photonpano.geometry import (
     Canvas,
     Covered,
     Extent,
-    apply,
     canvas_around,
     canvas_of,
     canvas_of_box,
@@ -20,18 +19,18 @@ from photonpano.geometry import (
     inverse,
     level_horizon,
     outline_of,
+    transform_points,
 )
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, FrameSpan
 
-BYTES_PER_PIXEL = 40
-"""Peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests."""
+BYTES_PER_PIXEL = 40  # peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests
+# A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time.
 MAX_EXCESS = 16
-"""A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time."""
+# Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused.
 _PLANAR_DEGREES, _WIDEST_PLANE_DEGREES = 90, 100
-"""Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused."""
+# Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused.
 _CYLINDER_DEGREES, _TALLEST_CYLINDER_DEGREES = 45, 80
-"""Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused."""
 _TURN = 360
 
 
@@ -186,7 +185,7 @@ def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Can
     """
     part = canvas_of_box(box, scale)
     ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
-    (left, top), (right, bottom) = np.rint(apply(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
+    (left, top), (right, bottom) = np.rint(transform_points(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
     x0, y0, x1, y1 = box
     if x1 <= left or x0 > right or y1 <= top or y0 > bottom:
         raise ExtentError(

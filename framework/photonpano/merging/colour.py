@@ -1,4 +1,4 @@
-"""Make an image in colour of the images of single colours: fill what one of them did not see, use clear pixels."""
+"""Make an image in colour of the images of single colours: fill gaps, share detail against noise, use clear pixels."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
-from photonpano.merging.shared_detail import noise_of_a_frame, with_shared_detail
 from photonpano.protocols import Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
+# The colours of a panorama, in the order of its third axis; the images of a filter array may have a fourth one, clear.
 COLOURS = ("red", "green", "blue")
-"""The colours of a panorama, in the order of its third axis; the images of a filter array may have a fourth one, clear."""
+# A colour is thin where it was seen in less than this part of the frames that are its due; its neighbours count there, too.
 _THIN = 0.1
-"""A colour is thin where it was seen in less than this part of the frames that are its due; its neighbours count there, too."""
-_ENOUGH = 0.2
-"""A neighbourhood is large enough if each colour has this part of its share of the frames in it."""
-_LARGEST = 8
-"""Neighbourhoods are doubled at most this many times."""
-_ROUNDS = 3
-"""Times that the sum of the colours, and their ratios to it, follow from each other."""
+_ENOUGH = 0.2  # a neighbourhood is large enough if each colour has this part of its share of the frames in it
+_LARGEST = 8  # neighbourhoods are doubled at most this many times
+_ROUNDS = 3  # times that the sum of the colours, and their ratios to it, follow from each other
+_RATIO_PX = 1.5  # standard deviation of the Gaussian over which the ratio of a colour to the sum of all is averaged
+_WINDOW_PX = 1.5  # standard deviation of the Gaussian over which the detail of a colour's own is measured
+_RELATIVE_STEP = 0.02  # relative step of numerical derivatives
+_MANY_FRAMES = 1e4
+_FEWEST_FRAMES = 1e-3
 
 
 def in_colours(source: Source, render: Callable[[Source], Panorama]) -> Panorama:
@@ -137,6 +138,49 @@ def with_clear(flux: FluxImage, weight: FluxImage, mix: FloatArray, response: Re
     return np.asarray(np.maximum(colours + gain * step[..., None], 0), np.float32)
 
 
+def with_shared_detail(flux: FluxImage, weight: FluxImage, response: Response) -> FluxImage:
+    """Return the flux of each colour, with less noise where all colours have the same detail.
+
+    What is expected of a colour is the brightness of the place, from the photons of all colours, times the ratio of the colour
+    to the brightness around the place. The flux differs from that by photon noise of the variance v, and by detail of the
+    colour's own of the variance e, which is measured around the place. The linear estimate with the least error is
+
+        expected + e / (e + v) (flux - expected)                        (Wiener 1949)
+
+    With many photons it is the flux itself.
+
+    Args:
+        flux: (H, W, C), finite.
+        weight: (H, W, C), in frames.
+        response: the camera's response, from which v follows.
+
+    Returns:
+        (H, W, C), not negative.
+    """
+    weight = np.maximum(weight, np.float32(_FEWEST_FRAMES))
+    photons = flux * weight
+    mean = _blurred(photons, _RATIO_PX) / _blurred(weight, _RATIO_PX)
+    brightness = photons.sum(axis=-1) / np.maximum((weight * mean).sum(axis=-1), np.float32(1e-9))
+    luminance = (brightness * mean.sum(axis=-1))[..., None]
+    below = np.maximum(_blurred(weight * luminance, _RATIO_PX), np.float32(1e-9))
+    expected = luminance * _blurred(photons, _RATIO_PX) / below
+    noise = noise_of_a_frame(np.asarray(expected, np.float32), response) / weight
+    certain = 1 / np.maximum(noise, np.float32(1e-12))
+    difference = flux - expected
+    own = _blurred(difference**2 * certain - 1, _WINDOW_PX) / _blurred(certain, _WINDOW_PX)
+    own = np.maximum(own, 0)
+    return np.asarray(np.maximum(expected + own / np.maximum(own + noise, np.float32(1e-12)) * difference, 0), np.float32)
+
+
+def noise_of_a_frame(flux: FluxImage, response: Response) -> FluxImage:
+    """Return the variance of flux estimated from many frames, times their number, from the scale on which it is uniform."""
+    at = np.maximum(flux, np.float32(1e-4))
+    low, high = (np.asarray(at * factor, np.float32) for factor in (1 - _RELATIVE_STEP, 1 + _RELATIVE_STEP))
+    slope = np.asarray((response.stabilised(high, _MANY_FRAMES) - response.stabilised(low, _MANY_FRAMES)) / (high - low))
+    std = response.stabilised_std(_MANY_FRAMES) / np.maximum(slope, np.float32(1e-9))
+    return np.asarray(_MANY_FRAMES * std**2, np.float32)
+
+
 def _due(weight: FluxImage) -> FluxImage:
     """Return the number of frames below which each colour is thin: (H, W, C)."""
     share = weight.sum(axis=(0, 1)) / max(float(weight.sum()), 1e-9)
@@ -180,6 +224,10 @@ def _halved(image: FluxImage) -> FluxImage:
     padded = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     averaged = padded.reshape(-(-height // 2), 2, -(-width // 2), 2, n_colours).mean(axis=(1, 3), dtype=np.float32)
     return np.asarray(averaged, np.float32)
+
+
+def _blurred(image: FluxImage, std_px: float) -> FluxImage:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), std_px, borderType=cv2.BORDER_REFLECT), np.float32)
 
 
 def seen_in(panorama: Panorama) -> BoolArray:

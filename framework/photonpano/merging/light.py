@@ -14,14 +14,10 @@ from photonpano.geometry import Canvas, inverse
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Response
 
-_ROUNDS = 8
-"""Steps that solve for the flux of bright pixels in frames of different gains. Each at least halves the error."""
-_ACCURACY = 1e-4
-"""The steps end when no flux changes by more than this share."""
-_FAR = 1e4
-"""A place on a map of amplitudes that lies beyond its end, in px."""
-_SEEN = 1e-3
-"""Sums of less than this many frames are rounding errors."""
+_ROUNDS = 8  # steps that solve for the flux of bright pixels in frames of different gains. Each at least halves the error
+_ACCURACY = 1e-4  # the steps end when no flux changes by more than this share
+_FAR = 1e4  # a place on a map of amplitudes that lies beyond its end, in px
+_SEEN = 1e-3  # sums of less than this many frames are rounding errors
 
 
 def bytes_of_light(source: Source) -> int:

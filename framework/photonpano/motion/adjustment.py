@@ -13,28 +13,22 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from photonpano.geometry import apply, corners, from_parameters, generators, inverse, slopes
+from photonpano.geometry import corners, from_parameters, generators, inverse, slopes, transform_points
+from photonpano.robust import cauchy_weights
 from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
-CONVERGED_PX = 1e-3
-"""A step that moves no corner by more than about this has converged."""
-MAX_HALVINGS = 8
-"""A step that raises the cost is halved up to this many times."""
-NO_WORSE = 1e-6
-"""Rounding errors may raise the cost by this share."""
+CONVERGED_PX = 1e-3  # largest motion of a corner in the last step
+MAX_HALVINGS = 8  # of a step that raises the cost
+NO_WORSE = 1e-6  # relative increase of the cost by rounding errors
+# Tuning constant of the Cauchy weights, in scales of the residuals: 95 % efficiency for Gaussian noise.
 CAUCHY = 2.385
-"""Tuning constant of the Cauchy weights: a residual of this many scales weighs half (95 % efficiency for Gaussian noise)."""
-OUTLIER = 8.0
-"""An edge whose residual exceeds this many scales is an outlier."""
-MEDIAN_NORM = 0.958
-"""The median of the root mean square of eight Gaussian numbers of unit variance."""
+OUTLIER = 8.0  # residual of an outlier, in scales of the residuals
+MEDIAN_NORM = 0.958  # the median of the root mean square of eight Gaussian numbers of unit variance
+# Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by.
 _DAMPING, _TINY = 1e-10, 1e-200
-"""Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by."""
-SAMPLES = 64
-"""Solutions drawn to estimate the expected error of each node, to a few per cent."""
-_DRAWN_ROWS = 8192
-"""Equations that are drawn at a time."""
+SAMPLES = 64  # solutions drawn to estimate the expected error of each node, to a few per cent
+_DRAWN_ROWS = 8192  # equations that are drawn at a time
 
 StateT = TypeVar("StateT")
 
@@ -56,44 +50,49 @@ class Assessment:
     std_camera: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A connected graph whose nodes are to be found.
+
+    Attributes:
+        pairs: (E, 2) the moving and the fixed node of each edge.
+        anchor: the node that does not change.
+        motions: the motions of the edges, with their information.
+        frame_shape: (height, width) of a frame.
+    """
+
+    pairs: NDArray[np.integer]
+    anchor: int
+    motions: Sequence[Located]
+    frame_shape: tuple[int, int]
+
+    @property
+    def observed(self) -> FloatArray:
+        """The homographies of the edges: (E, 3, 3), pixels of the moving frame to pixels of the fixed one."""
+        return np.array([motion.homography for motion in self.motions])
+
+
 class Adjustment(ABC, Generic[StateT]):
     """The least-squares problem of a connected graph.
 
     Each node has k unknowns, which move it a little in its own frame; all nodes may share some more. Unknowns have about unit
     size: a change by one moves the ends of a frame by about half its side, wherever the frame lies.
 
-    Subclasses say what a state is, such as the homographies of the nodes, and how it changes.
+    Subclasses define the state, such as the homographies of the nodes, and its change by a step.
     """
 
-    def __init__(
-        self,
-        pairs: NDArray[np.integer],
-        anchor: int,
-        observed: FloatArray,
-        motions: Sequence[Located],
-        frame_shape: tuple[int, int],
-        n_shared: int = 0,
-    ) -> None:
-        """Set up the problem.
-
-        Args:
-            pairs: (E, 2) the moving and the fixed node of each edge.
-            anchor: the node that does not change.
-            observed: (E, 3, 3) homographies of the edges, pixels of the moving frame to pixels of the fixed one.
-            motions: the motions of the edges, with their information.
-            frame_shape: (height, width) of a frame.
-            n_shared: unknowns that all nodes share.
-        """
-        self._moving, self._fixed = pairs.T
-        self._anchor = anchor
-        self._n_nodes = int(pairs.max()) + 1
+    def __init__(self, problem: Problem, n_shared: int = 0) -> None:
+        """Set up the problem; all nodes share `n_shared` unknowns."""
+        self._moving, self._fixed = problem.pairs.T
+        self._anchor = problem.anchor
+        self._n_nodes = int(problem.pairs.max()) + 1
         self._n_shared = n_shared
-        self._corners = corners(frame_shape)
+        self._frame_shape = problem.frame_shape
+        self._half = max(problem.frame_shape) / 2
+        self._corners = corners(problem.frame_shape)
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
-        self._targets = apply(observed, self._corners)
-        self._whitening = _whitening(motions, self._rows)
-        self._half = max(frame_shape) / 2
-        self._frame_shape = frame_shape
+        self._targets = transform_points(problem.observed, self._corners)
+        self._whitening = _whitening(problem.motions, self._rows)
 
     @abstractmethod
     def homographies(self, state: StateT) -> FloatArray:
@@ -254,11 +253,11 @@ class Adjustment(ABC, Generic[StateT]):
     def _robust_weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
         """Return the Cauchy weights of the edges, 0 for those that are not kept: (E,)."""
         scale = self._residual_scale(norms, kept) * CAUCHY
-        return np.asarray(np.where(kept, 1 / (1 + (norms / scale) ** 2), 0.0))
+        return np.asarray(np.where(kept, cauchy_weights(norms, scale), 0.0))
 
     def mapped_corners(self, state: StateT) -> FloatArray:
         """Return where a state expects the corners that each edge maps: (E, 4, 2) px."""
-        return apply(self.relative(state), self._corners)
+        return transform_points(self.relative(state), self._corners)
 
     def _residuals(self, state: StateT) -> FloatArray:
         return self.mapped_corners(state) - self._targets

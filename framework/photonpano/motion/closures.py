@@ -8,27 +8,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import apply, corners, inverse, rescaled, rescaling, translation
+from photonpano.geometry import corners, inverse, rescaled, rescaling, transform_points, translation
 from photonpano.motion.graph import GraphOptions, GraphSolution
 from photonpano.motion.level import FrameHomography
 from photonpano.motion.pairs import instants_of, lengths_of
 from photonpano.photometry import noise_free_correlation
 from photonpano.values import FloatArray, FluxImage, Group, VirtualExposure
 
+# Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5.
 MIN_SIMILARITY = 0.7
-"""Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5."""
-_GRID = 8
-"""The overlap of two fields of view is counted on a grid of this many points along each axis."""
-_MIN_SKIP = 2.0
-"""The exposures of a loop closure are at least this many times as far apart in time as the longest skip."""
+_GRID = 8  # the overlap of two fields of view is counted on a grid of this many points along each axis
+_MIN_SKIP = 2.0  # the exposures of a loop closure are at least this many times as far apart in time as the longest skip
+# Between two visits of a place the overlap falls by at least this share, two columns of the grid; a tremor does not count.
 _PROMINENCE = 0.25
-"""Between two visits of a place the overlap falls by at least this share, two columns of the grid; a tremor does not count."""
-_MAX_CLOSURES = 3
-"""Most loop closures of an exposure with earlier ones; those of the largest overlap are taken."""
+_MAX_CLOSURES = 3  # most loop closures of an exposure with earlier ones; those of the largest overlap are taken
+# Most exposures of a level with loop closures to earlier ones, spread over the capture. Neighbours tie the others to them.
 _MAX_EXPOSURES = 64
-"""Most exposures of a level with loop closures to earlier ones, spread over the capture. Neighbours tie the others to them."""
+# Exposures are compared by averages of blocks of this side, px: these have less noise, and hide differences of motion blur.
 _BLOCK = 4
-"""Exposures are compared by averages of blocks of this side, px: these have less noise, and hide differences of motion blur."""
 
 
 def closure_candidates(
@@ -140,7 +137,7 @@ def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int
     x, y = (low[axis] + (high[axis] - low[axis]) * (np.arange(_GRID) + 0.5) / _GRID for axis in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     between = inverse(fixed) @ moving
-    seen = apply(between, points)
+    seen = transform_points(between, points)
     ahead = points @ between[:, 2, :2, None] + between[:, 2:, 2, None] > 0
     with np.errstate(invalid="ignore"):
         inside = np.all((seen >= low) & (seen <= high), axis=-1) & ahead[..., 0]

@@ -17,17 +17,12 @@ from photonpano.photometry import signal_to_noise
 from photonpano.text import listed
 from photonpano.values import BoolArray, Edge, FrameSpan, Group, NotLocated, VirtualExposure, true_spans
 
-TOLERATED_RUN = 2
-"""Most exposures in a row that may be lost: the motion is interpolated across them."""
+TOLERATED_RUN = 2  # lost exposures in a row across which the motion is interpolated
+# Signal-to-noise ratios: below the first the likely cause is darkness, above the second blur; texture may lack at any.
 _NOISY, _CLEAR = 0.25, 2.0
-"""Below the first signal-to-noise ratio the likely cause is darkness, above the second it is blur, in between either. Lack of
-texture may be the cause at any ratio."""
-_NOTHING = 0.01
-"""Signal-to-noise ratio below which its value says no more than that there is hardly any signal."""
-_FAR = 1e9
-"""Numbers of a homography from this on map a frame to infinity."""
-_SHOWN = 6
-"""Most pairs, spans or parts that a message lists."""
+_NOTHING = 0.01  # signal-to-noise ratio below which there is hardly any signal
+_FAR = 1e9  # numbers of a homography from this on map a frame to infinity
+_SHOWN = 6  # most pairs, spans or parts that a message lists
 
 
 _START = "If the image turns or shifts at a constant velocity, write motion: {start: constant-velocity}."

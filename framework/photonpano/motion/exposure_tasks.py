@@ -15,8 +15,7 @@ from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import FrameHomography, NamedLocator
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import shared_share
-from photonpano.motion.start import StartingMotion
-from photonpano.motion.tracking import Place, Track
+from photonpano.motion.tracking import Place, StartingMotion, Track
 from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import Guard, Stopwatch
 from photonpano.values import Decision, Edge, Homography, Located, NotLocated, VirtualExposure

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import inverse, nearest_rotations, normalised, scaled_ahead
-from photonpano.motion.adjustment import Adjustment, Assessment
+from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.homography_graph import HomographyAdjustment
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
-from photonpano.motion.rotation_graph import RotationAdjustment, Turns
+from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, Located
 
+# A camera only turns if five unknowns more for each exposure lower the squared residuals by less than this for each of them, in
+# units of those that remain. Noise alone lowers them by 1, and noise that pairs have in common by some more.
 _EXPLAINED = 20.0
-"""A camera only turns if five unknowns more for each exposure lower the squared residuals by less than this for each of them,
-in units of those that remain. Noise alone lowers them by 1, and noise that pairs have in common by some more."""
 
 
 class GraphOptions(Protocol):
@@ -49,7 +49,7 @@ class GraphSolution:
 
     Convention:
         Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity. Those of a
-        camera that only turns have determinant 1, all others h33 = 1.
+        rotating camera have determinant 1, all others h33 = 1.
 
     Attributes:
         homographies: (N, 3, 3), NaN for nodes that are not tied to the anchor.
@@ -57,8 +57,8 @@ class GraphSolution:
         outliers: positions, in the list that was solved, of edges that were dropped because they contradict the others.
         residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
         assess: returns how well the L located nodes are determined. It takes about as long as to solve the graph.
-        turns: the rotations of the L located nodes, and the camera; None for homographies.
-        compare: returns how well a camera that only turns explains the edges; None where one of the two models is not fitted.
+        rotations: of the L located nodes, and their camera; None for homographies.
+        compare: returns how well a rotating camera explains the edges; None where one of the two models is not fitted.
             For rotations it takes about as long as to solve the graph.
     """
 
@@ -67,13 +67,13 @@ class GraphSolution:
     outliers: tuple[int, ...]
     residual_px: float
     assess: Callable[[], Assessment]
-    turns: Turns | None = None
+    rotations: Rotations | None = None
     compare: Callable[[], Evidence | None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """How well a camera that only turns explains the pairs, compared with any homographies.
+    """How well a rotating camera explains the pairs, compared with any homographies.
 
     Attributes:
         rotation: mean square of the whitened residuals of rotations, 1 where they are photon noise.
@@ -86,16 +86,16 @@ class Evidence:
     gain: float
 
     @classmethod
-    def of(cls, free: _Fit, turned: _Fit) -> Evidence:
+    def of(cls, free: _Fit, rotating: _Fit) -> Evidence:
         """Compare two fits to the same edges."""
-        kept = free.kept & turned.kept
-        (of_free, left_free), (of_turned, left_turned) = (fit.adjustment.cost(fit.norms, kept) for fit in (free, turned))
+        kept = free.kept & rotating.kept
+        (of_free, left_free), (of_rotating, left_rotating) = (fit.adjustment.cost(fit.norms, kept) for fit in (free, rotating))
         scale = max(of_free / max(left_free, 1), 1.0)
-        gain = (of_turned - of_free) / max(left_turned - left_free, 1) / scale
-        return cls(of_turned / max(left_turned, 1), of_free / max(left_free, 1), gain)
+        gain = (of_rotating - of_free) / max(left_rotating - left_free, 1) / scale
+        return cls(of_rotating / max(left_rotating, 1), of_free / max(left_free, 1), gain)
 
     @property
-    def turns_only(self) -> bool:
+    def rotations_suffice(self) -> bool:
         """Whether homographies explain the pairs no better than rotations."""
         return self.gain < _EXPLAINED
 
@@ -134,20 +134,20 @@ def solve(
         return tied.alone(model)
     if model.kind == "homography":
         return tied.solution(_homographies(tied, start))
-    turned = _turns(tied, start, model)
+    rotating = _rotations(tied, start, model)
     if model.kind == "rotation":
-        return tied.solution(turned, lambda: _compared(tied, start, turned)[1])
-    free, evidence = _compared(tied, start, turned)
-    chosen = turned if free is None or evidence is None or evidence.turns_only else free
+        return tied.solution(rotating, lambda: _compared(tied, start, rotating)[1])
+    free, evidence = _compared(tied, start, rotating)
+    chosen = rotating if free is None or evidence is None or evidence.rotations_suffice else free
     return tied.solution(chosen, lambda: evidence)
 
 
-def _compared(tied: _Tied, start: FloatArray | None, turned: _Fit) -> tuple[_Fit | None, Evidence | None]:
+def _compared(tied: _Tied, start: FloatArray | None, rotating: _Fit) -> tuple[_Fit | None, Evidence | None]:
     """Fit homographies, and compare rotations with them; None for both where no plane holds all frames."""
     try:
         with np.errstate(all="ignore"):
             free = _homographies(tied, start)
-            return free, Evidence.of(free, turned)
+            return free, Evidence.of(free, rotating)
     except (ValueError, np.linalg.LinAlgError):
         return None, None
 
@@ -210,18 +210,14 @@ class _Tied:
         return int(self.order[0])
 
     @property
-    def observed(self) -> FloatArray:
-        """The homographies of the edges: (E, 3, 3)."""
-        return np.array([motion.homography for motion in self.motions])
-
-    @property
     def compact_pairs(self) -> NDArray[np.integer]:
         """The nodes of the edges, numbered without those that are not tied: (E, 2)."""
         return np.asarray((np.cumsum(self.located) - 1)[self.pairs])
 
-    def problem(self) -> tuple[NDArray[np.integer], int, FloatArray, Sequence[Located], tuple[int, int]]:
-        """Return the arguments of an `Adjustment`."""
-        return self.compact_pairs, int(self.located[: self.anchor].sum()), self.observed, self.motions, self.frame_shape
+    @property
+    def problem(self) -> Problem:
+        """The least-squares problem, without nodes that are not tied."""
+        return Problem(self.compact_pairs, int(self.located[: self.anchor].sum()), self.motions, self.frame_shape)
 
     def composed(self, observed: FloatArray) -> FloatArray:
         """Return the maps of the tied nodes to the anchor, each composed from its parent's along one edge: (L, 3, 3)."""
@@ -253,36 +249,36 @@ class _Tied:
         residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2)))
         outliers = tuple(int(position) for position in self.positions[~fit.kept])
         assess = partial(adjustment.assess, found, fit.norms, fit.kept)
-        turns = found if isinstance(found, Turns) else None
-        return GraphSolution(homographies, self.located, outliers, residual_px, assess, turns, compare)
+        rotations = found if isinstance(found, Rotations) else None
+        return GraphSolution(homographies, self.located, outliers, residual_px, assess, rotations, compare)
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""
         homographies = np.full((len(self.located), 3, 3), np.nan)
         homographies[self.anchor] = np.eye(3)
-        turns = None if model.kind == "homography" else Turns(np.eye(3)[None], model.camera(self.frame_shape))
+        rotations = None if model.kind == "homography" else Rotations(np.eye(3)[None], model.camera(self.frame_shape))
         nothing = Assessment(np.full((1, 8, 8), np.nan), np.full(1, np.nan), np.zeros(0))
-        return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, turns)
+        return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, rotations)
 
 
 def _homographies(tied: _Tied, start: FloatArray | None) -> _Fit:
-    state = tied.composed(tied.observed)
+    problem = tied.problem
+    state = tied.composed(problem.observed)
     if start is not None:
         state = normalised(inverse(start[tied.anchor]) @ start[tied.located])
-    return tied.fit(HomographyAdjustment(*tied.problem()), state)
+    return tied.fit(HomographyAdjustment(problem), state)
 
 
-def _turns(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
-    problem = tied.problem()
-    camera = model.camera(tied.frame_shape)
-    adjustment = RotationAdjustment(*problem, model.seen_by(tied.frame_shape), model.unknown)
+def _rotations(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
+    problem, camera = tied.problem, model.camera(tied.frame_shape)
+    adjustment = RotationAdjustment(problem, model.seen_by(tied.frame_shape), model.unknown)
     if model.focal_px is None and model.known is None:
         camera = adjustment.likeliest_camera(camera)
     if start is None:
-        turns = tied.composed(nearest_rotations(camera.rotations(tied.observed)))
+        rotations = tied.composed(nearest_rotations(camera.rotations(problem.observed)))
     else:
-        turns = camera.rotations(inverse(start[tied.anchor]) @ start[tied.located])
-    return tied.fit(adjustment, Turns(nearest_rotations(turns), camera))
+        rotations = camera.rotations(inverse(start[tied.anchor]) @ start[tied.located])
+    return tied.fit(adjustment, Rotations(nearest_rotations(rotations), camera))
 
 
 def _tree(n_nodes: int, pairs: NDArray[np.integer], anchor: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:

@@ -18,7 +18,7 @@ from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
-from photonpano.motion.start import starting_motion
+from photonpano.motion.tracking import starting_motion
 from photonpano.protocols import camera_of
 from photonpano.threads import thread_pool
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated

@@ -16,8 +16,8 @@ from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.merge import VirtualExposures, merge
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import ReferencedTrajectory, TurningTrajectory, fit_turns
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.protocols import Source, Trajectory, camera_of_motion
 from photonpano.threads import Stopwatch
@@ -133,7 +133,7 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
         LocationError: the interpolator failed because exposures reach the horizon of the plane.
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
-    turns, shape = located.solution.turns, located.frame_shape
+    rotations, shape = located.solution.rotations, located.frame_shape
 
     def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:
         free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
@@ -142,8 +142,10 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
 
     def fitted(knots: slice, times: FloatArray) -> Trajectory:
         information = None if located.information is None else located.information[knots].copy()
-        if turns is not None:
-            return fit_turns(level.interpolator, times, turns.of(knots), information, partial(kept, knots=knots, times=times))
+        if rotations is not None:
+            return fit_rotations(
+                level.interpolator, times, rotations.of(knots), information, partial(kept, knots=knots, times=times)
+            )
         homographies = located.homographies[knots]
         try:
             found = level.interpolator.fit(times, homographies, information)
@@ -154,7 +156,11 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
 
     with clock("interpolate"), level.attributing("interpolator"):
         free = timeline.fit(fitted, located.instants)
-        return ReferencedTrajectory(free, reference) if turns is None else TurningTrajectory(free, turns.camera, reference)
+        return (
+            ReferencedTrajectory(free, reference)
+            if rotations is None
+            else RotationTrajectory(free, rotations.camera, reference)
+        )
 
 
 def _summary(result: LevelResult) -> str:

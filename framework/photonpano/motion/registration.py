@@ -16,8 +16,7 @@ from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes,
 from photonpano.motion.level import FrameHomography
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of
-from photonpano.motion.start import StartingMotion, starting_motion
-from photonpano.motion.tracking import Place
+from photonpano.motion.tracking import Place, StartingMotion, starting_motion
 from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import batched, in_order, lagging
 from photonpano.values import Decision, Edge, FloatArray, Located, NotLocated

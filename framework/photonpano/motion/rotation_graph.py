@@ -1,32 +1,36 @@
-"""The motion graph of a camera that only turns: three unknowns a node, and a camera that all share."""
+"""The motion graph of a rotating camera: three unknowns a node, and a camera that all share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano.geometry import ROTATION_AXES, Camera, apply, camera_matrix, nearest_rotations, rotation_matrices, slopes
-from photonpano.motion.adjustment import Adjustment
-from photonpano.motion.lens_shift import LensShift
-from photonpano.values import FloatArray, Located
+from photonpano.geometry import (
+    ROTATION_AXES,
+    Camera,
+    camera_matrix,
+    corners,
+    generators,
+    nearest_rotations,
+    rotation_matrices,
+    slopes,
+    transform_points,
+)
+from photonpano.motion.adjustment import Adjustment, Problem
+from photonpano.values import BoolArray, FloatArray
 
-_FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)
-"""Focal lengths that are tried first, in sides of a frame."""
+_FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
+# Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
-"""What is known of the focal length before: its logarithm is that of 3 sides of a frame, give or take 2."""
-_PRIOR_DISTORTION = 1.0
-"""What is known of the lens before: it moves the corners of a frame by up to about its half diagonal."""
-_STEP = 1e-5
-"""Change of an unknown by which derivatives are taken."""
-_MOST_TRIED = 400
-"""Edges by which the first focal length is chosen."""
+_PRIOR_DISTORTION = 1.0  # prior standard deviation of the displacement of a corner by the lens, in half diagonals
+_STEP = 1e-5  # step of numerical derivatives
+_MOST_TRIED = 400  # edges by which the first focal length is chosen
+_GRID = 7  # points of a frame along each axis to which a homography is fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turns:
+class Rotations:
     """The rotations of a camera.
 
     Attributes:
@@ -37,12 +41,63 @@ class Turns:
     rotations: FloatArray
     camera: Camera
 
-    def of(self, nodes: slice) -> Turns:
+    def of(self, nodes: slice) -> Rotations:
         """Return the rotations of some nodes."""
-        return Turns(self.rotations[nodes], self.camera)
+        return Rotations(self.rotations[nodes], self.camera)
 
 
-class RotationAdjustment(Adjustment[Turns]):
+@dataclass(frozen=True, slots=True, eq=False)
+class LensShift:
+    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens.
+
+    Attributes:
+        frame_shape: (height, width) of a frame.
+        points: (P, 2) all over a frame.
+        seen: (E, P) which of them both exposures of each pair see.
+    """
+
+    frame_shape: tuple[int, int]
+    points: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, frame_shape: tuple[int, int], observed: FloatArray) -> LensShift:
+        """Lay points over the frames of pairs with (E, 3, 3) homographies."""
+        height, width = frame_shape
+        x, y = ((np.arange(_GRID) + 0.5) / _GRID * side - 0.5 for side in (width, height))
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        mapped = transform_points(observed, points)
+        seen = np.all((mapped >= 0) & (mapped <= [width - 1, height - 1]), axis=-1)
+        # Four points at least determine a homography; a pair that hardly overlaps takes all.
+        seen[seen.sum(axis=1) < _GRID] = True
+        return cls(frame_shape, points, seen)
+
+    def of_corners(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
+        """Return the change of corner displacement caused by undistorting with the wrong lens: (E, 4, 2) px.
+
+        Args:
+            relative: (E, 3, 3) homographies of the ideal pixels of the camera.
+            camera: the true one.
+            assumed: camera used to undistort the pixels.
+        """
+        ideal = camera.ideal(assumed.distorted(self.points))
+        there = assumed.ideal(camera.distorted(transform_points(relative, ideal)))
+        shift = there - transform_points(relative, self.points)
+        weights = (self.seen & np.isfinite(shift).all(axis=-1)).astype(float)
+        by_points = self._slopes(relative, self.points)
+        weighted = by_points * np.repeat(weights, 2, axis=1)[..., None]
+        right = np.einsum("epk,ep->ek", weighted, np.nan_to_num(shift).reshape(len(relative), -1))
+        change = np.linalg.solve(np.swapaxes(weighted, -1, -2) @ by_points, right[..., None])
+        moved = self._slopes(relative, corners(self.frame_shape)) @ change
+        return np.asarray(moved.reshape(len(relative), 4, 2))
+
+    def _slopes(self, relative: FloatArray, points: FloatArray) -> FloatArray:
+        """Return the derivatives of mapped points by the eight parameters of a small homography that follows: (E, 2 P, 8)."""
+        mapped = relative @ np.concatenate([points, np.ones((len(points), 1))], axis=1).T
+        return slopes(mapped, generators(self.frame_shape) @ mapped[:, None])
+
+
+class RotationAdjustment(Adjustment[Rotations]):
     """The least-squares problem of a graph whose nodes are rotations of one camera.
 
     The unknowns of a node are a rotation vector in its own frame. Those of the camera that are not given are shared: the
@@ -51,77 +106,63 @@ class RotationAdjustment(Adjustment[Turns]):
 
     _n_node = 3
 
-    def __init__(
-        self,
-        pairs: NDArray[np.integer],
-        anchor: int,
-        observed: FloatArray,
-        motions: Sequence[Located],
-        frame_shape: tuple[int, int],
-        seen_by: Camera,
-        unknown: tuple[int, ...],
-    ) -> None:
-        """Set up the problem: see `Adjustment`.
+    def __init__(self, problem: Problem, assumed: Camera, unknown: tuple[int, ...]) -> None:
+        """Set up the problem.
 
         Args:
-            pairs: (E, 2).
-            anchor: the node that does not turn.
-            observed: (E, 3, 3) homographies of ideal pixels of `seen_by`.
-            motions: of the edges.
-            frame_shape: (height, width) of a frame.
-            seen_by: the camera by whose distortion the exposures were merged.
+            problem: its homographies are those of ideal pixels of `assumed`.
+            assumed: camera used to undistort the pixels.
             unknown: what is to be found of the camera: 0 for the focal length, 1 to 4 for k1, k2, p1, p2.
         """
-        super().__init__(pairs, anchor, observed, motions, frame_shape, n_shared=len(unknown))
-        self._seen_by = seen_by
-        self._unknown = unknown
-        self._lens = LensShift.of(frame_shape, observed)
+        super().__init__(problem, n_shared=len(unknown))
+        self._assumed, self._unknown = assumed, unknown
+        self._lens = LensShift.of(problem.frame_shape, problem.observed)
 
-    def homographies(self, state: Turns) -> FloatArray:
+    def homographies(self, state: Rotations) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
         return state.camera.homographies(state.rotations)
 
-    def relative(self, state: Turns) -> FloatArray:
+    def relative(self, state: Rotations) -> FloatArray:
         """Return K R K^-1 of the rotation between the nodes of each edge: (E, 3, 3)."""
         between = np.swapaxes(state.rotations[self._fixed], -1, -2) @ state.rotations[self._moving]
         return state.camera.homographies(between)
 
-    def changed(self, state: Turns, nodes: FloatArray, shared: FloatArray) -> Turns:
-        """Turn each node, and change the camera."""
-        turned = state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px))
+    def changed(self, state: Rotations, nodes: FloatArray, shared: FloatArray) -> Rotations:
+        """Rotate each node, and change the camera."""
+        rotated = state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px))
         camera = state.camera
         for index, step in zip(self._unknown, shared * self._units(camera), strict=True):
             camera = _changed(camera, index, float(step))
-        return Turns(turned, camera)
+        return Rotations(rotated, camera)
 
-    def mapped_corners(self, state: Turns) -> FloatArray:
+    def mapped_corners(self, state: Rotations) -> FloatArray:
         """Return where the corners are seen: (E, 4, 2) px.
 
-        Where the lens distorts otherwise than was known when the exposures were merged, no homography holds exactly; it is the
-        one that fits best where both exposures see the scene.
+        If pixels were undistorted with the wrong lens, no homography holds exactly; it is the one that fits best where both
+        exposures see the scene.
         """
         mapped = super().mapped_corners(state)
-        if not (state.camera.distorts or self._seen_by.distorts):
+        if not (state.camera.distorts or self._assumed.distorts):
             return mapped
-        return mapped + self._lens.of_corners(self.relative(state), state.camera, self._seen_by)
+        return mapped + self._lens.of_corners(self.relative(state), state.camera, self._assumed)
 
-    def generators(self, state: Turns) -> FloatArray:
+    def generators(self, state: Rotations) -> FloatArray:
         """Return the derivatives by rotations that move the middle of the frame by about half its side: (3, 3, 3)."""
         return state.camera.homographies(ROTATION_AXES) * (self._half / state.camera.focal_px)
 
-    def information(self, state: Turns, blocks: FloatArray) -> FloatArray:
+    def information(self, state: Rotations, blocks: FloatArray) -> FloatArray:
         """Convert to information on rotation vectors, in radians: (N, 3, 3)."""
         return blocks * (state.camera.focal_px / self._half) ** 2
 
-    def shared_slopes(self, state: Turns) -> FloatArray:
+    def shared_slopes(self, state: Rotations) -> FloatArray:
         """Return the derivatives of the corners by what is unknown of the camera: (E, 8, s)."""
         here, found = self.mapped_corners(state), []
         for index, unit in zip(self._unknown, self._units(state.camera), strict=True):
-            there = self.mapped_corners(Turns(state.rotations, _changed(state.camera, index, _STEP * unit)))
+            there = self.mapped_corners(Rotations(state.rotations, _changed(state.camera, index, _STEP * unit)))
             found.append((there - here).reshape(len(here), 8) / _STEP)
         return np.stack(found, axis=-1)
 
-    def shared_errors(self, state: Turns) -> FloatArray:
+    def shared_errors(self, state: Rotations) -> FloatArray:
         """Return how the corners of each frame move on the plane of the anchor by what is unknown of the camera: (N, 8, s)."""
         homographies, zoom = self.homographies(state), _zoom(state.camera)
         moved = (np.linalg.solve(homographies, zoom @ homographies) - zoom) @ self._rows
@@ -133,7 +174,7 @@ class RotationAdjustment(Adjustment[Turns]):
             found.append(by_focal if index == 0 else np.broadcast_to(by_lens, by_focal.shape))
         return np.concatenate(found, axis=-1)
 
-    def prior(self, state: Turns) -> tuple[FloatArray, FloatArray]:
+    def prior(self, state: Rotations) -> tuple[FloatArray, FloatArray]:
         """Return what is known before: a focal length of some sides of a frame, and a lens that distorts by less than that."""
         units = self._units(state.camera)
         away = [_away(state.camera, index, 2 * self._half) for index in self._unknown]
@@ -145,23 +186,19 @@ class RotationAdjustment(Adjustment[Turns]):
         end = float(np.hypot(*self._frame_shape)) / 2 / camera.focal_px
         return np.array([1.0, end**-2, end**-4, end**-1, end**-1])[list(self._unknown)]
 
-    def std_camera(self, state: Turns, std_shared: FloatArray) -> FloatArray:
+    def std_camera(self, state: Rotations, std_shared: FloatArray) -> FloatArray:
         """Return the expected errors of the focal length, in px, and of k1, k2, p1 and p2: (5,), 0 for what is given."""
         found = np.zeros(5)
         found[list(self._unknown)] = std_shared * self._units(state.camera)
         found[0] *= state.camera.focal_px
         return found
 
-    def start(self, homographies: FloatArray, camera: Camera) -> Turns:
-        """Return the rotations nearest to the homographies of the nodes: (N, 3, 3)."""
-        return Turns(nearest_rotations(camera.rotations(homographies)), camera)
-
     def likeliest_camera(self, camera: Camera) -> Camera:
         """Return the camera with the focal length that explains the edges best, each by itself."""
         candidates = [_with_focal(camera, length * 2 * self._half) for length in _FOCAL_LENGTHS]
-        return min(candidates, key=self._misfit)
+        return min(candidates, key=self._cost_of)
 
-    def _misfit(self, camera: Camera) -> float:
+    def _cost_of(self, camera: Camera) -> float:
         chosen = np.unique(np.linspace(0, len(self._moving) - 1, _MOST_TRIED).astype(int))
         whitening, targets = self._whitening[chosen], self._targets[chosen]
         here = np.broadcast_to(self._corners, targets.shape)
@@ -171,14 +208,14 @@ class RotationAdjustment(Adjustment[Turns]):
         moves = camera.homographies(ROTATION_AXES)
         for _ in range(2):
             mapped = camera.homographies(rotations)
-            by_turn = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
-            residuals = np.einsum("eij,ej->ei", whitening, (apply(mapped, self._corners) - targets).reshape(-1, 8))
+            by_rotation = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
+            residuals = np.einsum("eij,ej->ei", whitening, (transform_points(mapped, self._corners) - targets).reshape(-1, 8))
             step = -np.linalg.solve(
-                np.swapaxes(by_turn, -1, -2) @ by_turn, np.einsum("eij,ei->ej", by_turn, residuals)[..., None]
+                np.swapaxes(by_rotation, -1, -2) @ by_rotation, np.einsum("eij,ei->ej", by_rotation, residuals)[..., None]
             )
             rotations = rotations @ rotation_matrices(step[..., 0])
         residuals = np.einsum(
-            "eij,ej->ei", whitening, (apply(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
+            "eij,ej->ei", whitening, (transform_points(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
         )
         squares = (residuals**2).sum(axis=1)
         return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)

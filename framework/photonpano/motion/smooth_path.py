@@ -9,11 +9,9 @@ from photonpano.geometry import corners, nearest_rotations, normalised, rotation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.values import FloatArray, FrameSpan, Homography
 
-_REACH = 3.0
-"""Instants up to this many standard deviations away count."""
+_REACH = 3.0  # instants up to this many standard deviations away count
 _MOST_INSTANTS = 400
-_NEAR = 0.5
-"""A frame counts if its corners have more than this part of the depth of the instant's; others look elsewhere."""
+_NEAR = 0.5  # a frame counts if its corners have more than this part of the depth of the instant's; others look elsewhere
 
 
 def smooth_view(motion: FrameMotion, instant: float, std: float) -> Homography:

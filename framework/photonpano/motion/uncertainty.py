@@ -7,17 +7,15 @@ from numpy.typing import ArrayLike
 
 from photonpano.geometry import Camera, align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
+from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.turning import TurningTrajectory
 from photonpano.protocols import Trajectory, camera_of_motion
 from photonpano.values import FloatArray
 
-_COMPARED = 1000
-"""Number of frames at which two levels are compared."""
+_COMPARED = 1000  # number of frames at which two levels are compared
+# Error after a level, as a share of the change it made: each level removes at least three quarters of the error.
 _REMAINING_SHARE = 0.25
-"""Error after a level, as a share of the change it made: each level removes at least three quarters of the error."""
-_BLUR_SHARE = 0.02
-"""Error after the first level, as a share of the motion within a group, by which its exposures are blurred."""
+_BLUR_SHARE = 0.02  # error after the first level, as a share of the motion within a group, by which its exposures are blurred
 
 
 class Uncertainty:
@@ -87,17 +85,17 @@ class Uncertainty:
 
 
 def _std_camera(located: LocatedLevel, before: Camera | None) -> FloatArray | None:
-    if located.solution.turns is None:
+    if located.solution.rotations is None:
         return None
     if before is None:
         return located.std_camera
-    change = located.solution.turns.camera.numbers - before.numbers
+    change = located.solution.rotations.camera.numbers - before.numbers
     return np.asarray(np.hypot(located.std_camera, _REMAINING_SHARE * change))
 
 
 def _aligned(after: Trajectory, before: Trajectory, frames: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
     """Return the best map from the reference plane of one trajectory to that of another: (3, 3)."""
-    if isinstance(after, TurningTrajectory) and isinstance(before, TurningTrajectory):
+    if isinstance(after, RotationTrajectory) and isinstance(before, RotationTrajectory):
         turned = align_rotations(after.rotations(frames), before.rotations(frames))
         start = before.camera.homographies(turned)
         return align_planes(after.at(frames), before.at(frames), frame_shape, start)

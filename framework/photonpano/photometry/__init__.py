@@ -8,6 +8,7 @@ from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, F
 from photonpano.photometry.similarity import (
     Similarity,
     autocorrelation,
+    hann_window,
     noise_free_correlation,
     similarity_of,
     tapered,
@@ -30,6 +31,7 @@ __all__ = [
     "debiased",
     "flux_std",
     "grey_world",
+    "hann_window",
     "linear_to_srgb",
     "measurable_range",
     "noise_free_correlation",

@@ -12,15 +12,11 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-MAX_FRAMES = 255
-"""Frames of a block, so that a count fits into a byte."""
-_BYTES = 2048
-"""Bytes of a frame that are summed at a time, so that all rows of the sum fit into the level 1 cache."""
+MAX_FRAMES = 255  # frames of a block, so that a count fits into a byte
+_BYTES = 2048  # bytes of a frame that are summed at a time, so that all rows of the sum fit into the level 1 cache
 _WORDS = _BYTES // 8
-_ROWS = 12
-"""Rows of a stage: eight of input, three of counter, and the carry, of eight times the weight."""
-_STAGES = 3
-"""Stages, which count ones, eights and sixty-fours."""
+_ROWS = 12  # rows of a stage: eight of input, three of counter, and the carry, of eight times the weight
+_STAGES = 3  # stages, which count ones, eights and sixty-fours
 
 
 @compiled

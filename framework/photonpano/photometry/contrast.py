@@ -6,10 +6,8 @@ import numpy as np
 
 from photonpano.values import VirtualExposure
 
-_ROWS = 16
-"""Rows of blocks that are sampled."""
-_BLOCK = 4
-"""Side of the blocks, px, whose averages separate scene and noise: averaging reduces the noise and hardly the scene."""
+_ROWS = 16  # rows of blocks that are sampled
+_BLOCK = 4  # side of the blocks, px, whose averages separate scene and noise: averaging reduces the noise and hardly the scene
 
 
 def signal_to_noise(exposure: VirtualExposure) -> float:

@@ -13,13 +13,10 @@ from photonpano.photometry.responses import Factor
 if TYPE_CHECKING:
     from photonpano.values import BoolArray, FluxImage, Response
 
-_STEP = 0.01
-"""Relative step of numerical derivatives."""
-_NEARLY = 0.9
-"""A pixel counts as saturated if it was dark in less than this many frames, as its flux says."""
+_STEP = 0.01  # relative step of numerical derivatives
+_NEARLY = 0.9  # frames in which a pixel was dark, by its flux, below which it is saturated
 _MANY_FRAMES = 1e12
-_FLUXES = 4000
-"""Fluxes at which the signal-to-noise ratio is computed, to find where it is 1."""
+_FLUXES = 4000  # fluxes at which the signal-to-noise ratio is computed, to find where it is 1
 
 
 @runtime_checkable

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from photonpano.values import Counts
 
+# Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`.
 BitOrder: TypeAlias = Literal["big", "little"]
-"""Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`."""
 
-_BLOCK_BYTES = 1024**2
-"""Bytes of frames that are summed at a time: about the cache of a core."""
+_BLOCK_BYTES = 1024**2  # bytes of frames that are summed at a time: about the cache of a core
 
 
 def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None = None, bit_order: BitOrder = "big") -> Counts:

@@ -8,10 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Factor: TypeAlias = "NDArray[np.floating] | float"
-"""One number for all pixels, or one for each."""
-_LEAST_DARK = 0.75
-"""A pixel with fewer dark frames was lit in all: half a dark frame is what `flux` assumes then."""
+Factor: TypeAlias = "NDArray[np.floating] | float"  # one number for all pixels, or one for each
+_LEAST_DARK = 0.75  # a pixel with fewer dark frames was lit in all: half a dark frame is what `flux` assumes then
 
 
 @dataclass(frozen=True, slots=True)

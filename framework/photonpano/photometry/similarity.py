@@ -10,21 +10,17 @@ from numpy.typing import NDArray
 
 from photonpano.values import BoolArray, FloatArray
 
-_LOCAL_PX = 13
-"""Side of the square whose mean is subtracted from each pixel before images are compared, px."""
-_MIN_INDEPENDENT = 50
-"""With fewer independent pixels, a correlation is not estimated."""
-_MIN_SIGMA = 5.0
-"""Least variance of a scene, in standard errors of the variance of its noise."""
-_LAGS = 4
-"""The largest lag of an autocorrelation is the side of the image over this."""
+_LOCAL_PX = 13  # side of the square whose mean is subtracted from each pixel before images are compared, px
+_MIN_INDEPENDENT = 50  # with fewer independent pixels, a correlation is not estimated
+_MIN_SIGMA = 5.0  # least variance of a scene, in standard errors of the variance of its noise
+_LAGS = 4  # the largest lag of an autocorrelation is the side of the image over this
+# Least score of an accepted pair; high, because an alignment searches for the best correlation. Of 576 pairs of one place at
+# flux 0.02 and 0.1, pale and blurred ones among them, those that `direct` aligned scored 6.6 and more; of 370 pairs of smears
+# or of different places none reached 5.2, at correlations of up to 0.77. Repeated texture, such as windows, may pass.
 _MIN_SCORE = 5.5
-"""Least score of an accepted pair; high, because an alignment searches for the best correlation. Of 576 pairs of one place
-at flux 0.02 and 0.1, pale and blurred ones among them, those that `direct` aligned scored 6.6 and more; of 370 pairs of smears
-or of different places none reached 5.2, at correlations of up to 0.77. Repeated texture, such as windows, may pass."""
 
 
-def tapered(shape: tuple[int, ...]) -> NDArray[np.float32]:
+def hann_window(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Return the Hann window of OpenCV: (H, W), 0 at the edges of an image; along sides of 1 or 2 px it is constant."""
     import cv2
 
@@ -34,6 +30,9 @@ def tapered(shape: tuple[int, ...]) -> NDArray[np.float32]:
         if side < 3:
             window = np.repeat(window.take([1], axis), side, axis)
     return np.asarray(window)
+
+
+tapered = hann_window  # deprecated: use `hann_window`
 
 
 class Similarity(NamedTuple):

@@ -7,8 +7,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+# Factors of red, green and blue in a picture: all 1, those that make the mean grey, or given ones.
 WhiteBalance: TypeAlias = Literal["none", "grey-world"] | tuple[float, float, float]
-"""Factors of red, green and blue in a picture: all 1, those that make the mean grey, or given ones."""
 
 
 def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -21,8 +21,7 @@ from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
-from photonpano.motion.velocity import ConstantVelocity
-from photonpano.motion.velocity_search import find_velocity
+from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.run_steps import require_centre
 from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
@@ -281,7 +280,7 @@ def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decisio
     located = results[-1].located
     if plan.motion.model != "auto":
         return []
-    taken = "homography" if located.solution.turns is None else "rotation"
+    taken = "homography" if located.solution.rotations is None else "rotation"
     if located.evidence is None:
         return [Decision("motion_model", taken, "the camera turns too far for homographies to one plane")]
     gain = located.evidence.gain

@@ -10,7 +10,7 @@ import numpy as np
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas
 from photonpano.merging import MergeRenderer
-from photonpano.merging.bent import BentGrid
+from photonpano.merging.footprints import by_homographies
 from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.protocols import Renderer, Source, Trajectory, camera_of
 from photonpano.values import FrameSpan, Panorama
@@ -69,7 +69,7 @@ class AttributedRenderer:
         if camera is not None and camera.distorts:
             raise InputError(f"{self.origin} does not render through a lens that distorts; write render.use: merge")
         homographies = trajectory.at(np.arange(span.start, span.stop))
-        if BentGrid.of(canvas, camera, homographies, source.info.frame_shape) is not None:
+        if not by_homographies(canvas, camera, homographies, source.info.frame_shape):
             raise InputError(f"{self.origin} does not leave out frames that reach behind the plane; write render.use: merge")
 
     def require_seen(self, coverage_share: float) -> None:

@@ -22,13 +22,11 @@ from photonpano.values import FloatArray, ScenePoints
 
 PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "tum"]
 
-_GRAPHICS = np.diag([1.0, -1.0, -1.0])
-"""Axes of a camera in OpenGL, x right, y up, z back, to ours."""
-_WHITE_QUANTILE = 0.995
-"""Quantile of the flux of points that is white."""
+_GRAPHICS = np.diag([1.0, -1.0, -1.0])  # axes of a camera in OpenGL, x right, y up, z back, to ours
+_WHITE_QUANTILE = 0.995  # quantile of the flux of points that is white
 _MIDDLE_GREY = 128
+# Directions of the reference camera to a world whose z is up, in which that camera looks along y.
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Directions of the reference camera to a world whose z is up, in which that camera looks along y."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,8 +122,8 @@ def tum(poses: Poses) -> dict[str, str]:
     return {"trajectory.txt": "\n".join(lines) + "\n"}
 
 
+# Each returns the content of files by name.
 POSE_FORMATS: Mapping[PoseFormat, Callable[[Poses], dict[str, str]]] = {"colmap": colmap, "nerfstudio": nerfstudio, "tum": tum}
-"""Each returns the content of files by name."""
 
 
 def ply(points: ScenePoints) -> bytes:

@@ -201,7 +201,7 @@ def _evidence_record(evidence: Evidence | None) -> EvidenceRecord | None:
 
 
 def _camera_record(result: LevelResult) -> CameraRecord | None:
-    turns, std = result.located.solution.turns, result.uncertainty.std_camera
+    turns, std = result.located.solution.rotations, result.uncertainty.std_camera
     if turns is None or std is None:
         return None
     return {

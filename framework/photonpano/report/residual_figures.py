@@ -28,7 +28,6 @@ from photonpano.report.drawing import (
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.unexplained import SYSTEMATIC_PX
-from photonpano.residuals.verdict import block_shifts
 from photonpano.values import FloatArray, Light
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
@@ -207,7 +206,7 @@ def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
 
 def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | None:
     """Return places and shifts of the blocks of the sensor, (N, 2) each in px; None if noise explains the shifts."""
-    field, information = block_shifts(residuals)
+    field, information = residuals.block_shifts()
     with np.errstate(divide="ignore"):
         noise = np.sqrt(1 / np.linalg.eigvalsh(information).clip(min=0)[..., 0])
     length = np.linalg.norm(field, axis=-1)

@@ -1,1 +1,1 @@
-"""What the panorama does not explain: residuals of the photons, refinement of the motion, and the verdict on a run."""
+"""Residuals of the photons against the panorama, refinement of the motion, and the verdict on a run."""

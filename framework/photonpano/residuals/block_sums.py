@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry.sampling import run_from, sample_run, visible_columns
 
-BLOCK_PX = 16
-"""Side of a block, px."""
+BLOCK_PX = 16  # side of a block, px
+# Sums of a block. With residual r, predicted count m, its gradient (gx, gy) along x and y, and the variance v of r: gx gx / v,
+# gx gy / v, gy gy / v, gx r / v, gy r / v, gx m / v, gy m / v, m m / v, m r / v, r, v, m.
 GXX, GXY, GYY, GX_R, GY_R, GX_M, GY_M, M_M, M_R, R, V, M = range(12)
-"""Sums of a block. With residual r, predicted count m, its gradient (gx, gy) along x and y, and the variance v of r: gx gx / v,
-gx gy / v, gy gy / v, gx r / v, gy r / v, gx m / v, gy m / v, m m / v, m r / v, r, v, m."""
 N_SUMS = 12
+# A block with a smaller variance than this, in counts squared, is left out of the misfit: it is not normally distributed.
 _FEWEST_PHOTONS = 1.0
-"""A block with a smaller variance than this, in counts squared, is left out of the misfit: it is not normally distributed."""
 
 
 def n_blocks(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -167,6 +169,43 @@ def add_pixel_sums(
             totals[t] += expected if known else zero
 
 
+class Totals(NamedTuple):
+    """Sums over spans that `fold` adds to: (h, w) for blocks of the sensor, (H', W') for squares of the panorama.
+
+    Attributes:
+        blocks: (h, w, 12) sums over time.
+        block_misfit: squared residuals of blocks / their variance.
+        block_count: number of blocks in these sums.
+        cell_misfit: the same, by the square of the panorama that a block falls on.
+        cell_count: number of blocks in these sums.
+        cell_noise: variance of the residuals, relative to the squared prediction.
+        pixel_residual: (H, W) residuals of each pixel: see `add_pixel_sums`.
+        pixel_mean: (H, W) expected counts.
+    """
+
+    blocks: NDArray[np.float64]
+    block_misfit: NDArray[np.float64]
+    block_count: NDArray[np.float64]
+    cell_misfit: NDArray[np.float64]
+    cell_count: NDArray[np.float64]
+    cell_noise: NDArray[np.float64]
+    pixel_residual: NDArray[np.float32]
+    pixel_mean: NDArray[np.float32]
+
+    @classmethod
+    def zeros(cls, shape: tuple[int, int], canvas_shape: tuple[int, int]) -> Totals:
+        """Return no sums, for frames and a panorama of these shapes."""
+        grid, cells = n_blocks(shape), n_blocks(canvas_shape)
+        of_blocks = np.zeros((*grid, N_SUMS)), np.zeros(grid), np.zeros(grid)
+        of_cells = np.zeros(cells), np.zeros(cells), np.zeros(cells)
+        return cls(*of_blocks, *of_cells, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+
+    def plus(self, other: Totals) -> Totals:
+        """Return the sums over both."""
+        both: Iterable[tuple[Any, Any]] = zip(self, other, strict=True)
+        return Totals._make(one + another for one, another in both)
+
+
 @compiled
 def fold(
     sums: NDArray[np.float32],
@@ -176,12 +215,7 @@ def fold(
     variance_share: float,
     normal: NDArray[np.float64],
     gradient: NDArray[np.float64],
-    blocks: NDArray[np.float64],
-    block_misfit: NDArray[np.float64],
-    block_count: NDArray[np.float64],
-    cell_misfit: NDArray[np.float64],
-    cell_count: NDArray[np.float64],
-    cell_noise: NDArray[np.float64],
+    totals: Totals,
 ) -> float:
     """Add up the blocks of a span: the equations of its motion and gain, and squared residual / variance.
 
@@ -193,12 +227,7 @@ def fold(
         variance_share: expected variance of residuals, relative to that of the photons.
         normal: (5, 5), added to: see `Residuals`.
         gradient: (5,), added to.
-        blocks: (h, w, 12) sums over time, added to.
-        block_misfit: (h, w), added to.
-        block_count: (h, w), added to.
-        cell_misfit: squares of the panorama, added to.
-        cell_count: added to.
-        cell_noise: variance of the residual, relative to the squared prediction, added to.
+        totals: added to.
 
     Returns:
         Mean over the blocks of squared residual / variance; 1 if no block has photons enough.
@@ -226,20 +255,20 @@ def fold(
             normal[4, 4] += cell[M_M]
             gradient[4] += cell[M_R]
             for s in range(N_SUMS):
-                blocks[y, x, s] += cell[s]
+                totals.blocks[y, x, s] += cell[s]
             if cell[V] < _FEWEST_PHOTONS:
                 continue
             misfit = float(cell[R]) ** 2 / (float(cell[V]) * variance_share)
             total += misfit
             n += 1
-            block_misfit[y, x] += misfit
-            block_count[y, x] += 1
+            totals.block_misfit[y, x] += misfit
+            totals.block_count[y, x] += 1
             px, py = middle[y, x]
             depth = to_canvas[2, 0] * px + to_canvas[2, 1] * py + to_canvas[2, 2]
             i = int(np.floor((to_canvas[1, 0] * px + to_canvas[1, 1] * py + to_canvas[1, 2]) / depth / BLOCK_PX))
             j = int(np.floor((to_canvas[0, 0] * px + to_canvas[0, 1] * py + to_canvas[0, 2]) / depth / BLOCK_PX))
-            if 0 <= i < cell_misfit.shape[0] and 0 <= j < cell_misfit.shape[1]:
-                cell_misfit[i, j] += misfit
-                cell_count[i, j] += 1
-                cell_noise[i, j] += float(cell[V]) * variance_share / float(cell[M]) ** 2
+            if 0 <= i < totals.cell_misfit.shape[0] and 0 <= j < totals.cell_misfit.shape[1]:
+                totals.cell_misfit[i, j] += misfit
+                totals.cell_count[i, j] += 1
+                totals.cell_noise[i, j] += float(cell[V]) * variance_share / float(cell[M]) ** 2
     return total / n if n > 0 else 1.0

@@ -12,9 +12,10 @@ from photonpano.context import Context
 from photonpano.geometry import steps_px
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
+from photonpano.motion.tracking.runs import DARK, SumTrack, track_sums
+from photonpano.motion.tracking.spans import span_image
 from photonpano.protocols import Source
 from photonpano.residuals.refinement import Look
-from photonpano.residuals.sum_track import DARK, SumTrack, sum_image, track_sums
 from photonpano.residuals.unexplained import standing_out
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
 
@@ -238,7 +239,7 @@ def _beside(track: SumTrack, outlier: _Outlier) -> list[int]:
 def _template(source: Source, track: SumTrack, outlier: _Outlier, path: _Path) -> FluxImage:
     """Average the sums on both sides of an outlier, taken back along the path: (h, w); NaN beyond their borders."""
     moved = [
-        _moved(sum_image(source, track.spans[number]), -path.at(track.spans[number].centre, float(number >= outlier.after)))
+        _moved(span_image(source, track.spans[number]), -path.at(track.spans[number].centre, float(number >= outlier.after)))
         for number in _beside(track, outlier)
         if number not in (outlier.before, outlier.after)
     ]

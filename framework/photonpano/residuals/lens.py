@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from photonpano.geometry import apply, corners
+from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX
 from photonpano.values import FloatArray
 
-_INSTANTS = 64
-"""Instants of the motion at which the effect of a lens is computed."""
-_SYSTEMATIC_PX = 0.015
-"""Error of the shift of a block beside photon noise."""
+_INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
+_SYSTEMATIC_PX = 0.015  # error of the shift of a block beside photon noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +79,7 @@ def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int
     moves = sparse.csr_array(np.concatenate([along_x, along_y]))
 
     instants = np.linspace(0, len(homographies) - 1, min(_INSTANTS, len(homographies))).astype(int)
-    seen = apply(homographies[instants], points)
+    seen = transform_points(homographies[instants], points)
     cells = np.floor((seen - seen.min(axis=(0, 1))) / BLOCK_PX).astype(int)
     cell = (cells[..., 1] * (cells[..., 0].max() + 1) + cells[..., 0])[:, None, :] * 2 + np.arange(2)[:, None]
     place = np.unique(cell.ravel(), return_inverse=True)[1]

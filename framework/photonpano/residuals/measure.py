@@ -14,33 +14,38 @@ from numpy.typing import NDArray
 from photonpano.capture import Capture
 from photonpano.context import Context
 from photonpano.geometry import corners, steps_px
-from photonpano.residuals.block_sums import BLOCK_PX, N_SUMS, add_block_sums, add_pixel_sums, fold, n_blocks
+from photonpano.residuals.block_sums import (
+    BLOCK_PX,
+    GX_R,
+    GXX,
+    GXY,
+    GY_R,
+    GYY,
+    N_SUMS,
+    Totals,
+    add_block_sums,
+    add_pixel_sums,
+    fold,
+    n_blocks,
+)
 from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
-N_STEPS = 4
-"""Steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span."""
+N_STEPS = 4  # steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span
+# Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it.
 _NOISE_PX = 0.025
-"""Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it."""
-_SHORTEST, _LONGEST = 12, 64
-"""Fewest and most frames of a span, if the motion is slow."""
-_MAX_MOTION_PX = 2.0
-"""A span is short enough that the image moves by no more than this."""
+_SHORTEST, _LONGEST = 12, 64  # fewest and most frames of a span, if the motion is slow
+_MAX_MOTION_PX = 2.0  # a span is short enough that the image moves by no more than this
+# Spans are divided where the motion jumps from one frame to the next: by this much, and this many times the usual step.
 _JUMP_PX, _JUMP_RATIO = 1.0, 5.0
-"""Spans are divided where the motion jumps from one frame to the next: by this much, and this many times the usual step."""
-_FEWEST_SPANS = 64
-"""A capture is divided into at least this many spans, if it has the frames."""
-_BATCH = 64
-"""Spans that a thread measures at a time."""
-_PIXEL_STRIDE = 4
-"""One span in 4 is added to the sums of single pixels, which no other sum needs."""
-_DARK = 1e-6
-"""Least weight of a frame in the mean motion of a span."""
-_PROBES = 8
-"""Instants at which the noise of a shift is predicted."""
+_FEWEST_SPANS = 64  # a capture is divided into at least this many spans, if it has the frames
+_BATCH = 64  # spans that a thread measures at a time
+_PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
+_DARK = 1e-6  # least weight of a frame in the mean motion of a span
+_PROBES = 8  # instants at which the noise of a shift is predicted
+# Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
+# changes by less than a factor of 10.
 _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
-"""Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
-changes by less than a factor of 10."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +105,19 @@ class Residuals:
         solved = np.einsum("sij,sj->si", covariance, self.gradient)
         return solved[:, N_STEPS], np.sqrt(covariance[:, N_STEPS, N_STEPS])
 
+    def block_shifts(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean shift of each block of the sensor against the panorama, and its information.
+
+        Returns:
+            (h, w, 2) in px, and (h, w, 2, 2) inverse covariances by photon noise, 0 where a block carries no shift.
+        """
+        information = np.stack([self.blocks[..., [GXX, GXY]], self.blocks[..., [GXY, GYY]]], axis=-2)
+        right = self.blocks[..., [GX_R, GY_R]]
+        determined = np.linalg.det(information) > 1e-6 * np.trace(information, axis1=-2, axis2=-1) ** 2
+        information = np.where(determined[..., None, None], information, 0)
+        field = np.linalg.solve(np.where(determined[..., None, None], information, np.eye(2)), right[..., None])[..., 0]
+        return np.where(determined[..., None], field, 0), information
+
 
 def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Residuals:
     """Compare the frames of a span with what the panorama predicts, each pixel in its colour.
@@ -123,11 +141,11 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
         homographies = np.add.reduceat(gain[:, None, None] * of_frames, starts) / np.add.reduceat(gain, starts)[:, None, None]
     batches = [slice(first, first + _BATCH) for first in range(0, len(spans), _BATCH)]
     work = partial(_measured, predictions, spans, homographies)
-    total: _Batch | None = None
+    total: Totals | None = None
     results: list[tuple[FloatArray, ...]] = []
     with context.progress.stage("residuals", len(span), "frames") as advance:
-        for batch, part in zip(batches, context.in_order(work, batches), strict=True):
-            results.append((part.normal, part.gradient, part.misfit))
+        for batch, (of_spans, part) in zip(batches, context.in_order(work, batches), strict=True):
+            results.append(of_spans)
             total = part if total is None else total.plus(part)
             advance(sum(map(len, spans[batch])))
     assert total is not None
@@ -201,41 +219,8 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Batch:
-    """The sums of some spans; see `Residuals`. The counts are numbers of blocks."""
-
-    normal: FloatArray
-    gradient: FloatArray
-    misfit: FloatArray
-    blocks: FloatArray
-    block_misfit: FloatArray
-    block_count: FloatArray
-    pixel_residual: FluxImage
-    pixel_mean: FluxImage
-    cell_misfit: FloatArray
-    cell_count: FloatArray
-    cell_noise: FloatArray
-
-    def plus(self, other: _Batch) -> _Batch:
-        """Return the sums over both; `normal`, `gradient` and `misfit` are kept apart, and not used here."""
-        return _Batch(
-            self.normal,
-            self.gradient,
-            self.misfit,
-            self.blocks + other.blocks,
-            self.block_misfit + other.block_misfit,
-            self.block_count + other.block_count,
-            self.pixel_residual + other.pixel_residual,
-            self.pixel_mean + other.pixel_mean,
-            self.cell_misfit + other.cell_misfit,
-            self.cell_count + other.cell_count,
-            self.cell_noise + other.cell_noise,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Colour:
-    """What is compared in one colour of the capture.
+    """Counts and prediction in one colour of the capture.
 
     Attributes:
         source: its pixels.
@@ -282,10 +267,13 @@ class _Colour:
         return np.asarray(np.maximum(self.slope**2 * lit * (1 - lit) - mean * (1 - mean), 0), np.float32)
 
 
-def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice) -> _Batch:
+def _measured(
+    predictions: Predictions, spans: Sequence[FrameSpan], homographies: FloatArray, batch: slice
+) -> tuple[tuple[FloatArray, FloatArray, FloatArray], Totals]:
+    """Return the equations and the reduced chi-square of a batch of spans, and the sums over them."""
     first = predictions.first
     shape = first.frame_shape
-    grid, cells = n_blocks(shape), n_blocks(first.canvas.shape)
+    grid = n_blocks(shape)
     spans, homographies = spans[batch], homographies[batch]
     height, width = shape
     row, column = np.mgrid[: grid[0], : grid[1]]
@@ -293,19 +281,8 @@ def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies
     lever = middle - corners(shape).mean(axis=0)
     colours = [_Colour.of(source, prediction) for source, prediction in predictions.parts]
     source = colours[0].source
-    total = _Batch(
-        np.zeros((len(spans), 5, 5)),
-        np.zeros((len(spans), 5)),
-        np.zeros(len(spans)),
-        np.zeros((*grid, N_SUMS)),
-        np.zeros(grid),
-        np.zeros(grid),
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros(cells),
-        np.zeros(cells),
-        np.zeros(cells),
-    )
+    normal, gradient, misfit = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
+    total = Totals.zeros(shape, first.canvas.shape)
     # A pixel adds to the image of its colour, which fewer frames have seen.
     frames_seen = max(predictions.frames_seen / len(colours), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
@@ -320,21 +297,9 @@ def _measured(predictions: Predictions, spans: Sequence[FrameSpan], homographies
                 add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
-        total.misfit[index] = fold(
-            sums,
-            lever,
-            *first.cells(homography, middle),
-            1 - own,
-            total.normal[index],
-            total.gradient[index],
-            total.blocks,
-            total.block_misfit,
-            total.block_count,
-            total.cell_misfit,
-            total.cell_count,
-            total.cell_noise,
-        )
-    return total
+        cells = first.cells(homography, middle)
+        misfit[index] = fold(sums, lever, *cells, 1 - own, normal[index], gradient[index], total)
+    return (normal, gradient, misfit), total
 
 
 def _middles(index: np.ndarray, length: int) -> FloatArray:

@@ -15,16 +15,11 @@ from photonpano.protocols import Source, Trajectory
 from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
-_BLUR_PX = 0.7
-"""Standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture."""
-_INTERPOLATION_PX2 = 1 / 6
-"""Variance of the kernel of one linear interpolation, averaged over the fractions of a pixel."""
-_MANY_FRAMES = 1e4
-"""Frames for which the variance of a count is derived; it is then divided by them."""
-_MARGIN = 4
-"""Columns with which a full turn is continued on each side: more than the smoothing reaches."""
-_STRAIGHT_RUN_PX = 64
-"""From this length of straight runs on, the compiled interpolation is faster than OpenCV's."""
+_BLUR_PX = 0.7  # standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture
+_INTERPOLATION_PX2 = 1 / 6  # variance of the kernel of one linear interpolation, averaged over the fractions of a pixel
+_MANY_FRAMES = 1e4  # frames for which the variance of a count is derived; it is then divided by them
+_MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
+_STRAIGHT_RUN_PX = 64  # from this length of straight runs on, the compiled interpolation is faster than OpenCV's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,8 +91,8 @@ class Prediction:
         precision = np.asarray(1 / _variance(flux, response), np.float32)
         precision[~inside] = 0
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
-        bent = not canvas.planar or (camera is not None and camera.distorts)
-        ideal = _ideal(frame_shape, camera) if bent else None
+        remapped = not canvas.planar or (camera is not None and camera.distorts)
+        ideal = _ideal(frame_shape, camera) if remapped else None
         return cls(canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light, ideal, margin)
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:

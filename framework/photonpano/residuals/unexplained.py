@@ -11,24 +11,19 @@ from photonpano.geometry import corners
 from photonpano.residuals.measure import Residuals
 from photonpano.values import BoolArray, FloatArray
 
-SYSTEMATIC_PX = 0.015
-"""Error of measured shifts where frames and panorama are interpolated at different fractions of a pixel."""
-_SMOOTH_SPANS = 25
-"""The ratio is that of motion faster than this many spans."""
-_LOCAL_SPANS = 33
-"""The size is averaged over this many spans."""
+SYSTEMATIC_PX = 0.015  # error of measured shifts where frames and panorama are interpolated at different fractions of a pixel
+_SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
+_LOCAL_SPANS = 33  # the size is averaged over this many spans
+# Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations.
 _SIGNIFICANT = 3.0
-"""Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations."""
-_MISFIT = 3.0
-"""A span also stands out if the mean squared residual / variance of its blocks exceeds this."""
+_MISFIT = 3.0  # a span also stands out if the mean squared residual / variance of its blocks exceeds this
+# A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
+# 200,000 spans.
 _STANDS_OUT = 30.0
-"""A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
-200,000 spans."""
+# The measured steps of three spans bound the error of frames that are at most one span away from one.
 _BOUND_SPANS, _NEAR_SPANS = 3, 1.0
-"""The measured steps of three spans bound the error of frames that are at most one span away from one."""
 
-_DARK = -0.5
-"""Spans that are darker than predicted by half of the light or more show too little to be measured."""
+_DARK = -0.5  # spans that are darker than predicted by half of the light or more show too little to be measured
 
 
 def residual_ratio(residuals: Residuals) -> float:

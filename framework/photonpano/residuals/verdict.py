@@ -1,55 +1,29 @@
-"""The verdict on a run: tests of the residuals and of the motion, each with a known rate of false alarms."""
+"""The verdict on a run: a table of tests of the residuals and of the motion, each with a known rate of false alarms.
+
+A test is a function under `_doubtful_above`; `judge` makes a `Reason` of what it found if that exceeds the threshold.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import DARK_JUMP
-from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX, GXY, GY_R, GYY, M, R, V
+from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import lens_distortion
-from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
-from photonpano.values import BoolArray, Decision, FloatArray
+from photonpano.values import BoolArray, Decision
 
-MAX_RATIO = 2.0
-"""Scatter of the shifts of short spans, in units of what noise explains."""
-MAX_MISFIT, MAX_CONTRAST = 1.1, 0.02
-"""Mean squared residual / variance of blocks, and the part of the light that it stands for: both must be exceeded."""
-MAX_MOVING_SHARE, _MOVING_CONTRAST = 0.03, 0.05
-"""Share of the panorama whose photons change over time, and by how much of the light at least."""
-MAX_GAIN = 0.03
-"""Root mean square of the relative brightness, over the blocks of the sensor or over the spans of the capture."""
-MAX_HOT_SHARE = 0.005
-"""Share of the pixels that count far more, or far fewer, photons than the panorama predicts."""
-MAX_LENS, _LENS_SIGMAS = 0.002, 5.0
-"""Radial distortion at the corners, relative to their distance from the centre, and its significance: both must be exceeded.
-Even a small one bends a long path; half of this is seen without a lens."""
-MAX_DEFORMATION_PX = 0.05
-"""Root mean square of the shifts of blocks of the sensor that no motion of the whole frame explains."""
-MAX_STD_PX = 1.0
-"""Mean expected error of the motion."""
-MAX_CONTRADICTIONS = 0.1
-"""Share of the pairs of the last level that were dropped because they contradict the others."""
-MAX_AMBIGUOUS, _FEWEST_AMBIGUOUS = 0.05, 3
-"""Share of the pairs of a level that fit the scene at another place as well. One or two pairs may do so by their noise."""
-MAX_STANDING = 0.5
-"""Share of the frame that stands still while the rest moves."""
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
-"""A reason that only the loop can find: a run folder does not hold the other places."""
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
-"""A reason that only the loop can find: a run folder does not hold the pairs."""
-MAX_TURN_RESIDUAL = 3.0
-"""Root mean square of the residuals of the pairs of rotations, in units of their noise."""
-_SIGMAS = 6.0
-"""A place stands out if it exceeds what is expected by this many standard deviations."""
-_FEWEST = 16
-"""Blocks that must have fallen on a square of the panorama."""
+# These need the pairs of the loop, which a run folder does not hold.
+MAX_CONTRAST = 0.02  # of residuals, as a share of the light, beyond which a large misfit counts
+_STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
+_MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +64,61 @@ class Verdict:
     residual_ratio: float | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """Data of a run that is tested: see `judge`."""
+
+    explained: Explained
+    levels: Sequence[LevelResult]
+    decisions: Sequence[Decision]
+
+    @property
+    def pairs(self) -> tuple[int, int] | None:
+        """Number of contradicting pairs of the last level, and of all its pairs."""
+        if not self.levels:
+            return None
+        located = self.levels[-1].located
+        return len(located.solution.outliers), len(located.edges)
+
+
+class _Found(NamedTuple):
+    """Figure of a test and where it occurs; `doubtful` overrides the threshold."""
+
+    figure: float
+    where: str
+    doubtful: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """A row of the table: `find` returns what it found, or None where that is trusted or not known."""
+
+    what: str
+    threshold: float
+    what_to_do: str
+    find: Callable[[_Run], _Found | None]
+
+    def reason(self, found: _Found | None) -> Reason | None:
+        """Judge what was found; None if it is trusted, or not known."""
+        if found is None or not (found.doubtful or found.figure > self.threshold):
+            return None
+        return Reason(self.what, found.figure, self.threshold, found.where, self.what_to_do)
+
+
+_Finder: TypeAlias = Callable[[_Run], _Found | None]
+TESTS: list[Test] = []
+
+
+def _doubtful_above(threshold: float, what: str, what_to_do: str) -> Callable[[_Finder], Test]:
+    """Add a test to the table; those that are added first are listed first."""
+
+    def added(find: _Finder) -> Test:
+        TESTS.append(Test(what, threshold, what_to_do, find))
+        return TESTS[-1]
+
+    return added
+
+
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
     """Test the result of a run.
 
@@ -98,144 +127,124 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
         levels: the results of the loop; empty if they are not known.
         decisions: what was chosen from the capture, such as the share of the frame that stands still.
     """
-    residuals, motion = explained.residuals, explained.motion
-    tests: list[Callable[[], Reason | None]] = [
-        lambda: _fast_motion(explained.ratio),
-        lambda: _photons(residuals),
-        lambda: _moving(residuals),
-        lambda: _light(residuals),
-        lambda: _sensor(residuals),
-        lambda: _hot_pixels(residuals),
-        lambda: _lens(residuals, motion),
-        lambda: _deformation(residuals),
-        lambda: _uncertain(motion),
-        lambda: _contradictions(levels),
-        lambda: _no_turn(levels),
-        lambda: _ambiguous(levels),
-        lambda: _standing(decisions),
-        lambda: _jump_in_the_dark(decisions),
-    ]
-    reasons = tuple(reason for test in tests if (reason := test()) is not None)
+    run = _Run(explained, levels, decisions)
+    reasons = tuple(reason for test in TESTS if (reason := test.reason(test.find(run))) is not None)
     ratio = explained.ratio if np.isfinite(explained.ratio) else None
     return Verdict("doubtful" if reasons else "trusted", reasons, ratio)
 
 
-def _photons(residuals: Residuals) -> Reason | None:
+def contradictions(dropped: int, pairs: int) -> Reason | None:
+    """Judge the pairs of the last level.
+
+    Args:
+        dropped: pairs that contradict the others.
+        pairs: all pairs.
+    """
+    return _contradictions.reason(_contradicting(dropped, pairs))
+
+
+@_doubtful_above(
+    2.0,
+    "the image moves within groups by more than the motion that was found",
+    "use the refiner short-spans, or smaller groups (resample.with.group_size)",
+)
+def _fast_motion(run: _Run) -> _Found:
+    return _Found(run.explained.ratio, "scatter of the shifts of short spans over their noise")
+
+
+@_doubtful_above(
+    1.1,
+    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
+    "look at the maps of the report; the motion may be wrong, or the scene changes",
+)
+def _photons(run: _Run) -> _Found | None:
+    residuals = run.explained.residuals
     misfit = float(residuals.misfit.mean())
     sums = residuals.blocks.sum(axis=(0, 1))
     per_span = sums / max(len(residuals.spans), 1)
     n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
     # The squared residual of a block beyond its variance, as a part of its photons.
     contrast = float(np.sqrt(max(misfit - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
-    if misfit <= MAX_MISFIT or contrast <= MAX_CONTRAST:
-        return None
-    return Reason(
-        "the panorama does not explain the photons: they differ from its prediction by more than their noise",
-        misfit,
-        MAX_MISFIT,
-        f"on average by {contrast:.0%} of the light",
-        "look at the maps of the report; the motion may be wrong, or the scene changes",
-    )
+    return _Found(misfit, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
 
 
-def _moving(residuals: Residuals) -> Reason | None:
-    counted = residuals.cell_count >= _FEWEST
-    if not counted.any():
-        return None
-    expected = 1 + _SIGMAS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
+@_doubtful_above(
+    0.03,
+    "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
+    "merge with robust-merge, or mask what moves; the motion may be that of the thing instead of the scene",
+)
+def _moving(run: _Run) -> _Found | None:
+    residuals = run.explained.residuals
+    counted = residuals.cell_count >= _MIN_BLOCKS
+    expected = 1 + _STANDARD_DEVIATIONS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
     contrast = np.sqrt(np.maximum(residuals.cell_misfit - 1, 0) * residuals.cell_noise)
-    changing = counted & (residuals.cell_misfit > np.maximum(expected, 1.5)) & (contrast > _MOVING_CONTRAST)
-    share = float(changing.sum() / counted.sum())
-    if share <= MAX_MOVING_SHARE:
+    changing = counted & (residuals.cell_misfit > np.maximum(expected, 1.5)) & (contrast > 0.05)
+    if not changing.any():
         return None
-    return Reason(
-        "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-        share,
-        MAX_MOVING_SHARE,
-        _box(changing, "px of the panorama"),
-        "merge with robust-merge, or mask what moves; the motion may be that of the thing instead of the scene",
-    )
+    return _Found(float(changing.sum() / counted.sum()), _box(changing, "px of the panorama"))
 
 
-def _fast_motion(ratio: float) -> Reason | None:
-    if not ratio > MAX_RATIO:
-        return None
-    return Reason(
-        "the image moves within groups by more than the motion that was found",
-        ratio,
-        MAX_RATIO,
-        "scatter of the shifts of short spans over their noise",
-        "use the refiner short-spans, or smaller groups (resample.with.group_size)",
-    )
-
-
-def _light(residuals: Residuals) -> Reason | None:
+@_doubtful_above(0.03, "the light changes over time", "keep the light steady, or shorten the capture")
+def _light(run: _Run) -> _Found:
+    residuals = run.explained.residuals
     # Relative to the mean light: in the dark between two flickers, an error of the gain matters little.
     gains, stds = (each * residuals.light for each in residuals.gains())
     change = float(np.sqrt(max(float(np.mean(gains**2 - stds**2)), 0)))
-    if change <= MAX_GAIN:
-        return None
-    span = residuals.spans[int(np.argmax(np.abs(gains) / np.maximum(stds, 1e-9)))]
-    return Reason(
-        "the light changes over time",
-        change,
-        MAX_GAIN,
-        f"most at {span}",
-        "keep the light steady, or shorten the capture",
-    )
+    return _Found(change, f"most at {residuals.spans[int(np.argmax(np.abs(gains) / np.maximum(stds, 1e-9)))]}")
 
 
-def _sensor(residuals: Residuals) -> Reason | None:
-    sums = residuals.blocks
+@_doubtful_above(
+    0.03,
+    "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
+    "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
+)
+def _sensor(run: _Run) -> _Found | None:
+    sums = run.explained.residuals.blocks
     seen = sums[..., M] > 0
+    if not seen.any():
+        return None
     gain = np.divide(sums[..., R], sums[..., M], out=np.zeros(seen.shape), where=seen)
     noise = np.divide(sums[..., V], sums[..., M] ** 2, out=np.zeros(seen.shape), where=seen)
-    change = float(np.sqrt(max(np.mean((gain**2 - noise)[seen]), 0))) if seen.any() else 0.0
-    if change <= MAX_GAIN:
-        return None
-    worst = np.unravel_index(np.argmax(np.abs(gain)), gain.shape)
-    return Reason(
-        "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
-        change,
-        MAX_GAIN,
-        f"most at pixel ({worst[1] * BLOCK_PX + BLOCK_PX // 2}, {worst[0] * BLOCK_PX + BLOCK_PX // 2}) of the frame",
-        "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
-    )
+    change = float(np.sqrt(max(np.mean((gain**2 - noise)[seen]), 0)))
+    y, x = (int(index) * BLOCK_PX + BLOCK_PX // 2 for index in np.unravel_index(np.argmax(np.abs(gain)), gain.shape))
+    return _Found(change, f"most at pixel ({x}, {y}) of the frame")
 
 
-def _hot_pixels(residuals: Residuals) -> Reason | None:
-    predicted = residuals.pixel_mean
+@_doubtful_above(
+    0.005,
+    "single pixels count far more, or far fewer, photons than the panorama predicts",
+    "mask them (corrections: hot-pixels)",
+)
+def _hot_pixels(run: _Run) -> _Found:
+    predicted = run.explained.residuals.pixel_mean
     known = predicted > 0
-    excess = np.abs(residuals.pixel_gain - 1) * predicted
-    outlier = known & (excess > _SIGMAS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
-    share = float(outlier.sum() / max(known.sum(), 1))
-    if share <= MAX_HOT_SHARE:
+    excess = np.abs(run.explained.residuals.pixel_gain - 1) * predicted
+    outlier = known & (excess > _STANDARD_DEVIATIONS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
+    return _Found(float(outlier.sum() / max(known.sum(), 1)), f"{int(outlier.sum())} pixels")
+
+
+@_doubtful_above(
+    0.002,
+    "the lens distorts the frames, which bends the motion",
+    "write motion: {model: rotation} and camera: {distortion: {k1: find}} for a camera that only turns; or undistort the "
+    "frames before, or use their middle only (corrections: crop)",
+)
+def _lens(run: _Run) -> _Found | None:
+    residuals, motion = run.explained.residuals, run.explained.motion
+    # Half of the threshold is seen without a lens; even a small distortion bends a long path.
+    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
+    if found is None or found.sigmas <= 5:
         return None
-    return Reason(
-        "single pixels count far more, or far fewer, photons than the panorama predicts",
-        share,
-        MAX_HOT_SHARE,
-        f"{int(outlier.sum())} pixels",
-        "mask them (corrections: hot-pixels)",
-    )
+    return _Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
 
 
-def _lens(residuals: Residuals, motion: FrameMotion) -> Reason | None:
-    found = lens_distortion(*block_shifts(residuals), motion.homographies[motion.located], residuals.frame_shape)
-    if found is None or abs(found.k1) <= MAX_LENS or found.sigmas <= _LENS_SIGMAS:
-        return None
-    return Reason(
-        "the lens distorts the frames, which bends the motion",
-        abs(found.k1),
-        MAX_LENS,
-        f"about {found.k1:.1%} at the corners",
-        "write motion: {model: rotation} and camera: {distortion: {k1: find}} for a camera that only turns; or undistort the "
-        "frames before, or use their middle only (corrections: crop)",
-    )
-
-
-def _deformation(residuals: Residuals) -> Reason | None:
-    shifts, information = block_shifts(residuals)
+@_doubtful_above(
+    0.05,
+    "frames are deformed as no motion of the whole frame explains",
+    "look at the arrows in the report; correct the lens or the rolling shutter before",
+)
+def _deformation(run: _Run) -> _Found | None:
+    shifts, information = run.explained.residuals.block_shifts()
     known = information[..., 0, 0] > 0
     if not known.any():
         return None
@@ -249,135 +258,81 @@ def _deformation(residuals: Residuals) -> Reason | None:
     beyond = smooth - affine @ np.linalg.lstsq(affine * weights, smooth * weights)[0]
     fit = beyond @ np.linalg.pinv(beyond * weights) * weights.T
     size = float(np.sqrt(max(float(np.mean(((fit @ shifts[known]) ** 2).sum(axis=-1) - fit**2 @ noise)), 0)))
-    if size <= MAX_DEFORMATION_PX:
-        return None
-    return Reason(
-        "frames are deformed as no motion of the whole frame explains",
-        size,
-        MAX_DEFORMATION_PX,
-        "px, over the frame",
-        "look at the arrows in the report; correct the lens or the rolling shutter before",
-    )
+    return _Found(size, "px, over the frame")
 
 
-def block_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-    """Return the mean shift of each block of the sensor against the panorama, and its information.
-
-    Returns:
-        (h, w, 2) in px, and (h, w, 2, 2) inverse covariances by photon noise, 0 where a block carries no shift.
-    """
-    sums = residuals.blocks
-    information = np.stack([sums[..., [GXX, GXY]], sums[..., [GXY, GYY]]], axis=-2)
-    right = sums[..., [GX_R, GY_R]]
-    determined = np.linalg.det(information) > 1e-6 * np.trace(information, axis1=-2, axis2=-1) ** 2
-    information = np.where(determined[..., None, None], information, 0)
-    field = np.linalg.solve(np.where(determined[..., None, None], information, np.eye(2)), right[..., None])[..., 0]
-    return np.where(determined[..., None], field, 0), information
+@_doubtful_above(1.0, "no motion is known", "use smaller groups, or more light")
+def _unknown(run: _Run) -> _Found | None:
+    known = run.explained.motion.std_px[run.explained.motion.located]
+    return None if len(known) and np.isfinite(known).all() else _Found(0.0, "a single exposure was located", doubtful=True)
 
 
-def _uncertain(motion: FrameMotion) -> Reason | None:
+@_doubtful_above(1.0, "the expected error of the motion is large", "use more light")
+def _uncertain(run: _Run) -> _Found | None:
+    motion = run.explained.motion
     known = motion.std_px[motion.located]
-    mean = float(known.mean()) if len(known) else float("inf")
-    if mean <= MAX_STD_PX:
+    if not len(known) or not np.isfinite(known).all():
         return None
-    if not np.isfinite(mean):
-        return Reason(
-            "no motion is known", 0.0, MAX_STD_PX, "a single exposure was located", "use smaller groups, or more light"
-        )
     worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
-    return Reason(
-        "the expected error of the motion is large", mean, MAX_STD_PX, f"px on average, most at frame {worst}", "use more light"
-    )
+    return _Found(float(known.mean()), f"px on average, most at frame {worst}")
 
 
-def _contradictions(levels: Sequence[LevelResult]) -> Reason | None:
-    if not levels:
+@_doubtful_above(
+    0.1,
+    "pairs of exposures contradict each other, as where a scene repeats",
+    "look at the path in the report; use a slower motion, or smaller groups",
+)
+def _contradictions(run: _Run) -> _Found | None:
+    return None if run.pairs is None else _contradicting(*run.pairs)
+
+
+def _contradicting(dropped: int, pairs: int) -> _Found:
+    return _Found(dropped / max(pairs, 1), f"{dropped} of {pairs} pairs of the last level")
+
+
+@_doubtful_above(3.0, NO_TURN, "write motion: {model: homography}, or find the lens with camera: {distortion: {k1: find}}")
+def _no_turn(run: _Run) -> _Found | None:
+    if not run.levels or run.levels[-1].located.solution.rotations is None:
         return None
-    located = levels[-1].located
-    return contradictions(len(located.solution.outliers), len(located.edges))
-
-
-def contradictions(dropped: int, pairs: int) -> Reason | None:
-    """Judge the pairs of the last level.
-
-    Args:
-        dropped: pairs that contradict the others.
-        pairs: all pairs.
-    """
-    share = dropped / max(pairs, 1)
-    if share <= MAX_CONTRADICTIONS:
-        return None
-    return Reason(
-        "pairs of exposures contradict each other, as where a scene repeats",
-        share,
-        MAX_CONTRADICTIONS,
-        f"{dropped} of {pairs} pairs of the last level",
-        "look at the path in the report; use a slower motion, or smaller groups",
-    )
-
-
-def _no_turn(levels: Sequence[LevelResult]) -> Reason | None:
-    """Judge rotations of one camera by what any homographies would explain."""
-    if not levels or levels[-1].located.solution.turns is None:
-        return None
-    evidence = levels[-1].located.evidence
+    evidence = run.levels[-1].located.evidence
     if evidence is None:
         return None
     residual, free = np.sqrt([evidence.rotation, evidence.homography]).tolist()
-    if evidence.turns_only and residual <= MAX_TURN_RESIDUAL:
-        return None
-    return Reason(
-        NO_TURN,
-        residual,
-        MAX_TURN_RESIDUAL,
-        f"residuals in units of their noise; those of any homographies are {free:.2g}",
-        "write motion: {model: homography}, or find the lens with camera: {distortion: {k1: find}}",
-    )
+    where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
+    return _Found(residual, where, doubtful=not evidence.rotations_suffice)
 
 
-def _ambiguous(levels: Sequence[LevelResult]) -> Reason | None:
-    for result in levels:
-        located = result.located
-        if located.ambiguity is None:
-            continue
-        n_pairs = len(located.ambiguity.pairs)
-        share = n_pairs / max(len(located.edges), 1)
-        if share > MAX_AMBIGUOUS and n_pairs >= _FEWEST_AMBIGUOUS:
-            return Reason(
-                REPEATS,
-                share,
-                MAX_AMBIGUOUS,
-                f"{n_pairs} of {len(located.edges)} pairs of level {result.level.number}, "
-                f"{located.ambiguity.alternative_px:.0f} px away",
-                "look at the path in the report; a slower motion tells the places apart",
-            )
-    return None
+@_doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")
+def _ambiguous(run: _Run) -> _Found | None:
+    def found() -> Iterator[_Found]:
+        for result in run.levels:
+            ambiguity, n_edges = result.located.ambiguity, len(result.located.edges)
+            # One or two pairs may be ambiguous by their noise.
+            if ambiguity is not None and len(ambiguity.pairs) > 2:
+                of_level = f"{len(ambiguity.pairs)} of {n_edges} pairs of level {result.level.number}"
+                yield _Found(len(ambiguity.pairs) / max(n_edges, 1), f"{of_level}, {ambiguity.alternative_px:.0f} px away")
+
+    return max(found(), key=lambda each: each.figure > 0.05, default=None)
 
 
-def _standing(decisions: Sequence[Decision]) -> Reason | None:
-    share = next((float(each.value) for each in decisions if each.what == "standing_share"), 0.0)
-    if share <= MAX_STANDING:
-        return None
-    return Reason(
-        "more than half of the frame stands still while the rest moves",
-        share,
-        MAX_STANDING,
-        "share of the parts that show motion or rest",
-        "mask what stands in the frame (corrections: mask); the motion may be that of either part",
-    )
+@_doubtful_above(
+    0.5,
+    "more than half of the frame stands still while the rest moves",
+    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+)
+def _standing(run: _Run) -> _Found | None:
+    shares = [float(each.value) for each in run.decisions if each.what == "standing_share"]
+    return _Found(shares[0], "share of the parts that show motion or rest") if shares else None
 
 
-def _jump_in_the_dark(decisions: Sequence[Decision]) -> Reason | None:
-    found = [str(each.value) for each in decisions if each.what == DARK_JUMP]
-    if not found:
-        return None
-    return Reason(
-        "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
-        len(found),
-        0,
-        ", ".join(found),
-        "leave these frames out, or keep the light on",
-    )
+@_doubtful_above(
+    0,
+    "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
+    "leave these frames out, or keep the light on",
+)
+def _jump_in_the_dark(run: _Run) -> _Found:
+    found = [str(each.value) for each in run.decisions if each.what == DARK_JUMP]
+    return _Found(len(found), ", ".join(found))
 
 
 def _box(cells: BoolArray, unit: str) -> str:

@@ -25,23 +25,17 @@ from photonpano import (
 )
 from photonpano.merging import PhotonSum, divided
 from photonpano_core.configs import BurstConfig
-from photonpano_core.dense_motion.frames import WeightedFrames
-from photonpano_core.dense_motion.noise import count_variance
+from photonpano_core.dense_motion.frames import WeightedFrames, count_variance, rescaled
 from photonpano_core.dense_motion.patches import Image, PatchGrid, add_patches, search
-from photonpano_core.dense_motion.rescaled import rescaled
 from photonpano_core.dense_motion.sub_exposures import smoothed
+from photonpano_core.dense_motion.warping import Frames
 from photonpano_core.photon_mle import exposure_of
 
-_DETAIL_PX = 1.0
-"""Blur of blocks before they are compared, in px."""
-_LEVELS = 4
-"""Levels of the pyramid, each of half the size of the one before."""
-_RADIUS = 4, 2
-"""Search around the start, in px: at the coarsest level, and at each other."""
-_RESTS = 2.5
-"""A block rests if no patch agrees better elsewhere by this much, in units of the photon noise."""
-_TOLERANCE = 8.0
-"""Squared difference of a frequency that costs half of its weight, in units of its photon noise."""
+_DETAIL_PX = 1.0  # blur of blocks before they are compared, in px
+_LEVELS = 4  # levels of the pyramid, each of half the size of the one before
+_RADIUS = 4, 2  # search around the start, in px: at the coarsest level, and at each other
+_RESTS = 2.5  # a block rests if no patch agrees better elsewhere by this much, in units of the photon noise
+_TOLERANCE = 8.0  # squared difference of a frequency that costs half of its weight, in units of its photon noise
 
 
 class BurstMerger:
@@ -79,7 +73,7 @@ class _Burst:
     def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
         self._source, self._group, self._config = source, group, config
         self._counts = WeightedFrames(source)
-        self._worth = self._counts.worth if self._counts.worth.size else np.ones(source.info.frame_shape, np.float32)
+        self._weights = self._counts.worth if self._counts.worth.size else np.ones(source.info.frame_shape, np.float32)
         start = group.span.start
         parts = divided(len(group.span), max(1, round(len(group.span) / config.block_frames)))
         self._spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
@@ -104,7 +98,7 @@ class _Burst:
 
     def _image(self, span: FrameSpan) -> tuple[Image, float]:
         """Return a block as it lies, on the scale of uniform noise, and its variance there."""
-        photons = PhotonSum(self._counts(span), self._worth * np.float32(len(span)))
+        photons = PhotonSum(self._counts(span), self._weights * np.float32(len(span)))
         image = smoothed(photons, self._source.response, _DETAIL_PX, 1.0, 0.0)
         seen = image.frames > 0
         values = np.where(seen, image.values, image.values[seen].mean() if seen.any() else 0).astype(np.float32)
@@ -124,9 +118,8 @@ class _Burst:
             for part in divided(len(span), max(1, math.ceil(way_px / self._config.tolerance_px))):
                 chunk = FrameSpan(span.start + part.start, span.start + part.stop)
                 shifts = at_instant(middles, motion, chunk.centre) - there
-                add_patches(
-                    self._counts(chunk), self._worth, float(len(chunk)), shifts, self._grid.step, counts[place], weight[place]
-                )
+                summed = Frames(self._counts(chunk), self._weights, float(len(chunk)))
+                add_patches(summed, shifts, self._grid.step, counts[place], weight[place])
         mean = wiener_mean(counts, weight, self._reference, self._source.response)
         frames = weight.sum(axis=0)
         return PhotonSum(self._grid.joined(mean * frames), self._grid.joined(frames))

@@ -14,8 +14,7 @@ from photonpano_core.dense_motion.polynomials import value_of_each
 
 Image = NDArray[np.float32]
 
-_STEPS = 8
-"""Straight lines by which a path is measured."""
+_STEPS = 8  # straight lines by which a path is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

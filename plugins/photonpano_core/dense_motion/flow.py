@@ -14,24 +14,17 @@ from photonpano_core.dense_motion.field import Image, MotionField
 from photonpano_core.dense_motion.polynomials import add_moments, fit_each
 from photonpano_core.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures, blurred
 
+# Sub-exposures of each round. Parallax of a camera in the hand changes its speed too often for fewer in the last.
 _ROUNDS = 3, 9, 17
-"""Sub-exposures of each round. Parallax of a camera in the hand changes its speed too often for fewer in the last."""
-_DEGREE = 8
-"""Highest degree of the motion in time."""
-_DETAIL_PX = 1.2
-"""Blur of sub-exposures before they are compared, in px of a frame."""
-_AGREEMENT_PX = 2.0
-"""Window over which displaced sub-exposures are compared, in px of a frame."""
-_SMOOTHING_PX = 5.0
-"""Window over which the motion is fitted, in px of a frame."""
-_FINEST = {17: 0}
-"""Level of the pyramid at which optical flow of a round ends: 0 is the grid itself; 1, half of it, by default."""
+_DEGREE = 8  # highest degree of the motion in time
+_DETAIL_PX = 1.2  # blur of sub-exposures before they are compared, in px of a frame
+_AGREEMENT_PX = 2.0  # window over which displaced sub-exposures are compared, in px of a frame
+_SMOOTHING_PX = 5.0  # window over which the motion is fitted, in px of a frame
+_FINEST = {17: 0}  # level of the pyramid at which optical flow of a round ends: 0 is the grid itself; 1, half of it, by default
+# Distance of the patches of optical flow, and steps of each: as exact as more of them, and faster.
 _PATCH_STEP_PX, _DESCENT_STEPS = 4, 12
-"""Distance of the patches of optical flow, and steps of each: as exact as more of them, and faster."""
-_PRIOR = 1e-4
-"""Weight of no motion, relative to that of a sub-exposure at an end of the group."""
-_CLIPPED = 0.2, 99.8
-"""Percentiles of the values that are black and white to the optical flow."""
+_PRIOR = 1e-4  # weight of no motion, relative to that of a sub-exposure at an end of the group
+_CLIPPED = 0.2, 99.8  # percentiles of the values that are black and white to the optical flow
 
 
 def estimate_field(parts: SubExposures, moving: BoolArray) -> MotionField:

@@ -12,18 +12,13 @@ from photonpano import BoolArray
 from photonpano_core.dense_motion.field import Image
 from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred, noise_area_px2
 
-_DETAIL_PX = 1.2
-"""Blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame."""
-_WINDOW_PX = 2.0
-"""Standard deviation of the window over which differences are summed up, in px of a frame."""
-_SMALLEST_PX = 16
-"""Fewer connected pixels, of a frame, are a false alarm: less than the window."""
-_WEAKER = 0.6
-"""Share of the threshold from which on a pixel moves if it is connected with one that exceeds the threshold."""
+_DETAIL_PX = 1.2  # blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame
+_WINDOW_PX = 2.0  # standard deviation of the window over which differences are summed up, in px of a frame
+_SMALLEST_PX = 16  # fewer connected pixels, of a frame, are a false alarm: less than the window
+_WEAKER = 0.6  # share of the threshold from which on a pixel moves if it is connected with one that exceeds the threshold
+# Radius of the disc by which gaps are closed, in px of a frame: where texture is missing, nothing shows that it moves.
 _GAP_PX = 6
-"""Radius of the disc by which gaps are closed, in px of a frame: where texture is missing, nothing shows that it moves."""
-_FEWEST = 0.5
-"""Fewest degrees of freedom, on average over the window, of a pixel that is tested."""
+_FEWEST = 0.5  # fewest degrees of freedom, on average over the window, of a pixel that is tested
 
 
 @dataclass(frozen=True, slots=True, eq=False)

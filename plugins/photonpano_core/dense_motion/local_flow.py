@@ -13,29 +13,22 @@ from photonpano.geometry import inverse
 from photonpano.merging import PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import LocalFlowConfig
 from photonpano_core.dense_motion.flow import estimate_field
-from photonpano_core.dense_motion.frames import WeightedFrames
+from photonpano_core.dense_motion.frames import WeightedFrames, rescaled
 from photonpano_core.dense_motion.ghosts import GhostMap, compared
-from photonpano_core.dense_motion.rescaled import rescaled
 from photonpano_core.dense_motion.robust_sum import weighted
 from photonpano_core.dense_motion.sharpening import sharpened
 from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures
-from photonpano_core.dense_motion.warping import add_along
+from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along
 from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
+# Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have.
 _NUMBERS = {33: 8.0, 17: 8.0, 9: 2.0, 5: 2.0, 3: 2.0}
-"""Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have."""
-_USUAL = 17
-"""Sub-exposures, at most, unless something moves fast."""
-_COMPARED = 9
-"""Sub-exposures, at most, whose differences show what moves: fewer have more light each."""
-_SAMPLED = 16
-"""Frames from which the light of a group is measured."""
-_AROUND_PX = 6
-"""Surroundings of what moves that are merged along the field as well, in px of a frame."""
-_SWEPT_PX = 6.0
-"""Way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted."""
-_MARGIN_PX = 32
-"""Surroundings of these in which flow is estimated, in px of a frame."""
+_USUAL = 17  # sub-exposures, at most, unless something moves fast
+_COMPARED = 9  # sub-exposures, at most, whose differences show what moves: fewer have more light each
+_SAMPLED = 16  # frames from which the light of a group is measured
+_AROUND_PX = 6  # surroundings of what moves that are merged along the field as well, in px of a frame
+_SWEPT_PX = 6.0  # way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted
+_MARGIN_PX = 32  # surroundings of these in which flow is estimated, in px of a frame
 
 
 class LocalFlowMerger:
@@ -107,17 +100,17 @@ class LocalFlowMerger:
         fastest_px = parts.fastest_px(best.field, there)
         inside = enlarged(where, total.counts.shape, scale)
         counts, weight = (np.where(inside, np.float32(0), each) for each in (total.counts, total.weight))
-        blur = np.zeros_like(weight)
+        sums = Sums(counts, weight, np.zeros_like(weight))
         frames, cells = WeightedFrames(source), (SCALE / scale, box[0].start, box[1].start)
         for span, trust in zip(parts.spans, best.trusts, strict=True):
             for chunk, motion in parts.moving(clipped(chunks, span, trajectory), best.field, fastest_px, tolerance_px):
                 to_image = inverse(onto @ chunk.homography)
-                lit, n_frames = frames(chunk.span), float(len(chunk.span))
-                add_along(lit, frames.worth, n_frames, to_image, inside, cells, motion, trust, counts, weight, blur)
-        photons = PhotonSum(counts, weight)
+                summed = Frames(frames(chunk.span), frames.worth, float(len(chunk.span)))
+                add_along(summed, to_image, Moved(inside, cells, motion, trust), sums)
+        photons = PhotonSum(sums.counts, sums.weight)
         if scale > 1:
             return photons  # Its neighbouring pixels share more noise than `sharpened` expects.
-        blur_px2 = np.asarray(blur / np.maximum(weight, np.float32(1e-3)), np.float32)
+        blur_px2 = np.asarray(sums.blur / np.maximum(sums.weight, np.float32(1e-3)), np.float32)
         return sharpened(photons, blur_px2, inside, source.response)
 
 

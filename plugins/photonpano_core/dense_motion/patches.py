@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
+from photonpano_core.dense_motion.warping import Frames
 
 Image = NDArray[np.float32]
 
@@ -54,26 +55,17 @@ class PatchGrid:
 
 
 @compiled
-def add_patches(
-    image: Image,
-    worth: Image,
-    n_frames: float,
-    shifts: NDArray[np.float64],
-    step: int,
-    counts: Image,
-    weight: Image,
-) -> None:
+def add_patches(summed: Frames, shifts: NDArray[np.float64], step: int, counts: Image, weight: Image) -> None:
     """Add an image to patches, each shifted and interpolated bilinearly; the image is 0 outside of its border.
 
     Args:
-        image: (h, w) sum of frames.
-        worth: (h, w) what a frame of each pixel is worth, from 0 to 1.
-        n_frames: number of frames in the sum.
+        summed: frames, with the weight of each pixel.
         shifts: (rows, columns, 2), x and y: the pixel p of a patch is read at p + shift.
         step: distance of neighbouring patches, in px.
         counts: (rows, columns, side, side) sums that are added to.
         weight: the same of numbers of frames.
     """
+    image, weights = summed.image, summed.weights
     height, width = image.shape
     rows, columns, side = counts.shape[0], counts.shape[1], counts.shape[2]
     for i in range(rows):
@@ -90,8 +82,8 @@ def add_patches(
                     if not 0 <= source < height or first >= last:
                         continue
                     factor = (b if down else one - b) * (a if right else one - a)
-                    frames = factor * np.float32(n_frames)
-                    lit, seen = image[source, start + first : start + last], worth[source, start + first : start + last]
+                    frames = factor * np.float32(summed.number)
+                    lit, seen = image[source, start + first : start + last], weights[source, start + first : start + last]
                     to, of = counts[i, j, row, first:last], weight[i, j, row, first:last]
                     for t in range(len(to)):
                         to[t] += factor * lit[t]

@@ -12,14 +12,11 @@ from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import Image, MotionField
 from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures, blurred
 
+# Blur of sub-exposures, and the window over which their differences are averaged, in px of a frame.
 _DETAIL_PX, _WINDOW_PX = 0.9, 1.2
-"""Blur of sub-exposures, and the window over which their differences are averaged, in px of a frame."""
-_TOLERATED = 1.5
-"""Squared difference, in units of the photon noise, that costs no weight."""
-_EXPLAINED = 0.8
-"""Share of the frames that must agree, or other motions are tried."""
-_MOVES_PX = 1.0
-"""Motion within a group that a neighbour takes over, in px of a frame."""
+_TOLERATED = 1.5  # squared difference, in units of the photon noise, that costs no weight
+_EXPLAINED = 0.8  # share of the frames that must agree, or other motions are tried
+_MOVES_PX = 1.0  # motion within a group that a neighbour takes over, in px of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,11 +8,10 @@ import numpy as np
 from photonpano import BoolArray, Response
 from photonpano.merging import PhotonSum
 from photonpano_core.dense_motion.field import Image
-from photonpano_core.dense_motion.noise import count_variance
+from photonpano_core.dense_motion.frames import count_variance
 from photonpano_core.dense_motion.sub_exposures import blurred
 
-_WINDOW_PX = 1.5
-"""Standard deviation of the window over which the Laplacian is compared with its noise, in px."""
+_WINDOW_PX = 1.5  # standard deviation of the window over which the Laplacian is compared with its noise, in px
 
 
 def sharpened(photons: PhotonSum, blur: Image, where: BoolArray, response: Response) -> PhotonSum:

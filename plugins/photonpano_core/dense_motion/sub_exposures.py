@@ -12,31 +12,23 @@ import cv2
 import numpy as np
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, Response, Source, Trajectory
-from photonpano.geometry import apply, inverse, rescaling, translation
+from photonpano.geometry import inverse, rescaling, transform_points, translation
 from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
 from photonpano_core.dense_motion.field import Image, MotionField
 from photonpano_core.dense_motion.frames import WeightedFrames
-from photonpano_core.dense_motion.warping import add_along, mean_of_seen
+from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along, mean_of_seen
 from photonpano_core.photon_mle import to_exposure
 
-SCALE = 0.5
-"""Pixels of the grid per pixel of a frame."""
-_TOLERANCE_PX = 1.5
-"""Motion within which frames are summed before they are warped, in px of a frame."""
-_PLACES = 5
-"""Places along an axis, about, at which the blur of interpolation is looked at."""
-_CACHE_BYTES = 64 * 1024**2
-"""Memory for halved sums of frames, which are warped again in each round."""
+SCALE = 0.5  # pixels of the grid per pixel of a frame
+_TOLERANCE_PX = 1.5  # motion within which frames are summed before they are warped, in px of a frame
+_PLACES = 5  # places along an axis, about, at which the blur of interpolation is looked at
+_CACHE_BYTES = 64 * 1024**2  # memory for halved sums of frames, which are warped again in each round
+# Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale.
 _SHIFT_PX = 0.2
-"""Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale."""
-_MOST = 95.0
-"""Percentile of the speeds of a field by which frames are summed."""
-_SAMPLED = 3
-"""Step, along each axis, of the pixels whose speeds are compared."""
-_REACH = 4
-"""Standard deviations at which a Gaussian ends."""
-_SEEN = 0.1
-"""A pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it."""
+_MOST = 95.0  # percentile of the speeds of a field by which frames are summed
+_SAMPLED = 3  # step, along each axis, of the pixels whose speeds are compared
+_REACH = 4  # standard deviations at which a Gaussian ends
+_SEEN = 0.1  # a pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +89,7 @@ class SubExposures:
         """
         self._group, self._trajectory = group, trajectory
         self._frames = WeightedFrames(source)
-        self._worth = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
+        self._weights = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
         self._onto = to_exposure(group, trajectory, SCALE)
         height, width = source.info.frame_shape
         self.shape, self.response = (height // 2, width // 2), source.response
@@ -167,11 +159,11 @@ class SubExposures:
         fastest_px = self.fastest_px(field, where)
         for span, other in zip(self.spans, others or self.sums, strict=True):
             counts, weight = (np.where(where, np.float32(0), each) for each in (other.counts, other.weight))
+            sums = Sums(counts, weight, unwanted)
             for chunk, motion in self.moving(clipped(self._chunks, span, self._trajectory), field, fastest_px, _TOLERANCE_PX):
                 to_image = self._to_image(chunk.homography)
-                lit, n_frames = self._halved(chunk.span), float(len(chunk.span))
-                cells = (1.0, 0, 0)
-                add_along(lit, self._worth, n_frames, to_image, where, cells, motion, self._trusted, counts, weight, unwanted)
+                summed = Frames(self._halved(chunk.span), self._weights, float(len(chunk.span)))
+                add_along(summed, to_image, Moved(where, (1.0, 0, 0), motion, self._trusted), sums)
             merged.append(PhotonSum(counts, weight))
         return merged
 
@@ -232,7 +224,7 @@ def _spread(to_image: FloatArray, shape: tuple[int, int]) -> float:
         shape: (height, width) of the grid.
     """
     places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in shape[::-1])), axis=-1)
-    found = apply(to_image, places.reshape(-1, 2))
+    found = transform_points(to_image, places.reshape(-1, 2))
     fraction = found - np.floor(found)
     return float(np.mean(fraction * (1 - fraction)))
 

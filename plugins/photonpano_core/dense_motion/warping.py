@@ -2,46 +2,75 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
 
-@compiled
-def add_along(
-    image: NDArray[np.float32],
-    worth: NDArray[np.float32],
-    n_frames: float,
-    to_image: NDArray[np.float64],
-    where: NDArray[np.bool_],
-    cells: tuple[float, int, int],
-    motion: NDArray[np.float32],
-    trust: NDArray[np.float32],
-    counts: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    blur: NDArray[np.float32],
-) -> None:
-    """Add an image to some pixels of a grid, interpolated bilinearly; the image is 0 outside of its border.
+class Frames(NamedTuple):
+    """A sum of frames.
 
-    Args:
-        image: (h, w) sum of frames.
-        worth: (h, w) what a frame of each pixel is worth, from 0 to 1; (0, 0) if it is 1 for all.
-        n_frames: number of frames in the sum.
-        to_image: (3, 3), pixels of the grid to pixels of the image.
+    Attributes:
+        image: (h, w) float32 sum.
+        weights: (h, w) float32 of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all.
+        number: of frames in the sum.
+    """
+
+    image: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    number: float
+
+
+class Moved(NamedTuple):
+    """How the pixels of a grid move beyond a homography, in cells of a coarser or finer grid.
+
+    Attributes:
         where: (H, W) pixels of the grid that are added to.
         cells: cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike.
         motion: (h', w', 2), x and y by which cells are displaced, in cells.
         trust: (h', w') weight of the image in each cell.
-        counts: (H, W) sums that are added to.
-        weight: (H, W) numbers of frames that are added to.
-        blur: (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames, that are added
-            to; (0, 0) if unwanted.
     """
+
+    where: NDArray[np.bool_]
+    cells: tuple[float, int, int]
+    motion: NDArray[np.float32]
+    trust: NDArray[np.float32]
+
+
+class Sums(NamedTuple):
+    """What `add_along` adds to.
+
+    Attributes:
+        counts: (H, W) sums.
+        weight: (H, W) numbers of frames.
+        blur: (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames; (0, 0) for none.
+    """
+
+    counts: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    blur: NDArray[np.float32]
+
+
+@compiled
+def add_along(summed: Frames, to_image: NDArray[np.float64], moved: Moved, sums: Sums) -> None:
+    """Add an image to some pixels of a grid, interpolated bilinearly; the image is 0 outside of its border.
+
+    Args:
+        summed: frames.
+        to_image: (3, 3), pixels of the grid to pixels of the image.
+        moved: how pixels move beyond that.
+        sums: added to.
+    """
+    image, weights, where, trust = summed.image, summed.weights, moved.where, moved.trust
+    counts, weight, blur = sums.counts, sums.weight, sums.blur
+    scale, first_row, first_column = moved.cells
     height, width = image.shape
-    frames, per_cell, last = np.float32(n_frames), 1 / cells[0], where.shape[1]
+    frames, per_cell, last = np.float32(summed.number), 1 / scale, where.shape[1]
     steps = np.arange(last)
-    columns = np.minimum(np.maximum(((steps + 0.5) * cells[0]).astype(np.int64) - cells[2], 0), trust.shape[1] - 1)
+    columns = np.minimum(np.maximum(((steps + 0.5) * scale).astype(np.int64) - first_column, 0), trust.shape[1] - 1)
     us, vs, shares = np.empty(last), np.empty(last), np.empty(last, np.float32)
     for row in range(where.shape[0]):
         inside, first, stop = where[row], 0, last
@@ -51,11 +80,11 @@ def add_along(
             stop -= 1
         if first == stop:
             continue
-        cell = min(max(int((row + 0.5) * cells[0]) - cells[1], 0), trust.shape[0] - 1)
-        moved, trusted = motion[cell], trust[cell]
+        cell = min(max(int((row + 0.5) * scale) - first_row, 0), trust.shape[0] - 1)
+        displaced, trusted = moved.motion[cell], trust[cell]
         for i in range(first, stop):
             at = columns[i]
-            us[i], vs[i], shares[i] = i + per_cell * moved[at, 0], row + per_cell * moved[at, 1], trusted[at]
+            us[i], vs[i], shares[i] = i + per_cell * displaced[at, 0], row + per_cell * displaced[at, 1], trusted[at]
         _map(to_image, us[first:stop], vs[first:stop])
         into, of = counts[row], weight[row]
         for i in range(first, stop):
@@ -66,7 +95,7 @@ def add_along(
             a, b = np.float32(u - left), np.float32(v - top)
             if 0 <= left < width - 1 and 0 <= top < height - 1:
                 into[i] += share * _between(image, top, left, a, b)
-                seen = share * frames * (_between(worth, top, left, a, b) if worth.size else np.float32(1))
+                seen = share * frames * (_between(weights, top, left, a, b) if weights.size else np.float32(1))
                 of[i] += seen
                 if blur.size:
                     blur[row, i] += seen * np.float32(0.5) * (a * (1 - a) + b * (1 - b))
@@ -77,7 +106,7 @@ def add_along(
                     if 0 <= y < height and 0 <= x < width:
                         part = share * (b if down else 1 - b) * (a if right else 1 - a)
                         into[i] += part * image[y, x]
-                        of[i] += part * frames * (worth[y, x] if worth.size else np.float32(1))
+                        of[i] += part * frames * (weights[y, x] if weights.size else np.float32(1))
 
 
 @compiled

@@ -5,21 +5,18 @@ Similar patches are stacked, transformed together, and coefficients below the no
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-PATCH = 8
-"""Side of a patch, px."""
-GROUP = 16
-"""Similar patches that are filtered together; a power of 2."""
-SEARCH = 10
-"""Similar patches are looked for at this distance at most along x and y, px."""
-STEP = 4
-"""Distance of reference patches, px."""
-_THRESHOLD = np.float32(2.7)
-"""Coefficients below this many standard deviations of the noise are set to 0."""
+PATCH = 8  # side of a patch, px
+GROUP = 16  # similar patches that are filtered together; a power of 2
+SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
+STEP = 4  # distance of reference patches, px
+_THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
 
 
 def _dct_matrix() -> NDArray[np.float32]:
@@ -32,23 +29,35 @@ def _dct_matrix() -> NDArray[np.float32]:
 _DCT = _dct_matrix()
 
 
-def places_of(length: int) -> NDArray[np.int32]:
+class Patches(NamedTuple):
+    """Reference patches on a regular grid, and the patches that are similar to each.
+
+    Attributes:
+        rows: (R,) first rows of the reference patches.
+        columns: (C,) their first columns.
+        similar: (R, C, GROUP, 2) first row and column of the similar patches, the reference first.
+    """
+
+    rows: NDArray[np.int32]
+    columns: NDArray[np.int32]
+    similar: NDArray[np.int32]
+
+    @classmethod
+    def over(cls, shape: tuple[int, ...]) -> Patches:
+        """Return patches that cover an image of a (height, width), without similar ones."""
+        rows, columns = (_places(length) for length in shape)
+        return cls(rows, columns, np.empty((len(rows), len(columns), GROUP, 2), np.int32))
+
+
+def _places(length: int) -> NDArray[np.int32]:
     """Return where reference patches begin along a side, so that they cover it."""
     return np.unique(np.append(np.arange(0, length - PATCH + 1, STEP), length - PATCH)).astype(np.int32)
 
 
 @compiled
-def find_similar(
-    image: NDArray[np.float32], rows: NDArray[np.int32], columns: NDArray[np.int32], found: NDArray[np.int32]
-) -> None:
-    """Find the patches that differ least from each reference patch.
-
-    Args:
-        image: (H, W).
-        rows: (R,) first rows of the reference patches.
-        columns: (C,) their first columns.
-        found: (R, C, GROUP, 2) output: first row and column of the similar patches, the reference first.
-    """
+def find_similar(image: NDArray[np.float32], patches: Patches) -> None:
+    """Find the patches of an image, (H, W), that differ least from each reference patch."""
+    rows, columns, found = patches
     height, width = image.shape
     side = 2 * SEARCH + 1
     best = np.empty(GROUP, np.float32)
@@ -132,9 +141,7 @@ def _mixed(stack: NDArray[np.float32]) -> None:
 def filter_groups(
     image: NDArray[np.float32],
     noise: NDArray[np.float32],
-    rows: NDArray[np.int32],
-    columns: NDArray[np.int32],
-    found: NDArray[np.int32],
+    patches: Patches,
     total: NDArray[np.float32],
     weights: NDArray[np.float32],
 ) -> None:
@@ -143,12 +150,11 @@ def filter_groups(
     Args:
         image: (H, W).
         noise: (H, W) standard deviation of the noise to remove.
-        rows: (R,) first rows of the reference patches.
-        columns: (C,) their first columns.
-        found: (R, C, GROUP, 2) from `find_similar`.
+        patches: from `find_similar`.
         total: (H, W) weighted sum of patches, added to.
         weights: (H, W) sum of weights, added to.
     """
+    rows, columns, found = patches
     stack = np.empty((GROUP, PATCH, PATCH), np.float32)
     flat = stack.reshape(GROUP, PATCH * PATCH)
     room = np.empty((PATCH, PATCH), np.float32)

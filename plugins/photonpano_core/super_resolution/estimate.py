@@ -9,23 +9,17 @@ import numpy as np
 
 from photonpano import FloatArray, FluxImage
 from photonpano.merging import LitFrames
-from photonpano_core.super_resolution.collaborative import GROUP, PATCH, filter_groups, find_similar, places_of
+from photonpano_core.super_resolution.collaborative import PATCH, Patches, filter_groups, find_similar
 from photonpano_core.super_resolution.observing import counts_in_light, expected, log_likelihood, photon_ratio
 
+# Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round.
 STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
-"""Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round."""
-_STEPS = 6
-"""Steps of expectation-maximisation in a round."""
-_MATCHED_ROUNDS = 3
-"""Rounds for which similar patches are looked for once."""
-_FEWEST_FRAMES = 0.25
-"""Frames of a cell, smoothed, below which its noise grows no more."""
-_KEPT_PX = 8.0
-"""Denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian."""
-_DARKEST = 1e-5
-"""The flux stays above this share of its mean: expectation-maximisation cannot leave 0."""
-_BRIGHTEST = 1.55
-"""Largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame."""
+_STEPS = 6  # steps of expectation-maximisation in a round
+_MATCHED_ROUNDS = 3  # rounds for which similar patches are looked for once
+_FEWEST_FRAMES = 0.25  # frames of a cell, smoothed, below which its noise grows no more
+_KEPT_PX = 8.0  # denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian
+_DARKEST = 1e-5  # the flux stays above this share of its mean: expectation-maximisation cannot leave 0
+_BRIGHTEST = 1.55  # largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,16 +117,14 @@ def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
     noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
     flux = _started(observed)
     floor = np.float32(_DARKEST * max(float(flux.mean()), 1e-9))
-    rows, columns = places_of(flux.shape[0]), places_of(flux.shape[1])
-    found = np.empty((len(rows), len(columns), GROUP, 2), np.int32)
-    results = []
+    patches, results = Patches.over(flux.shape), []
     for number, strength in enumerate(STRENGTHS[:n_rounds]):
         flux = _likelier(flux, seen, floor, observed)
         stabilised = _stabilised(flux, observed.binary)
         if number % _MATCHED_ROUNDS == 0:
-            find_similar(stabilised, rows, columns, found)
+            find_similar(stabilised, patches)
         total, weights = np.zeros_like(flux), np.zeros_like(flux)
-        filter_groups(stabilised, np.asarray(strength * noise, np.float32), rows, columns, found, total, weights)
+        filter_groups(stabilised, np.asarray(strength * noise, np.float32), patches, total, weights)
         flux = _as_bright(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
         results.append(flux)
     return results

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-_UP = 0.5 + 1e-6
-"""A centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates."""
+_UP = 0.5 + 1e-6  # a centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates
 
 
 @compiled

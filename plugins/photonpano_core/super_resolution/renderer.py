@@ -13,7 +13,7 @@ from threading import Lock
 import numpy as np
 
 from photonpano import FloatArray, FluxImage, FrameSpan, Homography, Panorama, Source, Trajectory
-from photonpano.geometry import Canvas, apply, corners, inverse, translation
+from photonpano.geometry import Canvas, corners, inverse, transform_points, translation
 from photonpano.merging import Chunk
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.configs import SuperResolutionConfig
@@ -22,30 +22,21 @@ from photonpano_core.super_resolution.sums import PhotonSums, pieces_of, sums_on
 
 Decide = Callable[[str, int | bool, str], None]
 
-Box = tuple[slice, slice]
-"""Rows and columns of an image."""
+Box = tuple[slice, slice]  # rows and columns of an image
 
 logger = logging.getLogger("photonpano.super_resolution")
 
-_BLOCK_PX = 320
-"""Side of the blocks that are estimated one by one; all pixels of a block see with the same area."""
-_HALO_PX = 24
-"""Width of the margin around a block: what lies beyond has no influence that counts."""
-_PROBE_PX = 160
-"""Side of the squares on which frames are held out, without their margins."""
-_PROBES = (0.25, 0.5, 0.75)
-"""Where these squares lie: in the middles of the frames at these shares of the span."""
-_HELD_OUT = 8
-"""One chunk of frames in 8 is held out."""
-_FEWEST_FRAMES = 1.0
-"""Pixels that fewer frames saw are unknown."""
-_GATHERING = 5
-"""One part in 5 of the time is spent on sorting photons, about."""
+_BLOCK_PX = 320  # side of the blocks that are estimated one by one; all pixels of a block see with the same area
+_HALO_PX = 24  # width of the margin around a block: what lies beyond has no influence that counts
+_PROBE_PX = 160  # side of the squares on which frames are held out, without their margins
+_PROBES = (0.25, 0.5, 0.75)  # where these squares lie: in the middles of the frames at these shares of the span
+_HELD_OUT = 8  # one chunk of frames in 8 is held out
+_FEWEST_FRAMES = 1.0  # pixels that fewer frames saw are unknown
+_GATHERING = 5  # one part in 5 of the time is spent on sorting photons, about
+# The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
+# from frames held out, so that the most likely round is a noisy one.
 _ENOUGH = 0.93
-"""The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
-from frames held out, so that the most likely round is a noisy one."""
-_SIGNIFICANT = 2.0
-"""Held-out frames show detail if they are likelier with it than without by this many standard errors."""
+_SIGNIFICANT = 2.0  # held-out frames show detail if they are likelier with it than without by this many standard errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +284,7 @@ def _probe(share: float, source: Source, trajectory: Trajectory, span: FrameSpan
     instant = span.start + share * (len(span) - 1)
     shape = source.info.frame_shape
     to_canvas = canvas.transform @ trajectory.at([instant])[0]
-    outline = apply(to_canvas, corners(shape))
+    outline = transform_points(to_canvas, corners(shape))
     # Even sides, so that the detail of a grid half as fine is easily found.
     width, height = (2 * int(min(_PROBE_PX, side) // 2 + _HALO_PX) for side in np.ceil(np.ptp(outline, axis=0)) + 1)
     left, top = np.rint(outline.mean(axis=0) - [width / 2, height / 2])
@@ -305,12 +296,12 @@ def _zoom_at(middle: FloatArray, canvas: Homography, chunks: Sequence[Chunk], fr
     height, width = frame_shape
     every = chunks[:: max(1, len(chunks) // 256)]
     to_canvas = canvas @ np.array([chunk.homography for chunk in every])
-    points = apply(inverse(to_canvas), middle[None])[:, 0]
+    points = transform_points(inverse(to_canvas), middle[None])[:, 0]
     outside = np.maximum(np.abs(points - [(width - 1) / 2, (height - 1) / 2]) - [width / 2, height / 2], 0).sum(axis=1)
     inside = outside <= outside.min()
     seen, at = to_canvas[inside], points[inside]
     here, right, below = (
-        np.array([apply(homography, (point + step)[None])[0] for homography, point in zip(seen, at, strict=True)])
+        np.array([transform_points(homography, (point + step)[None])[0] for homography, point in zip(seen, at, strict=True)])
         for step in ([0, 0], [1, 0], [0, 1])
     )
     a, b = (right - here).T, (below - here).T

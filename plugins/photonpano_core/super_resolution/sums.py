@@ -12,17 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import BoolArray, Capture, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
-from photonpano.geometry import Canvas, apply, corners
+from photonpano.geometry import Canvas, corners, transform_points
 from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.super_resolution.observing import add_observations
 
-_BATCH = 16
-"""Chunks that are summed before they are added to the grid."""
-_PART_ROWS = 64
-"""Rows of the grid, about, that a thread adds to at a time."""
-_MANY_PIECES = 64
-"""A span is divided into at least this many chunks, if it has the frames: some of them are held out."""
+_BATCH = 16  # chunks that are summed before they are added to the grid
+_PART_ROWS = 64  # rows of the grid, about, that a thread adds to at a time
+_MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +58,7 @@ def visible(chunks: Sequence[Chunk], canvas: Canvas, frame_shape: tuple[int, int
     """Return the chunks whose frames may reach into a canvas."""
     if not chunks:
         return []
-    outlines = apply(canvas.transform @ np.array([chunk.homography for chunk in chunks]), corners(frame_shape))
+    outlines = transform_points(canvas.transform @ np.array([chunk.homography for chunk in chunks]), corners(frame_shape))
     low, high = outlines.min(axis=1) - 1, outlines.max(axis=1) + 1
     inside = (high >= 0).all(axis=1) & (low <= [canvas.width - 1, canvas.height - 1]).all(axis=1)
     return [chunk for chunk, flag in zip(chunks, inside, strict=True) if flag]

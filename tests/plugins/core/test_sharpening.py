@@ -6,7 +6,7 @@ import pytest
 
 from photonpano.merging import PhotonSum
 from photonpano.testing import MemorySource
-from photonpano_core.dense_motion.noise import count_variance
+from photonpano_core.dense_motion.frames import count_variance
 from photonpano_core.dense_motion.sharpening import sharpened
 
 SHAPE, N = (96, 128), 5000

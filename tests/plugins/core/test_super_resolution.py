@@ -15,7 +15,7 @@ from photonpano.merging import MergeRenderer
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
-from photonpano_core.super_resolution.collaborative import GROUP, filter_groups, find_similar, places_of
+from photonpano_core.super_resolution.collaborative import Patches, filter_groups, find_similar
 from photonpano_core.super_resolution.estimate import Observations, pixel_area, rounds_of
 from photonpano_core.super_resolution.observing import add_observations, counts_in_light, expected
 from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
@@ -220,11 +220,10 @@ def test_denoiser_keeps_edges_and_removes_noise() -> None:
     clean = np.zeros((64, 64), np.float32)
     clean[:, 32:] = 1
     noisy = clean + 0.1 * np.random.default_rng(2).standard_normal(clean.shape).astype(np.float32)
-    rows = columns = places_of(64)
-    found = np.empty((len(rows), len(columns), GROUP, 2), np.int32)
-    find_similar(noisy, rows, columns, found)
+    patches = Patches.over(noisy.shape)
+    find_similar(noisy, patches)
     total, weights = np.zeros_like(clean), np.zeros_like(clean)
-    filter_groups(noisy, np.full_like(clean, 0.1), rows, columns, found, total, weights)
+    filter_groups(noisy, np.full_like(clean, 0.1), patches, total, weights)
     assert np.sqrt(np.mean((total / weights - clean) ** 2)) < 0.03
 
 

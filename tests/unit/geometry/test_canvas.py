@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano.geometry import apply, canvas_of, corners, from_parameters, translation
+from photonpano.geometry import canvas_of, corners, from_parameters, transform_points, translation
 
 SHAPE = (40, 60)
 small = st.floats(-0.2, 0.2)
@@ -32,13 +32,13 @@ def test_canvas_at_twice_the_scale_has_twice_the_rows_and_columns() -> None:
     canvas = canvas_of(translation(-7, 0)[None], SHAPE, 2.0)
     assert canvas.shape == (80, 120)
     # The first reference pixel covers the first two pixels of the canvas.
-    np.testing.assert_allclose(apply(canvas.transform, [[-7, 0]]), [[0.5, 0.5]])
+    np.testing.assert_allclose(transform_points(canvas.transform, [[-7, 0]]), [[0.5, 0.5]])
 
 
 @given(motions, scales)
 def test_canvas_holds_every_corner_without_spare_rows(motion: np.ndarray, scale: float) -> None:
     canvas = canvas_of(motion, SHAPE, scale)
-    placed = apply(canvas.transform @ motion, corners(SHAPE)).reshape(-1, 2)
+    placed = transform_points(canvas.transform @ motion, corners(SHAPE)).reshape(-1, 2)
     before = placed.min(axis=0) + 0.5
     after = np.array([canvas.width, canvas.height]) - 0.5 - placed.max(axis=0)
     assert before.min() >= -1e-4

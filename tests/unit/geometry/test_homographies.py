@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photonpano.geometry import (
-    apply,
     corner_displacements,
     corners,
     from_parameters,
@@ -18,6 +17,7 @@ from photonpano.geometry import (
     rescaled,
     rescaling,
     step_motions,
+    transform_points,
     translation,
 )
 
@@ -30,46 +30,48 @@ points = st.lists(st.tuples(st.floats(-10, 600), st.floats(-10, 300)), min_size=
 
 def test_apply_divides_by_depth() -> None:
     tilted = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.001, 0.0, 1.0]])
-    np.testing.assert_allclose(apply(tilted, [[100, 50], [0, 0]]), [[105 / 1.1, 50 / 1.1], [5, 0]])
+    np.testing.assert_allclose(transform_points(tilted, [[100, 50], [0, 0]]), [[105 / 1.1, 50 / 1.1], [5, 0]])
 
 
 def test_step_motions_shift_roll_and_zoom_about_centre_of_frame() -> None:
     shifted, rolled, zoomed = step_motions([[1, 2, 0, 0], [0, 0, np.pi / 2, 0], [0, 0, 0, 0.5]], (11, 21))
     np.testing.assert_allclose(shifted, translation(1, 2))
-    np.testing.assert_allclose(apply(rolled, [[10, 5], [14, 5]]), [[10, 5], [10, 9]], atol=1e-12)
-    np.testing.assert_allclose(apply(zoomed, [[10, 5], [14, 7]]), [[10, 5], [16, 8]], atol=1e-12)
+    np.testing.assert_allclose(transform_points(rolled, [[10, 5], [14, 5]]), [[10, 5], [10, 9]], atol=1e-12)
+    np.testing.assert_allclose(transform_points(zoomed, [[10, 5], [14, 7]]), [[10, 5], [16, 8]], atol=1e-12)
 
 
 def test_apply_takes_x_as_column_and_y_as_row() -> None:
     image = np.zeros((5, 7), np.float32)
     image[1, 2] = 1
     moved = cv2.warpPerspective(image, translation(3, 1), (7, 5))
-    x, y = apply(translation(3, 1), [[2, 1]])[0]
+    x, y = transform_points(translation(3, 1), [[2, 1]])[0]
     assert (x, y) == (5, 2)
     assert moved[int(y), int(x)] == 1
 
 
 def test_apply_returns_infinity_on_the_horizon_without_warning() -> None:
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
-    assert np.isinf(apply(horizon, [[100, 50]])).all()
+    assert np.isinf(transform_points(horizon, [[100, 50]])).all()
 
 
 def test_apply_maps_stacks_with_shared_or_own_points() -> None:
     stack = np.stack([translation(1, 0), translation(0, 2)])
-    np.testing.assert_array_equal(apply(stack, [[5, 5]]), [[[6, 5]], [[5, 7]]])
-    np.testing.assert_array_equal(apply(stack, [[[5, 5]], [[0, 0]]]), [[[6, 5]], [[0, 2]]])
+    np.testing.assert_array_equal(transform_points(stack, [[5, 5]]), [[[6, 5]], [[5, 7]]])
+    np.testing.assert_array_equal(transform_points(stack, [[[5, 5]], [[0, 0]]]), [[[6, 5]], [[0, 2]]])
 
 
 @given(homographies, points)
 def test_inverse_maps_points_back(homography: np.ndarray, where: np.ndarray) -> None:
-    np.testing.assert_allclose(apply(inverse(homography), apply(homography, where)), where, atol=1e-6)
+    np.testing.assert_allclose(transform_points(inverse(homography), transform_points(homography, where)), where, atol=1e-6)
     assert inverse(homography)[2, 2] == 1
 
 
 @given(homographies, homographies, points)
 def test_products_apply_right_factor_first(first: np.ndarray, second: np.ndarray, where: np.ndarray) -> None:
     together = normalised(second @ first)
-    np.testing.assert_allclose(apply(together, where), apply(second, apply(first, where)), atol=1e-6)
+    np.testing.assert_allclose(
+        transform_points(together, where), transform_points(second, transform_points(first, where)), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("bad", [np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)])
@@ -80,8 +82,8 @@ def test_normalised_refuses_matrix_without_h33(bad: np.ndarray) -> None:
 
 def test_rescaling_keeps_pixel_edges_in_place() -> None:
     """The edges of the image lie at -0.5; the first pixel of a half-size image covers the first two."""
-    np.testing.assert_allclose(apply(rescaling(0.5), [[-0.5, -0.5], [0.5, 0.5]]), [[-0.5, -0.5], [0, 0]])
-    np.testing.assert_allclose(apply(rescaling(2), [[0, 0], [7.5, 3.5]]), [[0.5, 0.5], [15.5, 7.5]])
+    np.testing.assert_allclose(transform_points(rescaling(0.5), [[-0.5, -0.5], [0.5, 0.5]]), [[-0.5, -0.5], [0, 0]])
+    np.testing.assert_allclose(transform_points(rescaling(2), [[0, 0], [7.5, 3.5]]), [[0.5, 0.5], [15.5, 7.5]])
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0, 3.0])
@@ -90,15 +92,17 @@ def test_rescaling_agrees_with_opencv(scale: float) -> None:
     resized = cv2.resize(ramp, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
     inside = resized[5, int(scale) : -int(scale) or None]
     columns = np.arange(len(resized[5]))[int(scale) : -int(scale) or None]
-    back = apply(inverse(rescaling(scale)), np.stack([columns, np.full(len(columns), 5)], axis=1))[:, 0]
+    back = transform_points(inverse(rescaling(scale)), np.stack([columns, np.full(len(columns), 5)], axis=1))[:, 0]
     np.testing.assert_allclose(inside, back, atol=1e-5)
 
 
 @given(homographies, points, st.sampled_from([0.25, 0.5, 2.0, 3.0]))
 def test_rescaled_is_the_same_motion_of_rescaled_points(homography: np.ndarray, where: np.ndarray, scale: float) -> None:
     to_scaled = rescaling(scale)
-    expected = apply(to_scaled, apply(homography, where))
-    np.testing.assert_allclose(apply(rescaled(homography, scale), apply(to_scaled, where)), expected, atol=1e-6)
+    expected = transform_points(to_scaled, transform_points(homography, where))
+    np.testing.assert_allclose(
+        transform_points(rescaled(homography, scale), transform_points(to_scaled, where)), expected, atol=1e-6
+    )
 
 
 def test_rescaled_doubles_translation_at_scale_2() -> None:
@@ -123,7 +127,9 @@ def test_jacobian_agrees_with_finite_differences(homography: np.ndarray, where: 
     p = parameters(homography)
     steps = np.diag([1e-6] * 4 + [1e-4] * 2 + [1e-9] * 2)
     differences = [
-        (apply(from_parameters(p + step), where) - apply(from_parameters(p - step), where)) / (2 * step.max()) for step in steps
+        (transform_points(from_parameters(p + step), where) - transform_points(from_parameters(p - step), where))
+        / (2 * step.max())
+        for step in steps
     ]
     derivatives = jacobian(homography, where)
     assert derivatives.shape == (len(where), 2, 8)

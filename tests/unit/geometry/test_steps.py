@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from photonpano.geometry import apply, corners, from_parameters, generators, slopes, unit_coordinates
+from photonpano.geometry import corners, from_parameters, generators, slopes, transform_points, unit_coordinates
 
 SHAPE = (254, 496)
 HOMOGRAPHY = np.array([[1.02, 0.03, 11.0], [-0.02, 0.98, -4.0], [2e-5, -3e-5, 1.0]])
@@ -11,7 +11,7 @@ HOMOGRAPHY = np.array([[1.02, 0.03, 11.0], [-0.02, 0.98, -4.0], [2e-5, -3e-5, 1.
 
 def test_unit_coordinates_span_the_longer_side():
     edges = np.array([[-0.5, 126.5], [495.5, 126.5], [247.5, 126.5]])
-    assert apply(unit_coordinates(SHAPE), edges) == pytest.approx(np.array([[-1, 0], [1, 0], [0, 0]]))
+    assert transform_points(unit_coordinates(SHAPE), edges) == pytest.approx(np.array([[-1, 0], [1, 0], [0, 0]]))
 
 
 def test_generators_are_derivatives_of_pixel_homographies():
@@ -28,9 +28,8 @@ def test_slopes_agree_with_finite_differences():
     for parameter in range(8):
         step = np.zeros(8)
         step[parameter] = 1e-6
-        ahead, behind = (
-            apply(HOMOGRAPHY @ (np.eye(3) + np.tensordot(sign * step, generators(SHAPE), 1)), points) for sign in (1, -1)
-        )
+        moved = (np.eye(3) + sign * np.tensordot(step, generators(SHAPE), 1) for sign in (1, -1))
+        ahead, behind = (transform_points(HOMOGRAPHY @ each, points) for each in moved)
         assert found[:, parameter] == pytest.approx(((ahead - behind) / 2e-6).ravel(), rel=1e-6, abs=1e-4)
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photonpano.geometry import apply, corner_displacements, from_parameters, parameters
+from photonpano.geometry import corner_displacements, from_parameters, parameters, transform_points
 from photonpano.locating.fitting import MIN_NOISE_PX, fit_homography
 
 SHAPE = (160, 240)
@@ -14,7 +14,9 @@ SIZES = np.full(120, 4, np.float32)
 def matches(seed: int, std_px: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     points = rng.uniform((0, 0), (239, 159), (len(SIZES), 2))
-    return points.astype(np.float32), (apply(TRUE, points) + rng.normal(size=points.shape) * std_px).astype(np.float32)
+    return points.astype(np.float32), (transform_points(TRUE, points) + rng.normal(size=points.shape) * std_px).astype(
+        np.float32
+    )
 
 
 def error_px(homography: np.ndarray) -> float:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import Camera, apply, corner_displacements, parameters, rotation_matrices, scaled_ahead
+from photonpano.geometry import Camera, corner_displacements, parameters, rotation_matrices, scaled_ahead, transform_points
 from photonpano.locating import Matches, MatchingConfig, turn_of
 from photonpano.locating.agreement import agreeing_by_chance, distinct, rotation_of_most
 
@@ -21,10 +21,10 @@ def matches(right: int, wrong: int = 0, std_px: float = 0.5, seed: int = 0, guid
     """Right matches that turn by TRUE, then wrong ones: within `search_px` of it if guided, else anywhere."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((0, 0), (239, 159), (right + wrong, 2))
-    moved = apply(TRUE, points) + rng.normal(0, std_px, points.shape)
+    moved = transform_points(TRUE, points) + rng.normal(0, std_px, points.shape)
     if guided:
         angles, radii = rng.uniform(0, 2 * np.pi, wrong), LIMITS.search_px * np.sqrt(rng.uniform(0, 1, wrong))
-        moved[right:] = apply(TRUE, points[right:]) + (radii * [np.cos(angles), np.sin(angles)]).T
+        moved[right:] = transform_points(TRUE, points[right:]) + (radii * [np.cos(angles), np.sin(angles)]).T
     else:
         moved[right:] = rng.uniform((0, 0), (239, 159), (wrong, 2))
     return Matches(points, moved, guided)
@@ -122,7 +122,7 @@ def test_matches_in_a_spot_or_strip_are_rejected() -> None:
 def test_implausible_rotation_is_rejected() -> None:
     points = np.random.default_rng(0).uniform((150, 0), (239, 159), (40, 2))
     far = scaled_ahead(CAMERA.homographies(rotation_matrices([0.0, -0.6, 0.0])))
-    found = reason(turn(Matches(points, apply(far, points), guided=False)))
+    found = reason(turn(Matches(points, transform_points(far, points), guided=False)))
     assert found == "the homography changes the area of the image by a factor of 2.1 (at most 2 is plausible), from 39 matches"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import Located, LocatesTurns, NotLocated, VirtualExposure
-from photonpano.geometry import Camera, apply, corner_displacements, rotation_matrices, scaled_ahead
+from photonpano.geometry import Camera, corner_displacements, rotation_matrices, scaled_ahead, transform_points
 from photonpano.locating import Matches, MatchingConfig, PointLocator
 
 CAMERA = Camera.of(300.0, (160, 240))
@@ -33,7 +33,7 @@ class Known(PointLocator):
 
     def _matches(self, moving: Picture, fixed: Picture, initial: np.ndarray | None) -> Iterator[Matches]:
         points = np.random.default_rng(0).uniform((0, 0), (239, 159), (self._count, 2))
-        yield Matches(points, apply(TRUE, points), guided=initial is not None)
+        yield Matches(points, transform_points(TRUE, points), guided=initial is not None)
 
 
 def registered(count: int, homography: Located | NotLocated, turning: bool = True) -> Located | NotLocated:

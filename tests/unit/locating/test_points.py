@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonpano import Located, NotLocated
-from photonpano.geometry import apply, corner_displacements, from_parameters, inverse, translation
+from photonpano.geometry import corner_displacements, from_parameters, inverse, transform_points, translation
 from photonpano.locating import PointLimits, motion_from_points
 
 SHAPE = (160, 240)
@@ -19,7 +19,7 @@ def matches(count: int = 120, wrong: int = 0, std_px: float = 0.3, seed: int = 0
     """Points that move by TRUE with errors of 0.3 px; the first `wrong` of them are outliers."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((0, 0), (239, 159), (count, 2))
-    moved = apply(TRUE, points) + rng.normal(0, std_px, points.shape)
+    moved = transform_points(TRUE, points) + rng.normal(0, std_px, points.shape)
     moved[:wrong] += rng.uniform(20, 60, (wrong, 2))
     return points, moved
 

@@ -3,32 +3,36 @@
 import numpy as np
 import pytest
 
-from photonpano.geometry import inverse, rescaling, translation
-from photonpano.merging.footprints import footprints_of
+from photonpano.geometry import Canvas, inverse, rescaling, translation
+from photonpano.merging.footprints import Footprint, footprints_of
 
-FRAME, GRID = (254, 496), (300, 700)
+FRAME, GRID = (254, 496), Canvas(300, 700, np.eye(3))
+
+
+def footprints(to_grid: np.ndarray) -> list[Footprint]:
+    return footprints_of(GRID, None, to_grid, FRAME)
 
 
 def test_footprint_of_shift_is_straight_and_covers_shifted_frame() -> None:
-    (footprint,) = footprints_of(translation(10.5, 20.25)[None], FRAME, GRID)
+    (footprint,) = footprints(translation(10.5, 20.25)[None])
     assert (footprint.shrink, footprint.straight) == (1, True)
-    assert (footprint.rows, footprint.columns) == (range(19, 276), range(9, 508))
+    assert (footprint.rows, footprint.columns) == (range(19, 276), (range(9, 508),))
     assert footprint.to_image == pytest.approx(translation(-10.5, -20.25))
 
 
 def test_footprint_is_empty_outside_of_grid() -> None:
     for shift in (translation(800, 0), translation(-600, 0), translation(0, 400)):
-        (footprint,) = footprints_of(shift[None], FRAME, GRID)
+        (footprint,) = footprints(shift[None])
         assert not (footprint.rows and footprint.columns)
 
 
 def test_footprint_is_not_straight_beyond_small_rotation() -> None:
     turned = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in (0.005, 0.02)]
-    assert [footprint.straight for footprint in footprints_of(np.array(turned), FRAME, GRID)] == [True, False]
+    assert [footprint.straight for footprint in footprints(np.array(turned))] == [True, False]
 
 
 def test_footprint_shrinks_frame_on_coarse_grid() -> None:
-    found = footprints_of(np.array([rescaling(1), rescaling(0.5), rescaling(0.26)]), FRAME, GRID)
+    found = footprints(np.array([rescaling(1), rescaling(0.5), rescaling(0.26)]))
     assert [footprint.shrink for footprint in found] == [1, 2, 3]
     assert found[1].to_image == pytest.approx(np.eye(3))
     assert found[2].to_image == pytest.approx(inverse(rescaling(0.26) @ rescaling(3)))

@@ -9,7 +9,7 @@ import pytest
 
 from photonpano import CanvasTooLargeError, FrameSpan, InputError, LocationError, Panorama
 from photonpano.context import Context, Quiet
-from photonpano.geometry import Canvas, apply, from_parameters, translation
+from photonpano.geometry import Canvas, from_parameters, transform_points, translation
 from photonpano.merging import MergeRenderer, accumulate
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
 from photonpano.merging.panorama import Thumbnail, Tile, render, render_tiles, tiles_of
@@ -191,7 +191,7 @@ def test_thumbnail_averages_seen_pixels() -> None:
     np.testing.assert_array_equal(shown.panorama.flux, [[3, np.nan], [4, 8]])
     np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
     # The centre of the first square lies between the pixels 0 and 1.
-    np.testing.assert_allclose(apply(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
+    np.testing.assert_allclose(transform_points(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
 
 
 def test_tiles_of_canvas_that_fits_is_one_tile(pan: Callable) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photonpano.merging.shared_detail import noise_of_a_frame, with_shared_detail
+from photonpano.merging.colour import noise_of_a_frame, with_shared_detail
 from photonpano.photometry import BinaryResponse
 
 SHAPE = (96, 128)

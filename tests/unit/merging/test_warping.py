@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonpano.geometry import apply, translation
+from photonpano.geometry import transform_points, translation
 from photonpano.merging.warping import add_footprint, add_warped
 
 IMAGE = np.random.default_rng(0).random((23, 37)).astype(np.float32)
@@ -17,7 +17,7 @@ def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]
     """Interpolate an image, with zeros around it, at each pixel of a grid."""
     padded = np.pad(image.astype(np.float64), 2)
     y, x = np.mgrid[: shape[0], : shape[1]]
-    seen = apply(to_image, np.stack([x.ravel(), y.ravel()], axis=-1).astype(float)) + 2
+    seen = transform_points(to_image, np.stack([x.ravel(), y.ravel()], axis=-1).astype(float)) + 2
     u, v = (np.clip(seen[:, axis], 0, padded.shape[1 - axis] - 2) for axis in (0, 1))
     left, top = np.floor(u).astype(int), np.floor(v).astype(int)
     a, b = u - left, v - top

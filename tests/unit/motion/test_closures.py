@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -108,28 +109,28 @@ def test_exposure_similarity_falls_with_the_error_of_the_motion() -> None:
     assert found[-1] < 0.5
 
 
-def test_exposure_similarity_is_1_for_one_place_under_roll_and_tilt() -> None:
-    roll = np.array([[np.cos(0.35), -np.sin(0.35), 90], [np.sin(0.35), np.cos(0.35), 30], [2e-4, 0, 1]])
+ROLL = np.array([[np.cos(0.35), -np.sin(0.35), 90], [np.sin(0.35), np.cos(0.35), 30], [2e-4, 0, 1]])
+COLUMNS, ROWS = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
+COLUMNS[:, 70:90] = COLUMNS[5, 5] = ROWS[20:40] = True
+
+
+@pytest.mark.parametrize(
+    ("places", "moving", "fixed"),
+    [
+        ((ROLL, translation(80, 60)), {}, {}),
+        ((HERE, NEARBY), {"frames": 60}, {"frames": 1000}),
+        ((NEARBY, HERE), {"frames": 1000}, {"frames": 60}),
+        ((HERE, NEARBY), {"unseen": COLUMNS}, {"unseen": ROWS}),
+    ],
+    ids=["roll and tilt", "short onto long", "long onto short", "unseen pixels"],
+)
+def test_exposure_similarity_is_1_for_one_place(
+    places: tuple[np.ndarray, np.ndarray], moving: dict[str, Any], fixed: dict[str, Any]
+) -> None:
     rng = np.random.default_rng(0)
-    moving, fixed = (seen(scene(0), place, 0.1, rng) for place in (roll, translation(80, 60)))
-    assert exposure_similarity(moving, fixed, inverse(translation(80, 60)) @ roll) == pytest.approx(1, abs=0.02)
-
-
-def test_exposure_similarity_is_1_for_one_place_at_different_lengths() -> None:
-    rng = np.random.default_rng(0)
-    short, long = seen(scene(0), HERE, 0.1, rng, frames=60), seen(scene(0), NEARBY, 0.1, rng, frames=1000)
-    assert exposure_similarity(short, long, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.02)
-    assert exposure_similarity(long, short, inverse(HERE) @ NEARBY) == pytest.approx(1, abs=0.02)
-
-
-def test_exposure_similarity_ignores_pixels_that_were_not_seen() -> None:
-    """Columns and single pixels are missing from one exposure, rows from the other."""
-    rng = np.random.default_rng(0)
-    columns, rows = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
-    columns[:, 70:90] = columns[5, 5] = rows[20:40] = True
-    moving = seen(scene(0), HERE, 0.1, rng, unseen=columns)
-    fixed = seen(scene(0), NEARBY, 0.1, rng, unseen=rows)
-    assert exposure_similarity(moving, fixed, inverse(NEARBY) @ HERE) == pytest.approx(1, abs=0.01)
+    here, there = places
+    first, second = (seen(scene(0), place, 0.1, rng, **more) for place, more in ((here, moving), (there, fixed)))
+    assert exposure_similarity(first, second, inverse(there) @ here) == pytest.approx(1, abs=0.02)
 
 
 def test_exposure_similarity_is_0_for_little_overlap_or_few_seen_pixels() -> None:
@@ -219,25 +220,27 @@ def test_candidates_include_three_visits_of_a_place_at_most() -> None:
     assert [pair for pair in visiting(places, skips=()) if pair[0] == 10] == [(10, 0), (10, 2), (10, 4)]
 
 
-def test_candidates_are_none_for_a_pan() -> None:
-    assert visiting(line(*(np.arange(60) * 9.0))) == []
-    assert visiting(line(*(np.arange(60) * 0.5))) == []
+def tremor(std_px: float, seed: int, n: int = 60) -> np.ndarray:
+    return np.random.default_rng(seed).normal(scale=std_px, size=(n, 2))
 
 
-@pytest.mark.parametrize("tremor_px", [0, 1e-6, 0.01, 1.0])
-@pytest.mark.parametrize("seed", range(5))
-def test_candidates_are_none_for_a_still_or_trembling_camera(tremor_px: float, seed: int) -> None:
-    assert visiting(np.random.default_rng(seed).normal(scale=tremor_px, size=(60, 2))) == []
-
-
-def test_candidates_are_none_for_a_pan_with_tremor() -> None:
-    tremor = np.random.default_rng(0).normal(scale=1.0, size=(60, 2))
-    assert visiting(line(*(np.arange(60) * 3.0)) + tremor) == []
+@pytest.mark.parametrize(
+    "places",
+    [
+        line(*(np.arange(60) * 9.0)),
+        line(*(np.arange(60) * 0.5)),
+        line(*(np.arange(60) * 3.0)) + tremor(1.0, 0),
+        line(0.0),
+        line(0.0, 0.0),
+        *(tremor(std_px, seed) for std_px in (0, 1e-6, 0.01, 1.0) for seed in range(5)),
+    ],
+)
+def test_candidates_are_none_for_a_pan_or_a_trembling_camera(places: np.ndarray) -> None:
+    assert visiting(places) == []
 
 
 def test_candidates_take_the_best_view_of_a_visit_despite_tremor() -> None:
-    tremor = np.random.default_rng(0).normal(scale=1.0, size=(40, 2))
-    pairs = visiting(line(*FORTH, *BACK) + tremor)
+    pairs = visiting(line(*FORTH, *BACK) + tremor(1.0, 0, 40))
     assert [moving for moving, _ in pairs] == list(range(22, 40))
     assert all(abs(moving + fixed - 39) <= 1 for moving, fixed in pairs)
 
@@ -275,11 +278,6 @@ def test_candidates_skip_groups_of_another_length() -> None:
     spread = [Group(FrameSpan(0, 50), 0.0), *groups(*range(100, 4000, 100))]
     pairs = candidates(spread, homographies, np.ones(40, bool))
     assert {index for pair in pairs for index in pair} == set(range(1, 18)) | set(range(22, 40))
-
-
-@pytest.mark.parametrize("n_groups", [1, 2])
-def test_candidates_are_none_for_one_or_two_exposures(n_groups: int) -> None:
-    assert visiting(line(*[0.0] * n_groups)) == []
 
 
 @given(

@@ -37,16 +37,15 @@ def test_contrast_is_not_blank_if_one_pixel_has_one_dark_frame(frames: int) -> N
     assert contrast_of(exposed(counts, frames)).blank is None
 
 
-def test_contrast_is_blank_without_photons() -> None:
-    assert contrast_of(exposed(np.zeros((4, 6)), 100)).blank == (
-        "no pixel detected a photon; is the shutter closed, or is it the wrong file?"
-    )
-
-
-def test_contrast_is_blank_if_no_pixel_was_seen() -> None:
+@pytest.mark.parametrize(
+    ("seen", "blank"),
+    [(True, "no pixel detected a photon; is the shutter closed, or is it the wrong file?"), (False, "no pixel was seen")],
+)
+def test_contrast_is_blank_without_photons_or_pixels(seen: bool, blank: str) -> None:
     exposure = exposed(np.zeros((4, 6)), 100)
-    exposure.flux[:], exposure.weight[:] = np.nan, 0
-    assert contrast_of(exposure).blank == "no pixel was seen"
+    if not seen:
+        exposure.flux[:], exposure.weight[:] = np.nan, 0
+    assert contrast_of(exposure).blank == blank
 
 
 N = 10
@@ -69,14 +68,17 @@ def require(
     require_tied(2, GROUPS, edges, tied, contrasts, disconnected)
 
 
-@pytest.mark.parametrize("lost", [(), (0,), (4,), (4, 5), (0, 3, 6, 9), (8, 9)])
-def test_require_tied_accepts_up_to_two_lost_exposures_in_a_row(lost: tuple[int, ...]) -> None:
-    require(lost)
-
-
-@pytest.mark.parametrize("lost", [(4, 5, 6), (0, 1, 2, 3, 4, 5, 6, 7)])
-def test_require_tied_accepts_the_largest_part_with_disconnected_largest(lost: tuple[int, ...]) -> None:
-    require(lost, disconnected="largest")
+@pytest.mark.parametrize(
+    ("lost", "disconnected"),
+    [
+        *((lost, "error") for lost in ((), (0,), (4,), (4, 5), (0, 3, 6, 9), (8, 9))),
+        *((lost, "largest") for lost in ((4, 5, 6), (0, 1, 2, 3, 4, 5, 6, 7))),
+    ],
+)
+def test_require_tied_accepts_two_lost_exposures_in_a_row_or_the_largest_part(
+    lost: tuple[int, ...], disconnected: Literal["error", "largest"]
+) -> None:
+    require(lost, disconnected=disconnected)
 
 
 def test_require_tied_accepts_a_single_group() -> None:
@@ -110,35 +112,37 @@ texture there.
     )
 
 
-def test_refusal_advises_larger_groups_at_low_signal_to_noise() -> None:
-    assert refusal((0, 1, 2, 7, 8, 9), DARK).splitlines()[-2:] == [
-        "In these exposures of 100 frames the scene varies 0.17 times as much as a pixel's photon noise: either they are too "
-        "dark (try larger groups, such as resample.with.group_size=200), or the scene has no texture there.",
-        "To go on with the largest part alone, set graph.disconnected to largest.",
-    ]
-
-
-def test_refusal_gives_no_ratio_where_there_is_no_signal() -> None:
-    assert refusal((4, 5, 6), Contrast(0.0)).splitlines()[-2] == (
-        "In these exposures of 100 frames the scene does not stand out from a pixel's photon noise: either they are too dark "
-        "(try larger groups, such as resample.with.group_size=200), or the scene has no texture there."
-    )
-
-
-def test_refusal_advises_both_at_medium_signal_to_noise() -> None:
-    faint = Contrast(0.8)
-    assert refusal((4, 5, 6), faint).splitlines()[-2] == (
-        "In these exposures of 100 frames the scene varies 0.8 times as much as a pixel's photon noise: either motion blurs "
-        "them (try smaller groups, such as resample.with.group_size=50), or they are too dark for what texture there is (try "
-        "larger ones, such as resample.with.group_size=200)."
-    )
-
-
-def test_refusal_lists_several_lost_spans() -> None:
-    assert refusal((0, 1, 2, 7, 8, 9)).splitlines()[0] == (
+@pytest.mark.parametrize(
+    ("contrast", "advice"),
+    [
+        (
+            DARK,
+            "varies 0.17 times as much as a pixel's photon noise: either they are too dark (try larger groups, such as "
+            "resample.with.group_size=200), or the scene has no texture there.",
+        ),
+        (
+            Contrast(0.0),
+            "does not stand out from a pixel's photon noise: either they are too dark (try larger groups, such as "
+            "resample.with.group_size=200), or the scene has no texture there.",
+        ),
+        (
+            Contrast(0.8),
+            "varies 0.8 times as much as a pixel's photon noise: either motion blurs them (try smaller groups, such as "
+            "resample.with.group_size=50), or they are too dark for what texture there is (try larger ones, such as "
+            "resample.with.group_size=200).",
+        ),
+    ],
+)
+def test_refusal_advises_by_the_signal_to_noise_ratio(contrast: Contrast, advice: str) -> None:
+    lines = refusal((0, 1, 2, 7, 8, 9), contrast).splitlines()
+    assert lines[0] == (
         "level 2: 6 of 9 pairs of exposures could not be located, "
         "so that frames 0 to 299 and frames 700 to 999 cannot be tied to the rest"
     )
+    assert lines[-2:] == [
+        f"In these exposures of 100 frames the scene {advice}",
+        "To go on with the largest part alone, set graph.disconnected to largest.",
+    ]
 
 
 def parts_refusal(parts: list[int]) -> str:
@@ -149,18 +153,25 @@ def parts_refusal(parts: list[int]) -> str:
     return str(caught.value).splitlines()[1]
 
 
-def test_refusal_lists_parts_by_their_frames_largest_first() -> None:
-    """An exposure without a located pair is no part."""
-    assert parts_refusal([1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2]) == (
-        "Parts that are tied together: frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099."
-    )
-    assert parts_refusal([0, 0, 1, 2, 3]) == "Parts that are tied together: frames 0 to 199."
+SIX = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
 
 
-def test_refusal_lists_six_parts_at_most() -> None:
-    shown = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
-    assert parts_refusal([part for part in range(6) for _ in range(2)]) == f"Parts that are tied together: {shown}."
-    assert parts_refusal([part for part in range(7) for _ in range(2)]) == f"Parts that are tied together: {shown}; and others."
+@pytest.mark.parametrize(
+    ("parts", "named"),
+    [
+        # An exposure without a located pair is no part.
+        (
+            [1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2],
+            "frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099.",
+        ),
+        ([0, 0, 1, 2, 3], "frames 0 to 199."),
+        ([part for part in range(6) for _ in range(2)], f"{SIX}."),
+        ([part for part in range(7) for _ in range(2)], f"{SIX}; and others."),
+    ],
+    ids=["largest first", "one", "six", "seven"],
+)
+def test_refusal_lists_six_parts_at_most(parts: list[int], named: str) -> None:
+    assert parts_refusal(parts) == f"Parts that are tied together: {named}"
 
 
 def test_refusal_lists_six_pairs_at_most() -> None:

@@ -8,7 +8,6 @@ import pytest
 from photonpano.geometry import (
     Camera,
     align_rotations,
-    apply,
     corners,
     from_parameters,
     jacobian,
@@ -16,6 +15,7 @@ from photonpano.geometry import (
     parameters,
     rotation_matrices,
     rotation_vectors,
+    transform_points,
 )
 from photonpano.motion.graph import GraphSolution, solve
 from photonpano.motion.model import MotionModel
@@ -58,8 +58,8 @@ def edges_of(rotations: FloatArray, rng: np.random.Generator, further: float = 0
 
 def error_deg(solution: GraphSolution, rotations: FloatArray) -> FloatArray:
     """Return the angles between true and estimated rotations, once aligned: (N,)."""
-    assert solution.turns is not None
-    found = solution.turns.rotations
+    assert solution.rotations is not None
+    found = solution.rotations.rotations
     away = np.swapaxes(rotations, -1, -2) @ align_rotations(found, rotations) @ found
     return np.rad2deg(np.linalg.norm(rotation_vectors(away), axis=1))
 
@@ -68,8 +68,8 @@ def error_deg(solution: GraphSolution, rotations: FloatArray) -> FloatArray:
 def test_rotations_and_focal_length_are_found_at_any_angle(degrees: float) -> None:
     rotations = turn(60, degrees)
     solution = solve(60, edges_of(rotations, np.random.default_rng(0)), 30, SHAPE, model=MotionModel("rotation"))
-    assert solution.turns is not None
-    error_focal = solution.turns.camera.focal_px / FOCAL_PX - 1
+    assert solution.rotations is not None
+    error_focal = solution.rotations.camera.focal_px / FOCAL_PX - 1
     std_focal = solution.assess().std_camera[0] / FOCAL_PX
     assert abs(error_focal) < 3 * std_focal < 0.03
     assert error_deg(solution, rotations).max() < np.rad2deg(3 * NOISE_PX / FOCAL_PX)
@@ -82,13 +82,13 @@ def test_expected_errors_of_rotations_hold() -> None:
     for seed in range(12):
         solution = solve(20, edges_of(rotations, np.random.default_rng(seed)), 10, SHAPE, model=MotionModel("rotation"))
         assessed = solution.assess()
-        assert solution.turns is not None
-        found = solution.turns.rotations
+        assert solution.rotations is not None
+        found = solution.rotations.rotations
         aligned = align_rotations(found, rotations) @ found
         away = camera.homographies(np.swapaxes(rotations, -1, -2) @ aligned)
-        errors.append(np.square(apply(away, corners(SHAPE)) - corners(SHAPE)).sum(axis=-1).mean(axis=-1))
+        errors.append(np.square(transform_points(away, corners(SHAPE)) - corners(SHAPE)).sum(axis=-1).mean(axis=-1))
         stds.append(assessed.std_px**2)
-        focals.append(solution.turns.camera.focal_px / FOCAL_PX - 1)
+        focals.append(solution.rotations.camera.focal_px / FOCAL_PX - 1)
         focal_stds.append(assessed.std_camera[0] / FOCAL_PX)
     assert np.mean(errors) / np.mean(stds) == pytest.approx(1, abs=0.6)
     assert np.std(focals) / np.mean(focal_stds) == pytest.approx(1, abs=0.5)
@@ -98,14 +98,14 @@ def test_known_focal_length_is_kept() -> None:
     rotations = turn(20, 60.0)
     edges = edges_of(rotations, np.random.default_rng(0))
     solution = solve(20, edges, 10, SHAPE, model=MotionModel("rotation", focal_px=FOCAL_PX))
-    assert solution.turns is not None
-    assert solution.turns.camera.focal_px == FOCAL_PX
+    assert solution.rotations is not None
+    assert solution.rotations.camera.focal_px == FOCAL_PX
     np.testing.assert_array_equal(solution.assess().std_camera, np.zeros(5))
 
 
 def test_auto_takes_rotations_of_a_camera_that_turns() -> None:
     solution = solve(20, edges_of(turn(20, 60.0), np.random.default_rng(0)), 10, SHAPE, model=MotionModel("auto"))
-    assert solution.turns is not None
+    assert solution.rotations is not None
     evidence = solution.compare()
     assert evidence is not None
     assert evidence.gain == pytest.approx(1, abs=0.5)
@@ -116,7 +116,7 @@ def test_auto_takes_homographies_where_no_rotation_explains_the_pairs() -> None:
     edges = edges_of(turn(20, 60.0), np.random.default_rng(0), further=0.004)
     plain = solve(20, edges, 10, SHAPE)
     solution = solve(20, edges, 10, SHAPE, model=MotionModel("auto"))
-    assert solution.turns is None
+    assert solution.rotations is None
     evidence = solution.compare()
     assert evidence is not None
     assert evidence.gain > 20

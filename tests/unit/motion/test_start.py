@@ -11,7 +11,7 @@ import pytest
 
 from photonpano import FrameSpan, Group
 from photonpano.context import Context
-from photonpano.motion.start import StartingMotion, starting_motion
+from photonpano.motion.tracking import StartingMotion, starting_motion
 
 SHAPE = (64, 96)
 LENGTH = 32

@@ -12,9 +12,8 @@ import pytest
 
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
-from photonpano.geometry import apply, inverse
-from photonpano.motion.velocity import ConstantVelocity, Velocity
-from photonpano.motion.velocity_search import FoundVelocity, find_velocity
+from photonpano.geometry import inverse, transform_points
+from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
 
 SHAPE = (64, 96)
 MIDDLE = np.array([47.5, 31.5])
@@ -63,7 +62,7 @@ def found(source: Any) -> FoundVelocity:
 def test_velocity_leaves_the_centre_where_it_is_and_adds_up() -> None:
     once, twice = TURN.after([3.0, 6.0])
     np.testing.assert_allclose(TURN.centre, CENTRE)
-    np.testing.assert_allclose(apply(once, CENTRE[None])[0], CENTRE)
+    np.testing.assert_allclose(transform_points(once, CENTRE[None])[0], CENTRE)
     np.testing.assert_allclose(once @ once, twice, atol=1e-9)
     np.testing.assert_allclose(SHIFT.after([5.0])[0][:2, 2], [3, -1])
 

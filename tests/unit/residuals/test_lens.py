@@ -13,7 +13,6 @@ from photonpano.merging.panorama import render
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.residuals.verdict import block_shifts
 
 SHAPE = (96, 128)
 
@@ -33,7 +32,7 @@ def found(k1: float):
         canvas = plan_canvas(motion, span, SHAPE, 1.0, 2**30)
         panorama = render(source, motion, span, canvas, 0.25, Context())
         residuals = measure(span, Predictions.of(source, panorama, canvas, motion, SHAPE), Context())
-        return lens_distortion(*block_shifts(residuals), motion.at(np.arange(span.stop)), SHAPE)
+        return lens_distortion(*residuals.block_shifts(), motion.at(np.arange(span.stop)), SHAPE)
 
 
 @pytest.mark.parametrize("k1", [-0.02, 0.02])

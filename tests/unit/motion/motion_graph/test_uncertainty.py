@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from photonpano.geometry import align_planes, apply, corners, from_parameters, inverse, normalised, parameters
+from photonpano.geometry import align_planes, corners, from_parameters, inverse, normalised, parameters, transform_points
 from photonpano.motion.graph import solve
 from photonpano.values import Edge
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def squared_errors(homographies: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return the mean square distance of the corners from where they should be, after the best alignment of planes: (N,)."""
     frame = corners(SHAPE)
-    missed = apply(np.linalg.inv(true) @ align_planes(homographies, true, SHAPE) @ homographies, frame) - frame
+    missed = transform_points(np.linalg.inv(true) @ align_planes(homographies, true, SHAPE) @ homographies, frame) - frame
     return np.sum(missed**2, axis=-1).mean(axis=-1)
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry import apply, corners, inverse, normalised
+from photonpano.geometry import corners, inverse, normalised, transform_points
 from photonpano.motion.level import FrameHomography
-from photonpano.motion.start import StartingMotion
+from photonpano.motion.tracking.start import StartingMotion
 from photonpano.values import FloatArray, Group, Homography
 
 
@@ -106,4 +106,4 @@ class Track:
         return self._groups[moving].reference - self._groups[fixed].reference
 
     def _shift(self, motion: Homography) -> FloatArray:
-        return np.asarray(apply(motion, self._middle[None])[0] - self._middle)
+        return np.asarray(transform_points(motion, self._middle[None])[0] - self._middle)

@@ -11,42 +11,100 @@ from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft, optimize
 
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
-from photonpano.geometry import apply, corners
+from photonpano.geometry import corners, transform_points
 from photonpano.merging import binned_mean, binning_of
-from photonpano.motion.velocity import Velocity, mean_shift
 from photonpano.protocols import Source
+from photonpano.robust import robust_std
 from photonpano.values import FloatArray, FrameSpan
 
-_SPANS = 128
-"""A capture is divided into at most this many spans."""
+_SPANS = 128  # a capture is divided into at most this many spans
 _FEWEST_SPANS = 8
-_LAGS = 4
-"""Spans that are up to this many apart are compared in the search over all velocities."""
-_FASTEST = np.radians(20)
-"""Fastest turn that is considered, in radians from span to span."""
-_FASTEST_SHIFT = 8.0
-"""Fastest shift that is considered, in binned pixels from span to span."""
+_LAGS = 4  # spans that are up to this many apart are compared in the search over all velocities
+_FASTEST = np.radians(20)  # fastest turn that is considered, in radians from span to span
+_FASTEST_SHIFT = 8.0  # fastest shift that is considered, in binned pixels from span to span
+# Standard deviations of the Gaussians between whose scales structure is compared, in binned pixels. Brightness that varies over
+# longer distances is light rather than scene, and has no sharp optimum.
 _FINE, _COARSE = 1.0, 4.0
-"""Standard deviations of the Gaussians between whose scales structure is compared, in binned pixels. Brightness that varies
-over longer distances is light rather than scene, and has no sharp optimum."""
+# Steps of the search, in binned pixels between the two farthest spans that are compared, at the border of the frame.
 _STEP_PX = 1.0
-"""Steps of the search, in binned pixels between the two farthest spans that are compared, at the border of the frame."""
+# Least height of the peak, in standard deviations over all velocities: of noise alone, the highest reaches 5 to 6.5.
 _SIGNIFICANT = 8.0
-"""Least height of the peak, in standard deviations over all velocities: of noise alone, the highest reaches 5 to 6.5."""
-_STD_PER_MEDIAN = 1.4826
-"""Standard deviation of Gaussian numbers over the median of their magnitudes."""
+# Contrast over its noise falls to 0.71 when windows double, if the photons of their halves do not fit together at all.
 _STEADY = 0.8
-"""Contrast over its noise falls to 0.71 when windows double, if the photons of their halves do not fit together at all."""
-_LEAST_PX = 1.0
-"""What moves by less over the whole capture, in binned pixels, stands still."""
+_LEAST_PX = 1.0  # what moves by less over the whole capture, in binned pixels, stands still
 _WITHOUT = "; if the velocity is not constant, leave out motion.start"
 
 Images = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Velocity:
+    """A constant velocity of the image.
+
+    Convention:
+        Points are (x, y), y down, integers are pixel centres. A positive turn is clockwise as one sees the picture.
+
+    Attributes:
+        turn: of the image, in radians per frame period.
+        shift: (2,) velocity of what is at `middle`, in px per frame period.
+        middle: (2,) point of the frame.
+    """
+
+    turn: float
+    shift: FloatArray
+    middle: FloatArray
+
+    @property
+    def centre(self) -> FloatArray:
+        """The (2,) point about which the image turns; not finite if it only shifts."""
+        x, y = self.shift
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.middle + np.divide([-y, x], self.turn))
+
+    def after(self, periods: ArrayLike) -> FloatArray:
+        """Return where the image is N times some frame periods later: (N, 3, 3) from pixels now to pixels then."""
+        periods = np.asarray(periods, dtype=np.float64)
+        angles = self.turn * periods
+        cosine, sine = np.cos(angles), np.sin(angles)
+        moved = np.zeros((len(periods), 3, 3))
+        moved[:, 0, 0], moved[:, 0, 1], moved[:, 1, 0], moved[:, 1, 1], moved[:, 2, 2] = cosine, -sine, sine, cosine, 1
+        shifts = periods[:, None] * mean_shift(self.shift, angles)
+        moved[:, :2, 2] = self.middle + shifts - moved[:, :2, :2] @ self.middle
+        return moved
+
+
+class ConstantVelocity:
+    """The trajectory of an image that moves at a constant velocity.
+
+    Args:
+        velocity: of the image.
+        reference: the frame whose homography is the identity.
+    """
+
+    def __init__(self, velocity: Velocity, reference: float) -> None:
+        self._velocity, self._reference = velocity, reference
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants, in frames, to the reference frame: (N, 3, 3)."""
+        return self._velocity.after(self._reference - np.asarray(frame_indices, dtype=np.float64))
+
+
+def mean_shift(shift: FloatArray, angle: ArrayLike) -> FloatArray:
+    """Return the mean of shifts that turn at a constant rate: (..., 2).
+
+    Args:
+        shift: (..., 2) at first.
+        angle: (...) in radians, by which they turn in all.
+    """
+    angle = np.asarray(angle, dtype=np.float64)
+    along, across = np.sinc(angle / np.pi), np.sinc(angle / 2 / np.pi) * np.sin(angle / 2)
+    x, y = shift[..., 0], shift[..., 1]
+    return np.stack([along * x - across * y, across * x + along * y], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +249,7 @@ def _searched(images: Images, context: Context) -> tuple[FloatArray, float]:
     found = list(context.in_order(partial(_fits, images, spectra, shape, velocities), turns.tolist()))
     fits = np.stack(found)
     best = np.unravel_index(int(fits.argmax()), fits.shape)
-    height = float(fits[best]) / max(_STD_PER_MEDIAN * float(np.median(np.abs(fits))), 1e-30)
+    height = float(fits[best]) / max(robust_std(fits), 1e-30)
     return np.array([turns[best[0]], *velocities[best[1]]]), height
 
 
@@ -257,7 +315,9 @@ class _Contrast:
     def moved_px(self, velocity: FloatArray) -> float:
         """Return how far corners of the frame move within a window, at most, in binned pixels."""
         there = Velocity(float(velocity[0]), velocity[1:], self.middle).after(self._times[[0, -1]])
-        return float(np.linalg.norm(apply(there[1], self._corners) - apply(there[0], self._corners), axis=-1).max())
+        return float(
+            np.linalg.norm(transform_points(there[1], self._corners) - transform_points(there[0], self._corners), axis=-1).max()
+        )
 
     @property
     def steps(self) -> FloatArray:

@@ -8,23 +8,15 @@ from functools import partial
 from itertools import chain, islice
 
 import numpy as np
-from scipy import fft
 
 from photonpano.context import Context
-from photonpano.locating import shift_of_spectra
-from photonpano.merging import binned_mean
-from photonpano.photometry import tapered
+from photonpano.motion.tracking.spans import shifts_between, span_image, spectra_of
 from photonpano.protocols import Source
-from photonpano.values import FloatArray, FluxImage, FrameSpan
+from photonpano.values import FloatArray, FrameSpan
 
-_PEAK_PX = 1.5
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
-_FEWEST = 6
-"""Fewer sums are not tracked."""
-DARK = 0.2
-"""Sums, and frames, with less than this share of the usual light show nothing."""
-_BLOCK = 32
-"""Sums that are tracked in one task."""
+_FEWEST = 6  # fewer sums are not tracked
+DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
+_BLOCK = 32  # sums that are tracked in one task
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,12 +67,6 @@ def track_sums(source: Source, runs: Sequence[Sequence[FrameSpan]], context: Con
             yield _joined(left, [_tracked_block(source, block) for block in _blocks_of(left)])[1]
 
 
-def sum_image(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the mean counts of a sum, binned: (h, w); where no pixel is valid, the mean of the others."""
-    image = binned_mean(source, span)
-    return np.nan_to_num(image, nan=float(np.nanmean(image)))
-
-
 def _blocks_of(spans: Sequence[FrameSpan]) -> list[tuple[FrameSpan, ...]]:
     return [tuple(spans[first : first + _BLOCK + 2]) for first in range(0, len(spans), _BLOCK)]
 
@@ -95,16 +81,12 @@ def _joined(
 
 def _tracked_block(source: Source, spans: Sequence[FrameSpan]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the light of the first 32 sums, and their shifts to the next and the second next; two further sums follow them."""
-    images = [sum_image(source, span) for span in spans]
-    window = tapered(images[0].shape)
-    spectra = [fft.rfft2(window * (image - image.mean())) for image in images]
+    images = [span_image(source, span) for span in spans]
+    spectra = spectra_of(images)
 
     def shifts(skip: int) -> FloatArray:
         # An image without texture does not shift.
-        found = [
-            shift_of_spectra(before, after, images[0].shape, _PEAK_PX, gaussian_peak=False)
-            for before, after in zip(spectra[:_BLOCK], spectra[skip:], strict=False)
-        ]
+        found = shifts_between(spectra[:_BLOCK], spectra[skip:], images[0].shape)
         return np.array([np.zeros(2) if shift is None else shift for shift in found]).reshape(-1, 2)
 
     return np.array([float(np.mean(image)) for image in images[:_BLOCK]]), shifts(1), shifts(2)

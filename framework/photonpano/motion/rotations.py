@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from photonpano.geometry import Camera, inverse, nearest_rotations, rotation_matrices, rotation_vectors, scaled_ahead
-from photonpano.motion.rotation_graph import Turns
+from photonpano.motion.rotation_graph import Rotations
 from photonpano.protocols import InterpolatesTurns, Interpolator, Trajectory
 from photonpano.values import FloatArray
 
+# Angle between the knots of the coarse path. Up to this angle, rotation vectors add up well enough for splines.
 _STEP_RAD = np.deg2rad(30)
-"""Angle between the knots of the coarse path. Up to this angle, rotation vectors add up well enough for splines."""
-_HOLD = 2.0
-"""Mean distances of the knots for which the coarse path goes on beyond its ends."""
+_HOLD = 2.0  # mean distances of the knots for which the coarse path goes on beyond its ends
 
 
-class TurningTrajectory:
+class RotationTrajectory:
     """A trajectory of rotations of one camera; that of the reference frame is the identity.
 
     Convention:
@@ -63,17 +62,17 @@ class ReferencedTrajectory:
         return scaled_ahead(self._to_reference @ self._free.at(frame_indices))
 
 
-def fit_turns(
+def fit_rotations(
     interpolator: Interpolator,
     instants: FloatArray,
-    knots: Turns,
+    knots: Rotations,
     information: FloatArray | None,
     checked: Callable[..., Trajectory],
 ) -> Trajectory:
     """Interpolate rotations by any angle.
 
-    A coarse path passes some of the knots, 30 degrees apart; the interpolator gets what the others turn beyond it, which is
-    small: as rotation vectors if it `InterpolatesTurns`, else as homographies.
+    A coarse path passes some of the knots, 30 degrees apart; the interpolator gets the rotations of the others beyond it,
+    which are small: as rotation vectors if it `InterpolatesTurns`, else as homographies.
 
     Args:
         interpolator: of the level.
@@ -83,10 +82,10 @@ def fit_turns(
         checked: wraps what the interpolator fitted, given the (N, 3, 3) `homographies` of the knots.
     """
     path, camera = CoarsePath(instants, knots.rotations), knots.camera
-    turns = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ knots.rotations)
-    homographies = scaled_ahead(camera.homographies(rotation_matrices(turns)))
+    vectors = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ knots.rotations)
+    homographies = scaled_ahead(camera.homographies(rotation_matrices(vectors)))
     if isinstance(interpolator, InterpolatesTurns):
-        fitted: Trajectory = _Turns(interpolator.fit_turns(instants, turns, information), camera)
+        fitted: Trajectory = _RotationVectors(interpolator.fit_turns(instants, vectors, information), camera)
     else:
         fitted = interpolator.fit(instants, homographies, None)
     return _Along(path, checked(fitted, homographies=homographies), camera)
@@ -132,7 +131,7 @@ class CoarsePath:
         return np.array(self._spline(instants).as_matrix())
 
 
-class _Turns:
+class _RotationVectors:
     """Rotation vectors as a trajectory of homographies."""
 
     def __init__(self, vectors: Callable[[FloatArray], FloatArray], camera: Camera) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from photonpano.geometry import Camera, rotation_matrices, rotation_vectors
 from photonpano.motion.model import MotionModel
-from photonpano.motion.rotation_graph import Turns
-from photonpano.motion.turning import TurningTrajectory, fit_turns
+from photonpano.motion.rotation_graph import Rotations
+from photonpano.motion.rotations import RotationTrajectory, fit_rotations
 from photonpano.protocols import Interpolator
 from photonpano.values import FloatArray, NotLocated
 from photonpano_core.configs import InterpolatorConfig
@@ -37,10 +37,12 @@ def rotations_at(instants: FloatArray, degrees: float) -> FloatArray:
     return rotation_matrices(angle[:, None] * [0, 1, 0]) @ rotation_matrices(wobble)
 
 
-def fitted(interpolator: Interpolator, instants: FloatArray, rotations: FloatArray, std_rad: float | None) -> TurningTrajectory:
+def fitted(
+    interpolator: Interpolator, instants: FloatArray, rotations: FloatArray, std_rad: float | None
+) -> RotationTrajectory:
     information = None if std_rad is None else np.broadcast_to(np.eye(3) / std_rad**2, (len(instants), 3, 3))
-    free = fit_turns(interpolator, instants, Turns(rotations, CAMERA), information, lambda found, **_: found)
-    return TurningTrajectory(free, CAMERA, 500)
+    free = fit_rotations(interpolator, instants, Rotations(rotations, CAMERA), information, lambda found, **_: found)
+    return RotationTrajectory(free, CAMERA, 500)
 
 
 def errors_px(found: FloatArray, true: FloatArray) -> FloatArray:

@@ -4,57 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from photonpano.context import Context
 from photonpano.geometry import translation
-from photonpano.locating import Follows, correlation_peaks, correlation_surface, follows
-from photonpano.merging import binned_mean, binning_of
+from photonpano.locating import Follows, correlation_peaks, correlation_surface
+from photonpano.merging import binning_of
 from photonpano.motion.pairs import lengths_of
 from photonpano.motion.timeline import Timeline
-from photonpano.photometry import tapered
+from photonpano.motion.tracking.spans import (
+    SHORTEST,
+    Spectrum,
+    following,
+    noise_of_difference,
+    shifted,
+    span_image,
+    spectra_of,
+    stabilised,
+)
 from photonpano.protocols import Source
+from photonpano.robust import robust_std
 from photonpano.values import FloatArray, FrameSpan, Group
 
-_SPANS = 16
-"""A window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur."""
-_SHORTEST = {"binary": 4, "intensity": 1}
-"""Frames of the shortest span: sums of fewer binary frames are mostly noise."""
-_PEAK_PX = 1.0
-"""Standard deviation of the peak of the phase correlation, in binned pixels."""
+_SPANS = 16  # a window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur
+_PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
+# Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
 _SIGNIFICANT = 7.0
-"""Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5."""
-_STD_PER_MEDIAN = 1.4826
-"""Standard deviation of Gaussian numbers over the median of their magnitudes."""
-_RIVAL = 0.6
-"""Peaks of at least this share of the highest one are kept as hypotheses."""
-_LEAST_EXTENT = 0.05
-"""A part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's."""
-_DISTINCT_PX = 4.0
-"""Two motions are told apart if they differ by this many binned pixels over a window."""
+_RIVAL = 0.6  # least height of the peak of a hypothesis, relative to the highest
+_LEAST_EXTENT = 0.05  # a part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's
+_DISTINCT_PX = 4.0  # least difference of two motions over a window, in binned pixels
+# Shift between spans that is exact enough, in binned pixels; spans are doubled until then.
 _EXACT_PX = 4.0
-"""Spans are doubled until the image moves by this many binned pixels from one to the next, which determines the speed."""
-_TRACKED_PX = 2.0
-"""A peak of doubled spans lies within this many binned pixels of twice the shift of single ones."""
-_CONTINUITY_PX = 1.0
-"""Standard deviation of the change of a shift, in binned pixels, from one window to the next."""
-_CONTINUITY_SHARE = 0.3
-"""It is at most this share of the difference of two hypotheses: the motions of scene and object go on."""
-_SLOWER = 3.0
-"""A motion is taken for granted, and one that is this many times as fast is not considered."""
-_TIE = 4.0
-"""Hypotheses whose log likelihoods differ by less than this cannot be told apart."""
+_TRACKED_PX = 2.0  # a peak of doubled spans lies within this many binned pixels of twice the shift of single ones
+_CONTINUITY_PX = 1.0  # standard deviation of the change of a shift, in binned pixels, from one window to the next
+_CONTINUITY_SHARE = 0.3  # its largest value, relative to the difference of two hypotheses
+_SLOWER = 3.0  # motions that are faster than the slowest by this factor are left out
+_TIE = 4.0  # difference of the log likelihoods of hypotheses below which both are kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """What the image may do within one window.
+    """Possible velocities of the image within one window.
 
     Attributes:
         velocities: (P, 2) in px of a frame per frame period, likeliest first.
@@ -130,7 +124,7 @@ def starting_motion(
         None if no window has a significant peak.
     """
     n_frames = source.info.n_frames
-    length = min(n_frames, max(2 * _SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
+    length = min(n_frames, max(2 * SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
     starts = np.rint(np.linspace(0, n_frames - length, max(1, n_frames // length))).astype(int).tolist()
     found = list(context.in_order(partial(_hypotheses, source, length), starts))
     found = list(context.in_order(partial(_with_those_near, source, length, starts, found), range(len(starts))))
@@ -153,20 +147,20 @@ def _hypotheses(source: Source, length: int, start: int, offered: Sequence[Float
         start: its first frame.
         offered: velocities that such a part may have beside its own, in px of a frame per frame period.
     """
-    short = max(_SHORTEST[source.info.kind], length // _SPANS)
+    short = max(SHORTEST[source.info.kind], length // _SPANS)
     spans = [FrameSpan(first, first + short) for first in range(start, start + length - short + 1, short)]
-    binned = np.stack([_binned(source, span) for span in spans])
-    window = _window(binned.shape[1:])
-    found = _velocities(binned, window)
+    binned = np.stack([span_image(source, span) for span in spans])
+    found = _velocities(binned)
     if found is None:
         return None
     shifts, heights, doubled = found
     heights, px_per_frame = heights / heights[0], binning_of(source) / short
     part = _following(source, binned, short, shifts[0])
     if part.suspect:
-        of_rest = _velocities(binned, window * part.rest)
+        of_rest = _velocities(binned, part.rest)
         rivals = [each / px_per_frame for each in offered] + ([] if of_rest is None else [of_rest[0][0]])
-        extents = [_extents(part, _following(source, binned, short, rival)) for rival in rivals]
+        others = [_following(source, binned, short, rival) for rival in rivals]
+        extents = [(part.extent_beyond(other), other.extent_beyond(part)) for other in others]
         distinct = [np.linalg.norm(rival - shifts[0]) * len(binned) > _DISTINCT_PX for rival in rivals]
         shares = [
             other / max(own, other, 1e-12) if apart else 0.0 for (own, other), apart in zip(extents, distinct, strict=True)
@@ -193,11 +187,6 @@ def _with_those_near(
     return _hypotheses(source, length, starts[index], [velocity for each in near for velocity in each.velocities])
 
 
-def _extents(part: Follows, other: Follows) -> tuple[float, float]:
-    """Return the extents of the parts of an image that clearly follow one of two motions."""
-    return part.extent_beyond(other), other.extent_beyond(part)
-
-
 def _following(source: Source, binned: NDArray[np.float32], n_frames: int, shift: FloatArray) -> Follows:
     """Find the part of a window that follows a shift between successive spans: compare its first third with its last.
 
@@ -207,36 +196,25 @@ def _following(source: Source, binned: NDArray[np.float32], n_frames: int, shift
         n_frames: of a span.
         shift: (x, y) in binned pixels.
     """
-    height, width = binned.shape[1:]
     middle, third = (len(binned) - 1) / 2, max(1, len(binned) // 3)
-
-    def along(index: int) -> NDArray[np.float32]:
-        there = translation(*(shift * (index - middle)))[:2]
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(binned[index], there, (width, height), flags=flags, borderValue=np.nan), np.float32)
-
-    frames = float(n_frames * third * binning_of(source) ** 2)
-    first, last = (
-        source.response.stabilised(source.response.flux(np.mean([along(index) for index in part], axis=0), frames), frames)
-        for part in (range(third), range(len(binned) - third, len(binned)))
-    )
-    noise = 2 * float(source.response.stabilised_std(frames)) ** 2
-    seen = np.isfinite(first) & np.isfinite(last)
-    return follows(np.nan_to_num(first), np.nan_to_num(last), np.where(seen, np.float32(noise), np.float32(np.inf)))
+    aligned = [shifted(image, shift * (index - middle)) for index, image in enumerate(binned)]
+    means = (np.mean(part, axis=0) for part in (aligned[:third], aligned[-third:]))
+    first, last = (stabilised(source, mean, n_frames * third) for mean in means)
+    return following(first, last, noise_of_difference(source, n_frames * third))
 
 
-def _velocities(images: NDArray[np.float32], window: NDArray[np.float32]) -> tuple[FloatArray, FloatArray, int] | None:
+def _velocities(
+    images: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+) -> tuple[FloatArray, FloatArray, int] | None:
     """Return the (P, 2) shifts between successive images, in their pixels, the heights of the peaks, and how many were summed.
 
     Images are summed in twos until a peak is significant; then on, to make the shift exact, as long as the peak is found again.
 
     Args:
         images: (S, h, w).
-        window: (h, w) weights of their pixels.
+        weight: (h, w) of their pixels, 1 by default.
     """
-    weight = window / max(float(window.sum()), 1e-12)
-    spectra = np.array([fft.rfft2(window * (image - float((weight * image).sum()))) for image in images])
-    shape, doubled = images.shape[1:], 1
+    spectra, shape, doubled = spectra_of(images, weight), images.shape[1:], 1
     while len(spectra) >= 2:
         surface = _surface(spectra, shape)
         if surface is not None and surface.max() >= _SIGNIFICANT:
@@ -246,7 +224,7 @@ def _velocities(images: NDArray[np.float32], window: NDArray[np.float32]) -> tup
     return None
 
 
-def _refined(spectra: NDArray[np.complexfloating], shape: tuple[int, ...], shifts: FloatArray) -> FloatArray:
+def _refined(spectra: Spectrum, shape: tuple[int, ...], shifts: FloatArray) -> FloatArray:
     """Return (P, 2) shifts more exactly, from sums of more spans, whose shifts are larger."""
     refined, doubled, moving = shifts.copy(), 1, np.ones(len(shifts), dtype=bool)
     while len(spectra) >= 4 and moving.any():
@@ -265,14 +243,14 @@ def _refined(spectra: NDArray[np.complexfloating], shape: tuple[int, ...], shift
     return refined
 
 
-def _surface(spectra: NDArray[np.complexfloating], shape: tuple[int, ...]) -> FloatArray | None:
+def _surface(spectra: Spectrum, shape: tuple[int, ...]) -> FloatArray | None:
     """Return the phase correlation of successive images, in standard deviations of its noise."""
     surface = correlation_surface((spectra[1:] * spectra[:-1].conj()).sum(axis=0), shape, _PEAK_PX)
-    # The median, since a scene that repeats has many peaks.
-    return None if surface is None else surface / (_STD_PER_MEDIAN * max(float(np.median(np.abs(surface))), 1e-12))
+    # Robust, since a scene that repeats has many peaks.
+    return None if surface is None else surface / max(robust_std(surface), 1e-12)
 
 
-def _summed_in_twos(spectra: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+def _summed_in_twos(spectra: Spectrum) -> Spectrum:
     even = len(spectra) // 2 * 2
     return np.asarray(spectra[:even:2] + spectra[1:even:2])
 
@@ -308,14 +286,3 @@ def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:
     change = before.velocities[:, None] - after.velocities
     std = min(_CONTINUITY_PX * max(before.px_per_frame, after.px_per_frame), _CONTINUITY_SHARE * min(before.apart, after.apart))
     return np.asarray(-np.sum((change / std) ** 2, axis=-1) / 2)
-
-
-def _binned(source: Source, span: FrameSpan) -> NDArray[np.float32]:
-    """Return the mean of a span in binned pixels; where no pixel is valid, the mean of the others."""
-    mean = binned_mean(source, span)
-    return np.where(np.isnan(mean), np.nanmean(mean), mean)
-
-
-@cache
-def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    return tapered(shape)

@@ -17,7 +17,7 @@ from photonpano.geometry import (
 )
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.averaging import Averaging
-from photonpano.merging.bent import BentGrid, laid
+from photonpano.merging.canvas_noise import laid
 from photonpano.testing.captures import MemorySource
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
@@ -154,14 +154,11 @@ def test_runs_of_chunks_add_up_also_across_the_seam(camera: Camera, run: int, mo
     assert np.allclose(in_runs.weight, at_once.weight, atol=1e-3)
 
 
-def test_bent_warp_onto_a_plane_is_that_of_opencv() -> None:
+def test_remap_onto_a_plane_is_that_of_opencv() -> None:
     image = np.random.default_rng(0).random(SHAPE, np.float32)
     matrix = translation(-20, 10) @ CAMERA.homographies(rotation_matrices([0.05, 0.1, 0.2]))
     none = Camera(CAMERA.matrix, np.array([1e-12, 0, 0, 0]))
     canvas = Canvas(60, 80, np.eye(3))
-    (at,) = BentGrid(canvas, none).footprints(matrix[None], SHAPE)
-    assert at.columns
-    assert at.rows
     source = seen_through(MemorySource((image * 255).astype(np.uint8)[None]), none)
     photons = accumulate(source, [Chunk(FrameSpan(0, 1), matrix)], np.eye(3), canvas.shape)
     pixels = (image * 255).astype(np.uint8).astype(np.float32)
@@ -202,7 +199,7 @@ def test_corrections_are_laid_on_a_sphere_as_counts_are() -> None:
     photons = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
     motions = CAMERA.homographies(turns)
     images = [image.astype(np.float32), np.ones(SHAPE, np.float32)]
-    sums, share = laid(canvas, LENS, motions, images, np.ones(SHAPE, np.float32))
+    sums, share = laid(canvas, LENS, motions, images, np.ones(SHAPE, np.bool_))
     assert np.allclose(sums[0], photons.counts, rtol=1e-4, atol=0.1)
     assert np.allclose(share, photons.weight, atol=1e-3)
     assert np.allclose(sums[1], share, atol=1e-3)
