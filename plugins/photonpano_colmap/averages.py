@@ -36,26 +36,19 @@ from photonpano_colmap.posing.merging import lit_counts
 from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
 from photonpano_colmap.reversal import Readings
 
-_PHOTONS = 60.0
-"""Photons of a pixel in an average: with fewer, keypoints are noise."""
-_BLUR_PX = 6.0
-"""Blur of an average by motion that keypoints bear; the less of both decides."""
-_MOST = 150
-"""Averages of a capture, at most: matching all pairs takes minutes."""
-_FEWEST = 24
-"""Averages of a capture, at least, if it is long enough."""
+_PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise
+_BLUR_PX = 6.0  # motion blur of an average that keypoints tolerate; the shorter average of both limits is taken
+_MOST = 150  # most averages of a capture: matching all pairs of more takes many minutes
+_FEWEST = 24  # fewest averages of a capture that is long enough
 _SHORTEST = 4
-_TEXTURE = 60, 15
-"""Keypoints of an average, and matches with another one, below which it shows too little texture."""
+_TEXTURE = 60, 15  # keypoints of an average, and matches with another, below which there is too little texture
+# Fraction of matched keypoints below which noise or blur, not the path of the camera, is why there are no poses.
 _FEW_MATCH = 0.25
-"""Share of keypoints that match another average, below which noise or blur, and not the path, is why there are no poses."""
 _ANOTHER_SIZE = "choose a larger pose.with.group_size for less noise, or a smaller one for less blur"
-_FOCAL_SHARE = 0.02
-"""Expected error of a focal length that was found, relative to it, above which the poses are doubtful."""
+_FOCAL_SHARE = 0.02  # relative standard error of an estimated focal length above which poses are doubtful
+# Relative error of an estimated focal length that residuals do not show: blur shifts keypoints alike in many averages.
 _FOCAL_BIAS = 0.01
-"""Error of a found focal length that residuals do not show, relative to it: blur moves keypoints alike in many averages."""
-_PLANE = 0.01
-"""Smallest extent of the points, relative to their largest, below which they lie in a plane."""
+_PLANE = 0.01  # points lie in a plane if their smallest extent is below this fraction of the largest
 _SHOWN_PIECES = 4
 
 
@@ -333,8 +326,8 @@ def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: F
     return np.where(located, np.sqrt(at_poses**2 + _MISSED_SHARE * missed), np.nan)
 
 
+# Interpolation error of the spline between poses, as a fraction of the variance of leave-one-out errors.
 _MISSED_SHARE = 0.5
-"""Share of the variance about a spline with a gap that one without a gap misses between poses."""
 
 
 def _require_texture(found: Reconstruction) -> None:

@@ -9,8 +9,7 @@ from pydantic import Field
 from photonpano import Config
 from photonpano.locating import KeypointConfig
 
-MIN_AVERAGES = 5
-"""Averages of a capture, at least: a spline through fewer poses would be a guess."""
+MIN_AVERAGES = 5  # a spline through fewer poses would be a guess
 
 
 class PycolmapTwoViewConfig(KeypointConfig):

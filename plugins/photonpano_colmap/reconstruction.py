@@ -21,14 +21,10 @@ from photonpano import CameraGuess, FloatArray
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.reversal import Readings, likelier_reading
 
-_FIRST_CENTRE = 0.5
-"""Position of the first pixel's centre in COLMAP; ours is 0."""
-_SEEDS = 2**31
-"""Seeds of the library are below this."""
-_USUAL_FOCAL = 1.2
-"""Focal length to start from where none is given, as a share of the longer side of a frame."""
-_START_ANGLE_DEG = 4.0
-"""Parallax of the pair that COLMAP starts with: captures are short, so this is less than its own 16 degrees."""
+_FIRST_CENTRE = 0.5  # position of the centre of the first pixel in COLMAP; ours is 0
+_SEEDS = 2**31  # seeds of the library are below this
+_USUAL_FOCAL = 1.2  # initial focal length where none is given, in longer sides of a frame
+_START_ANGLE_DEG = 4.0  # parallax of COLMAP's initial pair; its own 16 degrees are too much for short captures
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,14 +16,10 @@ from scipy.spatial.transform import Rotation
 from photonpano import FloatArray
 from photonpano_colmap.pose_spline import positions_of
 
-_NEAREST = 0.1
-"""Reversed points are at least this far away, as a share of the median depth."""
-_FARTHEST_OFF_PX = 4.0
-"""Points further than this from where images show them are left out of a reversed reading, as COLMAP leaves them out."""
-_SAME = 0.2
-"""Two readings agree if turns of the camera differ by less than this share of them."""
-_ALIKE = 0.9
-"""Neither reading is likelier if the residuals of the better one are above this share of the other's."""
+_NEAREST = 0.1  # minimum distance of reversed points, in median depths
+_FARTHEST_OFF_PX = 4.0  # points of a reversed reading with a larger residual are removed, as COLMAP removes them
+_SAME = 0.2  # two readings agree if their rotations differ by less than this fraction
+_ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is above this
 
 
 @dataclass(frozen=True, slots=True)

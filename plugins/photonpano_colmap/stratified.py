@@ -28,8 +28,7 @@ from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import Path
 
-_MISSED = 0.5
-"""Share of the last change of a frame's pose, beyond that of its exposures, that the next level would change it by."""
+_MISSED = 0.5  # expected next pose update, as a fraction of the last one
 
 
 class StratifiedEstimator:

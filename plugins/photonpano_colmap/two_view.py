@@ -21,13 +21,10 @@ from photonpano.locating import (
 )
 from photonpano_colmap.configs import PycolmapTwoViewConfig
 
-CENTRE_OF_FIRST_PIXEL = 0.5
-"""Position of the first pixel's centre in COLMAP; ours is 0."""
-MAX_TRIALS = 10_000
-"""RANSAC finds a homography with 20 % inliers in half as many trials; unrelated images would take far more."""
+CENTRE_OF_FIRST_PIXEL = 0.5  # position of the centre of the first pixel in COLMAP; ours is 0
+MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
 _SIFT = pycolmap.FeatureExtractorType.SIFT
-_SEEDS = 2**31
-"""Seeds of the library are below this."""
+_SEEDS = 2**31  # seeds of the library are below this
 
 
 @dataclass(frozen=True, slots=True, eq=False)

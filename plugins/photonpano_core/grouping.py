@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from photonpano import FrameSpan, Group, InputError, StreamInfo
 from photonpano_core.configs import GroupedConfig
 
-_SHORTEST = {"binary": 16, "intensity": 1}
-"""Frames of the shortest group that `group_size: auto` chooses: fewer binary frames are too noisy."""
-_SHORTEST_END = 4
-"""Frames of the shortest group at the ends of the capture, which may be noisier, since there is no other measurement there."""
+_SHORTEST = {"binary": 16, "intensity": 1}  # frames of the shortest group of `group_size: auto`; fewer are too noisy
+_SHORTEST_END = 4  # frames of the shortest group at an end of the capture, where nothing else is measured
 
 
 def shortest_of(stream: StreamInfo) -> int:

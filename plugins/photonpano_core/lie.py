@@ -14,8 +14,7 @@ from photonpano_core.trajectories import GroupTrajectory, interpolating_spline
 
 DEGREE = 3
 MAX_ITERATIONS = 50
-TOLERANCE_PX = 1e-7
-"""Converged when the residual at the knots, at the corners of the frame, is below this."""
+TOLERANCE_PX = 1e-7  # converged when the residual of the knots, at the corners of the frame, is below this
 
 
 class LieInterpolator:

@@ -46,14 +46,11 @@ from photonpano.reading import (
     unpacked_content,
 )
 
-_READ_BYTES = 4 * 1024**2
-"""Bytes of the frames that are read at once."""
+_READ_BYTES = 4 * 1024**2  # bytes of the frames that are read at once
 
 
-_CHECKED = 16
-"""Frames whose values are checked before a run."""
-_PLAIN = re.compile(r"[\w./~+-]+")
-"""Paths that YAML takes without quotes."""
+_CHECKED = 16  # frames whose values are checked before a run
+_PLAIN = re.compile(r"[\w./~+-]+")  # paths that YAML takes without quotes
 _NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
 
 

@@ -12,16 +12,12 @@ from photonpano.geometry import BLOCK_FRAMES, apply, corners, inverse, normalise
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.uneven_noise import separated
 
-_FEWEST_SPANS = 16
-"""Fewer spans than this have no spectrum."""
+_FEWEST_SPANS = 16  # fewest spans that have a spectrum
+# The light goes out, as between two flickers, if 5 % of the steps have 10 times the usual variance.
 _DARK, _DARK_SHARE = 10.0, 0.05
-"""The light goes out, as between two flickers, if the variance of this share of the steps is this many times the usual one."""
-_SMOOTH_SPANS = 16.0
-"""Standard deviation of the Gaussian that makes a trajectory smooth, in spans."""
-_NAMED_LINES = 3
-"""Frequencies that a summary names at most."""
-_NAMED_SHARE = 0.003
-"""A frequency is named if its peak has at least this share of the power."""
+_SMOOTH_SPANS = 16.0  # standard deviation of the Gaussian that smooths a trajectory, in spans
+_NAMED_LINES = 3  # most frequencies named in a summary
+_NAMED_SHARE = 0.003  # a frequency is named if its peak has at least this fraction of the power
 
 
 class ShortSpansRefiner:

@@ -10,12 +10,10 @@ import numpy as np
 
 from photonpano import FloatArray
 
-_TERMS = 19
-"""Terms of the exponential series; for eigenvalues below 1 the remainder is below 1 / 19!, a rounding error."""
-_SMALL = 0.2
-"""Below this eigenvalue of the logarithm, eight terms of its series are exact to rounding."""
+_TERMS = 19  # of the exponential series; for eigenvalues below 1 the remainder is below 1 / 19!, a rounding error
+_SMALL = 0.2  # eigenvalue of the logarithm below which eight terms of its series are exact to rounding
+# Newton iterations of a square root, which converge quadratically
 _ITERATIONS = 10
-"""Newton iterations of a square root, which converge quadratically."""
 
 
 def unimodular(matrices: FloatArray) -> FloatArray:

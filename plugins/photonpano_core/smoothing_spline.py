@@ -14,21 +14,18 @@ from photonpano.geometry import apply, corners, from_parameters, jacobian, param
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.trajectories import ParameterTrajectory, SplinePath, interpolating_spline
 
-ORDER = 3
-"""Order of the derivative that is penalised. Parabolas, which fit any three knots, are not penalised."""
+ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three knots, are not
+# Candidates for the scale of the jerk, from a parabola to interpolation. The number of knots averaged grows with the sixth
+# root.
 _SCALES = np.logspace(-10, 10, 41)
-"""Candidates for the scale of the jerk: from a parabola to interpolation. The number of knots that are averaged grows with the
-sixth root."""
+# Candidates for the noise variance, relative to the squared distance of the quiet modes from a parabola.
 _NOISES = np.logspace(-16, 0, 129)
-"""Candidates for the variance of the noise, relative to the squared distance of the quiet modes from a parabola."""
-_TINY = 1e-200
-"""Floor on the noise variance, for knots that lie on a parabola exactly."""
-_MIN_INFORMATION = 1e-8
-"""Floor on the information eigenvalues of a knot, relative to the largest."""
+_TINY = 1e-200  # floor on the noise variance, for knots that lie on a parabola exactly
+_MIN_INFORMATION = 1e-8  # floor on the information eigenvalues of a knot, relative to the largest
+# Orthonormal map from the corners' coordinates to modes in px: shift, twist, stretch, shear.
 _TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
-"""Orthonormal map from the corners' coordinates to modes (shift, twist, stretch, shear), which so are in px, too."""
+# the twists, which a shaking camera hardly excites: it changes perspective less than shift, roll and scale
 _QUIET = [2, 3]
-"""The twists: modes that a shaking camera hardly excites, since it changes shift, roll and scale more than perspective."""
 
 
 class SmoothingSplineInterpolator:

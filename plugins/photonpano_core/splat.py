@@ -22,10 +22,8 @@ from photonpano.merging import PhotonSum, gain_image
 from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 from photonpano_core.splatting import add_coverage, splat
 
-_READ_BYTES = 1024**2
-"""Bytes of unpacked frames that are read at a time: about the cache of a core."""
-_RIGID = 0.01
-"""Bound on the deviation of the pixel spacing from 1 px, below which splat weights sum to 1 within its square."""
+_READ_BYTES = 1024**2  # unpacked frames read at a time: about the cache of a core
+_RIGID = 0.01  # deviation of the pixel spacing from 1 px below which splat weights sum to 1 within its square
 
 
 class SplatMerger:

@@ -9,12 +9,9 @@ from scipy.ndimage import uniform_filter
 
 from photonpano import BoolArray, FloatArray
 
-_ROUNDS = 6
-"""Steps of expectation and maximisation that estimate a spectrum; more change the motion by less than its noise."""
-_UNKNOWN = 1e6
-"""Variance of an unknown value, relative to the median of the others."""
-_NEIGHBOURS = 3, 5
-"""Windows, and frequencies, over which the power is averaged to test it."""
+_ROUNDS = 6  # steps of expectation maximisation; more change the motion by less than its noise
+_UNKNOWN = 1e6  # variance of an unknown value, relative to the median of the others
+_NEIGHBOURS = 3, 5  # windows and frequencies over which the power is averaged to test it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,9 +46,9 @@ def _moments_of_products() -> FloatArray:
     return np.stack(along, axis=2).reshape(64, 75)
 
 
+# Coefficients of moments: (8, 9) of those of `residuals_and_moments` along x and y in the derivative by a parameter, and (64,
+# 75) of those of `derivative_moments` in the second derivative by two parameters.
 MOMENTS_X, MOMENTS_Y, _MOMENTS_OF_PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _moments_of_products()
-"""Coefficients of moments: (8, 9) of those of `residuals_and_moments` along x and y in the derivative by a parameter, and
-(64, 75) of those of `derivative_moments` in the second derivative by two parameters."""
 
 
 @compiled

@@ -27,24 +27,16 @@ from photonpano_direct.pyramid import Pyramid, pyramid_of
 from photonpano_direct.similarity import similarity_under
 from photonpano_direct.small_matrices import rescaled
 
-_EXACT_PX = 0.1
-"""Coarser layers are not considered if the expected error of a corner is below this."""
-_COARSE_TOLERANCE = 12
-"""Tolerance of the coarser layers, which only initialise the finest, relative to `converged_px`."""
-_PEAK_PX = 0.5
-"""Standard deviation of the peaks of the phase correlation, px of the coarsest layer."""
-_RIVAL = 0.7
-"""Peaks of at least this share of the highest one are hypotheses, too."""
-_RESTRICTED = 2
-"""A motion that is tried is aligned twice, each time where the last one fits."""
-_TRUST = 3.0
-"""The part that follows the motion known so far counts three times: many pairs have gone into that motion."""
+_EXACT_PX = 0.1  # expected corner error below which coarser layers are not considered
+_COARSE_TOLERANCE = 12  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`
+_PEAK_PX = 0.5  # standard deviation of the peaks of the phase correlation, px of the coarsest layer
+_RIVAL = 0.7  # peaks of at least this fraction of the highest are hypotheses, too
+_RESTRICTED = 2  # alignments of a hypothesis, each restricted to where the last one fits
+_TRUST = 3.0  # weight of the part that follows the motion known so far, which many pairs have determined
+# Corner error above which a pair does not determine eight parameters; for a rotating camera, three are estimated instead.
 _DETERMINED_PX = 1.0
-"""A pair whose corners are less certain than this does not determine eight parameters; of a camera that turns, it is aligned
-again with three."""
+# Largest residual that different motion blur explains, as a fraction of the contrast; in much light, many times the noise.
 _BLUR_DIFFERENCE = 0.1
-"""Largest residual that different motion blur explains, as a fraction of the contrast. In much light this is many times the
-photon noise."""
 
 
 class _Descent(NamedTuple):

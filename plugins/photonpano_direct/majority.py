@@ -19,16 +19,12 @@ if TYPE_CHECKING:
     from photonpano_direct.layers import Layer
     from photonpano_direct.pyramid import Pyramid
 
-JUDGED = 1
-"""Number of the layer on which parts are compared: coarse, so that neither noise nor a small error of the motion matters."""
-_DIFFERENT = 0.5
-"""Largest misfit of a pixel in a search for shifts, relative to its usual one."""
+JUDGED = 1  # layer on which parts are compared: coarse, so that noise and small errors of the motion do not matter
+_DIFFERENT = 0.5  # cap on the residual of a pixel in a search for shifts, relative to its usual one
+# Side of the squares compared in a search for shifts, and spacing of the shifts that are tried.
 _SEARCH_PX, _NEAR_PX = 5, 2
-"""Side of the squares that are compared in a search for shifts, and the distance of two shifts that are tried, px."""
-_LEAST_SEEN = 0.3
-"""Least share of the template that both images show under a shift."""
-_TRIED = 3
-"""Number of shifts that a search returns."""
+_LEAST_SEEN = 0.3  # minimum overlap under a shift, as a fraction of the template
+_TRIED = 3  # number of shifts that a search returns
 
 
 def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follows:

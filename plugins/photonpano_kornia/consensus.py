@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from photonpano import Homography, Located, NotLocated
 from photonpano.locating import Matches, MatchingConfig, consensus_of, motion_from_points
 
-_CONFIDENCE = 0.999
-"""RANSAC stops once it has found the best motion with this probability."""
+_CONFIDENCE = 0.999  # probability of having found the best motion at which RANSAC stops
 
 
 def motion_of(

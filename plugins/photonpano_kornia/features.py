@@ -18,8 +18,7 @@ from photonpano_kornia.configs import KorniaFeaturesConfig
 from photonpano_kornia.consensus import motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
 
-_FAR = 1e3
-"""Descriptor distance assigned to keypoints beyond the search radius; true distances are at most 2."""
+_FAR = 1e3  # descriptor distance of keypoints beyond the search radius; true ones are at most 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
 
     from photonpano import Locator, StageContext, StreamInfo
 
-REQUIRES = (Requirement("kornia", "photonpano[kornia]"),)
-"""kornia installs torch."""
+REQUIRES = (Requirement("kornia", "photonpano[kornia]"),)  # kornia installs torch
 
 
 @hookimpl

@@ -17,8 +17,7 @@ from photonpano_kornia.consensus import motion_of
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 from photonpano_kornia.weights import loftr_from
 
-_SMALLEST_SIDE = 32
-"""Least side of an image in px: four of the cells that LoFTR matches first."""
+_SMALLEST_SIDE = 32  # px: four of the cells that LoFTR matches first
 
 
 class Picture(NamedTuple):

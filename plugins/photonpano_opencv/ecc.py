@@ -20,8 +20,7 @@ from photonpano.locating import (
 )
 from photonpano_opencv.configs import OpencvEccConfig
 
-_SMALLEST_SIDE = 32
-"""The images of the pyramid have at least this many pixels along a side."""
+_SMALLEST_SIDE = 32  # minimum side of the images of the pyramid, px
 
 
 class EccLocator:

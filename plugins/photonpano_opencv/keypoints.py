@@ -14,10 +14,9 @@ from photonpano.geometry import apply, why_implausible
 from photonpano.locating import KeypointConfig, Matches, PointLocator, consensus_of, motion_from_points
 from photonpano_opencv.matching import match_everywhere, match_nearby
 
-GUIDED_RADII = (1.5, 1.0)
-"""Search radii around the positions that the current fit predicts, one a round, in units of `threshold_px`."""
+GUIDED_RADII = (1.5, 1.0)  # of the search around predicted positions, one a round, in units of `threshold_px`
+# Lowe's ratio within these radii
 GUIDED_RATIO = 0.9
-"""Lowe's ratio within these radii."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

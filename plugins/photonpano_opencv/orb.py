@@ -14,9 +14,9 @@ from photonpano_opencv.configs import OpencvOrbConfig
 from photonpano_opencv.keypoints import KeypointMatcher, Keypoints, detected
 from photonpano_opencv.matching import unit_bits
 
+# Standard deviation of rounding to whole pixels. Where a camera only shifts, all keypoints are rounded alike, so that the
+# error does not decrease with the number of matches.
 _ROUNDING_PX = math.sqrt(1 / 12)
-"""Standard deviation of rounding to whole pixels. Where a camera only shifts, all keypoints are rounded alike, so that the
-error does not decrease with the number of matches."""
 
 
 class OrbLocator(KeypointMatcher):

@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 
 ItemT = TypeVar("ItemT")
 
-_MOST = 16
-"""Frames of a file, or files of a capture, that are looked at, and a few more."""
+_MOST = 16  # about how many frames of a file, or files of a capture, are read
 
 
 def spread(items: Sequence[ItemT]) -> Sequence[ItemT]:

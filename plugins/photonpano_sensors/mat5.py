@@ -24,11 +24,10 @@ Stream: TypeAlias = IO[bytes] | io.BufferedReader
 _HEADER_BYTES = 128
 _MATRIX, _COMPRESSED = 14, 15
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+# classes of numeric arrays; the others are cells, structures, objects, text and sparse matrices
 _NUMBERS = range(6, 16)
-"""Classes of numeric arrays; the others are cells, structures, objects, text and sparse matrices."""
 _COMPLEX = 0x0800
-_MOST_BYTES = 1024
-"""Upper limit of the size of a name or of dimensions."""
+_MOST_BYTES = 1024  # upper limit of the size of a name or of dimensions
 _BLOCK_BYTES = 256 * 1024
 
 

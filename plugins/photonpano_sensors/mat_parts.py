@@ -20,8 +20,7 @@ from photonpano_sensors.mat_file import MatFrames, is_hdf
 
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
-_MOST_PARTS = 4
-"""Parts kept in memory, eight pixels to a byte: compressed files can only be read from the beginning."""
+_MOST_PARTS = 4  # packed parts kept in memory: compressed files can only be read from the beginning
 
 
 class MatPartsConfig(Config):

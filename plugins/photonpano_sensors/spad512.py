@@ -10,8 +10,8 @@ from photonpano_sensors.bin_files import BinConfig, arrived, checked, opened, si
 
 LAYOUT = FrameLayout((512, 512), (512, 64))
 FOOTER_BYTES = 4
+# Sizes by which a file is recognised. 256 frames without a footer have the size of files of SwissSPAD2.
 _FILE_SIZES = {1000 * LAYOUT.stored_bytes: "1000 frames", 256 * LAYOUT.stored_bytes + FOOTER_BYTES: "256 frames and a footer"}
-"""Sizes by which a file is recognised. 256 frames without a footer have the size of files of SwissSPAD2."""
 
 
 class Spad512Config(BinConfig):

@@ -15,11 +15,9 @@ from photonpano.reading import BinarySource, FrameLayout, files_in, objections, 
 
 _SIZE = 512
 _PIXELS = _SIZE**2
-_END = _PIXELS
-"""The address that ends a frame."""
+_END = _PIXELS  # the address that ends a frame
 _WORD = np.dtype("<u4")
-_MOST_FRAMES = 32
-"""Frames unpacked at once."""
+_MOST_FRAMES = 32  # frames unpacked at once
 _BLOCK_WORDS = 1024**2
 
 

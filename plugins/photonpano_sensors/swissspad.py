@@ -15,14 +15,10 @@ from photonpano_sensors.bin_files import BinConfig, arrived, checked, opened, si
 Pixels = TypeVar("Pixels", bound=np.generic)
 
 _ZONES = 4
-_FILE_BYTES = 512 * 256 * 64
-"""Bytes of a file, of 512 frames of the half array or 256 of the full one."""
-_COMPARED = 64
-"""To distinguish the arrays, 64 frames of the full array, or pairs of the half array, are compared."""
-_CLIP_QUANTILE = 0.9
-"""Brightness is clipped at this quantile, because hot pixels must not outweigh the scene."""
-_STANDARD_ERRORS = 5.0
-"""Difference of the two correlations, in standard errors, from which the array is decided."""
+_FILE_BYTES = 512 * 256 * 64  # of 512 frames of the half array, or 256 of the full one
+_COMPARED = 64  # frames of the full array, or pairs of frames of the half array, compared to tell them apart
+_CLIP_QUANTILE = 0.9  # brightness is clipped at this quantile: hot pixels must not outweigh the scene
+_STANDARD_ERRORS = 5.0  # minimum difference of the two correlations
 
 
 class SwissSpadHalfConfig(BinConfig):

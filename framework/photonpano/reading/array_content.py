@@ -12,26 +12,19 @@ from numpy.typing import NDArray
 from photonpano.reading.pixel_order import other_order
 from photonpano.reading.significance import MIN_SCORE, score, units_of
 
-_MIN_BITS = 20
-"""Fewest places with a 1 in an array of zeros and ones; of packed pixels one in eight lies in the lowest bit of its byte."""
-_MIN_SUMS = 200
-"""Fewest places with a count in an array without high values; of packed pixels one in eight lies in the highest bit."""
-_BRIGHT = 0.9
-"""To recognise sums, values above this quantile are left out, because hot pixels must not outweigh the scene."""
-_COMPARED = 16
-"""Frames whose bytes are compared as numbers."""
+_MIN_BITS = 20  # fewest lit pixels by which an array of zeros and ones is recognised
+_MIN_SUMS = 200  # fewest nonzero pixels by which an array without values of 128 and more is recognised
+_BRIGHT = 0.9  # pixels above this quantile are left out: hot pixels must not outweigh the scene
+_COMPARED = 16  # frames whose bytes are compared as numbers
+# sum of the squares of the bits of each byte
 _WEIGHTS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 8) @ 4.0 ** np.arange(7, -1, -1)
-"""Sum of the squares of the bits of each byte."""
+# Neighbouring numbers differ by less than their bits: 127 and 128 by 1. If a byte is eight pixels, the squared difference of
+# two is at least a third of the sum of the squares of their bits, even in a checkerboard.
 _CARRIES = 0.25
-"""Neighbouring numbers differ by less than the bits in which they differ: 127 and 128 by 1. The square of the difference is at
-least a third of the sum of the squares of its bits if these are pixels, even of a checkerboard."""
-_BLOCK = 8
-"""Blocks of eight frames, rows and columns are compared with those beside them."""
-_TIMES_LONGER = 2
-"""The axis of the frames is more than twice as long as both of the image."""
+_BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated with their neighbours
+_TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
 
-_MIN_LEAD = 4.0
-"""Least lead of the correlation along the axis of the frames, in its standard errors."""
+_MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
 
 
 class Content(NamedTuple):

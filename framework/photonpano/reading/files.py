@@ -22,8 +22,7 @@ from photonpano.reading.remote import size_of as remote_size
 Model = TypeVar("Model", bound=BaseModel)
 P = ParamSpec("P")
 
-_MOST_OPEN = 16
-"""Files that are kept open: a capture may consist of hundreds, and a process may often open 1024."""
+_MOST_OPEN = 16  # files kept open: a capture may have hundreds, and a process may often open 1024
 _TEXT_AND_NUMBER = re.compile("([^0-9]*)([0-9]*)")
 
 

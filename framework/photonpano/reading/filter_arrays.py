@@ -12,8 +12,8 @@ from photonpano.reading.arrays import read_array, read_picture
 from photonpano.reading.first_look import look_first
 from photonpano.values import Bayer
 
+# red, green and blue of each colour in a pattern
 COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "clear": (255, 255, 255)}
-"""Red, green and blue of each colour in a pattern."""
 _LETTERS = "rgb"
 _WHAT = "the pattern of a colour filter"
 

@@ -10,8 +10,7 @@ from photonpano.reading.files import size_of
 from photonpano.reading.gzipped import is_gzip
 from photonpano.reading.npy import npy_header
 
-_SHORTEST_HEADER = 128
-"""Bytes of the shortest header that numpy writes."""
+_SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
 
 
 def arrived_frames(path: Location) -> int | None:

@@ -15,8 +15,7 @@ from photonpano.paths import Location, Url
 from photonpano.reading.files import read_start, reading, size_of
 from photonpano.reading.remote import read_range
 
-_HEADER_BYTES = 4096
-"""Bytes of a URL that are read for the header, which has 128 for any capture."""
+_HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 
 
 class NpyHeader(NamedTuple):

@@ -17,10 +17,8 @@ from photonpano.reading.packed_layout import FrameLayout
 from photonpano.reading.pieces import Pieces
 from photonpano.values import FrameSpan
 
-_READ_BYTES = 1024**2
-"""Bytes read at once: they stay in the cache of a core until they are summed."""
-_PIECE_BYTES = 4 * 1024**2
-"""Bytes fetched from a URL at once: a request takes milliseconds, whatever it asks for."""
+_READ_BYTES = 1024**2  # read at once: they stay in the cache of a core until they are summed
+_PIECE_BYTES = 4 * 1024**2  # fetched from a URL at once: a request takes milliseconds, whatever its size
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from photonpano.photometry import BitOrder
 from photonpano.reading.significance import MIN_SCORE, score, units_of
 
+# Frames of a sum; both are tried: short sums are sharp, long ones less noisy.
 _LENGTHS = (16, 128)
-"""Frames of a sum. Short sums are sharp, long ones less noisy; each length is tried."""
-_CLIP_QUANTILE = 0.95
-"""Sums are clipped at this quantile, because hot pixels must not outweigh the scene."""
+_CLIP_QUANTILE = 0.95  # sums are clipped at this quantile: hot pixels must not outweigh the scene
+# Minimum score of the best order against each other one, and of pixels within bytes against the expected order.
 _MIN_LEAD = 3.0
-"""Least score by which the best order differs from each other one, and the expected order from pixels within bytes."""
-_FLOOR = 0.2
-"""Units are weighted by their variance, plus this fraction of its mean."""
+_FLOOR = 0.2  # units are weighted by their variance, plus this fraction of the mean variance
 
 
 class PixelOrder(NamedTuple):

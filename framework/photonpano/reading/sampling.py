@@ -13,12 +13,9 @@ from photonpano.reading.gzipped import is_gzip, local, unpacked_start
 from photonpano.reading.npy import NpyHeader
 from photonpano.values import FrameSpan
 
-_VALUES = 3 * 1024**2
-"""Values that are read, about."""
-_RUN = 128
-"""Frames of a run of consecutive frames, at most."""
-_SHORTEST_RUN = 16
-"""Frames of a run, even if only some columns of them can be read."""
+_VALUES = 3 * 1024**2  # values read, about
+_RUN = 128  # most frames of a run of consecutive frames
+_SHORTEST_RUN = 16  # frames of a run, even if only some of their columns can be read
 
 
 def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+# Minimum score of a difference that is not chance. Scores of noise scatter by 1.2: one in 60,000 exceeds 5.
 MIN_SCORE = 5.0
-"""Least score of a difference that is not chance. Scores of noise scatter by 1.2, so that it exceeds 5 once in 60,000 tests."""
-_ROWS = 8
-"""Rows of a unit."""
-_MIN_UNITS = 30
-"""With fewer units their scatter says too little."""
+_ROWS = 8  # rows of a unit
+_MIN_UNITS = 30  # fewest units whose scatter can be trusted
 
 
 def units_of(images: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -10,33 +10,25 @@ from gtsam.symbol_shorthand import L as POINT
 from gtsam.symbol_shorthand import X as POSE
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import chi2
 
 from photonpano import FloatArray
 from photonpano_colmap.pose_noise import without_gauge
 from photonpano_colmap.pose_spline import positions_of
 from photonpano_colmap.posing.path import posed, projected
 
-_ROBUST = 2.0
-"""Sightings further off than this many standard deviations count by their distance, not by its square."""
-_FLOOR_PX = 0.02
-"""Error that sightings have beside photon noise: interpolation, and depth that is not quite right."""
+_ROBUST = 2.0  # scale of the Cauchy loss, in standard deviations
+_FLOOR_PX = 0.02  # error of observations beside photon noise, from interpolation and errors of depth
+# Prior standard deviation of poses: in radians, and in mean distances of the cameras from their centroid.
 _PRIOR_RAD, _PRIOR_SHIFT = 0.02, 0.2
-"""How far poses may be from where they begin: in radians, and in mean distances of the cameras from their middle."""
-_PRIOR_POINT = 100.0
-"""The same of points, whose depth sightings may not tell."""
-_OUTLIER = 3.0
-"""Points are kept if they are seen within this many standard deviations, ..."""
-_SEEN_BY = 3
-"""... by at least this many exposures."""
+_PRIOR_POINT = 100.0  # the same for points, whose depth may be undetermined, in those mean distances
+_OUTLIER = 3.0  # standard deviations within which an observation confirms its point
+_SEEN_BY = 3  # fewest exposures that confirm a point
 _MOST_STEPS = 30
-_REWEIGHTINGS = 3
-"""After the first solution, sightings are weighted by the residuals of their point."""
-_MEDIAN_OF_TWO = 2 * np.log(2)
-"""Median of the sum of the squares of two normal numbers."""
-_SHARED_PX = 6.0
-"""Patches nearer to each other have most of their photons in common."""
-_FAR_PX = 1e3
-"""Residual of a point behind a camera."""
+_REWEIGHTINGS = 3  # solutions; after each, observations are weighted by the residuals of their point
+_MEDIAN_OF_TWO = float(chi2.median(2))  # of the squared norm of two standard normal numbers
+_SHARED_PX = 6.0  # patches nearer to each other share most of their photons
+_FAR_PX = 1e3  # residual of a point behind a camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,25 +19,19 @@ from photonpano_colmap.posing.path import Path, between, moves
 from photonpano_colmap.posing.smoothing import exceeding_noise_of_poses
 from photonpano_colmap.posing.tremor import Tremor, find_tremor
 
-_PATCHES = 300
-"""Patches of a key exposure."""
+_PATCHES = 300  # patches of a key exposure
+# Patches are chosen in about 12 key exposures, at least in every 10th exposure.
 _KEYS = 12
-"""Key exposures, whose patches are sought in others: about so many, and at least every 10th exposure."""
 _EVERY = 10
+# They are searched in the 12 exposures before and after, and in every 6th of the others.
 _NEIGHBOURS = 12
-"""Patches are sought in so many exposures before and after, and in every 6th of all others."""
 _FURTHER = 6
-_SEEN_BY = 4
-"""A point must be seen by so many exposures."""
-_LEAST_SIGHTINGS = 20
-"""An exposure with fewer sightings is not located."""
-_LEAST_LOCATED = 5
-"""Exposures that a path needs at least."""
+_SEEN_BY = 4  # minimum number of exposures that observe a point
+_LEAST_SIGHTINGS = 20  # minimum number of observations in a located exposure
+_LEAST_LOCATED = 5  # minimum number of located exposures
+# Corrections of tremor in a level end after 4, below 0.02 px, or when they grow: then depth is wrong, not the path.
 _MOST_TREMORS, _LEFT_PX = 4, 0.02
-"""Corrections of a tremor in a level, at most; fewer if the next would move the image by less than this, or by more than the
-last: then it is not tremor that spans show, but depth that is wrong."""
-_OUT_OF_SIGHT = 0.8
-"""Exposures are not compared if the middle of one lies further than this from that of the other, in sides of a frame."""
+_OUT_OF_SIGHT = 0.8  # exposures are compared if their centres are closer than this, in sides of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

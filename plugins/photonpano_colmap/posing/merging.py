@@ -13,8 +13,7 @@ from photonpano.geometry import inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
 from photonpano_colmap.posing.path import Path, between
 
-_CHUNK_PX = 1.0
-"""Frames that move less than this are summed before they are warped."""
+_CHUNK_PX = 1.0  # frames that move less than this are summed before they are warped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,25 +14,19 @@ from photonpano.locating import view_of
 from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import between
 
-_BLUR_PX = 1.0
-"""Standard deviation of the blur against photon noise."""
-_HALF = 9
-"""Patches have 19 x 19 pixels, with Gaussian weights."""
+_BLUR_PX = 1.0  # standard deviation of the blur against photon noise
+_HALF = 9  # patches have 19 x 19 pixels, with Gaussian weights
 _BORDER = _HALF + 3
+# Corners are at least 9 px apart, with at least this fraction of the strongest corner's curvature.
 _APART_PX = 9
 _QUALITY = 0.002
-"""Corners are at least 9 px apart, and have this share of the curvature of the best."""
 _STEPS = 15
 _CONVERGED_PX = 0.01
 _LARGEST_STEP_PX = 2.0
-_LARGEST_SHIFT_PX = 8.0
-"""Patches are sought this far from where they are predicted."""
-_MISFIT = 2.0
-"""A patch differs by more than noise if the mean square of its residuals is this many times that of photon noise."""
-_LARGEST_STD_PX = 1.0
-"""Patches whose place is less certain are left out."""
-_SLOPE_PX = 3.0
-"""Standard deviation of the blur before slopes of the inverse depth are taken."""
+_LARGEST_SHIFT_PX = 8.0  # radius of the search around the predicted position
+_MISFIT = 2.0  # maximum reduced chi-square of a patch
+_LARGEST_STD_PX = 1.0  # maximum standard error of the position of a patch
+_SLOPE_PX = 3.0  # standard deviation of the blur before slopes of the inverse depth are computed
 
 
 class Stabilised(NamedTuple):

@@ -7,8 +7,7 @@ import numpy as np
 from photonpano import FloatArray
 from photonpano.filtering import exceeding_noise
 
-_DEGREE = 5
-"""Degree of the polynomial in time that is always kept: the gauge, drift, and where else the world has moved."""
+_DEGREE = 5  # degree of the polynomial in time that is always kept: gauge and drift
 
 
 def exceeding_noise_of_poses(moves: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -25,24 +25,18 @@ from photonpano.photometry import flux_std
 from photonpano_colmap.posing.merging import PosedExposure, lit_counts
 from photonpano_colmap.posing.path import Path, between
 
-_NOISE_PX = 0.1
-"""Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it."""
-_SHORTEST, _LONGEST = 6, 32
-"""Fewest and most frames of a span."""
-_FEWEST = 16
-"""Fewer spans than this have no spectrum."""
-_BLUR_PX = 1.0
-"""Standard deviation of the blur of an exposure before its slopes are taken."""
+_NOISE_PX = 0.1  # standard error of the shift of a span that determines its length, within the limits below
+_SHORTEST, _LONGEST = 6, 32  # frames of a span
+_FEWEST = 16  # fewest spans that have a spectrum
+_BLUR_PX = 1.0  # standard deviation of the blur of an exposure before its gradient is computed
+# variance of the gradient of noise, relative to that of a pixel before the blur
 _SLOPE_NOISE = (1 - np.exp(-1 / _BLUR_PX**2)) / (8 * np.pi * _BLUR_PX**2)
-"""Variance of a slope that is noise, relative to that of a pixel before the blur."""
-_BORDER = 4
-"""Pixels nearer to unknown ones have no slope."""
+_BORDER = 4  # pixels nearer to masked ones have no gradient
+# Unknowns of a span: rotation about three axes, translation along them, and the gain of the light.
 _TURNS, _MOTION, _GAIN = slice(3), slice(6), 6
-"""Unknowns of a span: turns about three axes and shifts along them, and last the gain of the light."""
+# The translations that are well determined; along the third axis the camera translates as much.
 _SIDEWAYS, _AXES = slice(3, 5), 3
-"""Shifts that are seen well; the camera shifts along the third axis as much."""
-_LEAST_INFORMATION = 1e-2
-"""Modes that a span shows with a noise of more than 10 px are unknown."""
+_LEAST_INFORMATION = 1e-2  # modes with a standard error above 10 px are unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,7 @@ from photonpano_sensors.intensity.configs import VideoConfig
 from photonpano_sensors.intensity.source import IntensitySource, Levels
 from photonpano_sensors.intensity.video_index import VideoIndex, index_of, open_video
 
-_KEPT_BYTES = 256 * 1024**2
-"""Size of the cache of decoded frames."""
+_KEPT_BYTES = 256 * 1024**2  # size of the cache of decoded frames
 
 
 class VideoSource(IntensitySource):
