@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from photonpano import CaptureSummary, Group, Resampler, StageContext
-from photonpano_core.grouping import shortest_of
+from photonpano import CaptureSummary, Group, Resampler, StageContext, StreamInfo
 
+_SHORTEST = {"binary": 16, "intensity": 1}  # frames of the shortest group that is chosen: fewer are too noisy
 _BLUR = 0.15  # blur of a group at level 1, in shorter sides of a frame; twice as much spoils the result
 _DARK_PHOTONS = 3.0  # photons per pixel below which groups get longer, since noise harms more than blur
 _DARK_BLUR = 2.0  # factor on the blur that is allowed in the dark
@@ -62,6 +62,11 @@ class AutoResampler:
             # Twice the length, at the density of this level.
             return self._of_size(2 * self._size).groups(n_frames, level + 1)
         return self._of_size(self._size).groups(n_frames, level)
+
+
+def shortest_of(stream: StreamInfo) -> int:
+    """Return the frames of the shortest group that is chosen."""
+    return _SHORTEST[stream.kind]
 
 
 def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int, shortest: int) -> tuple[int, str]:

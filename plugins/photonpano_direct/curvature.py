@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.locating import MIN_COMMON_CURVATURE
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import Buffers, derivative_moments, differentiate
+from photonpano_direct.moments import Buffers, Layer, derivative_moments, differentiate
 from photonpano_direct.small_matrices import cholesky, dot, product, solve_lower, transposed
 
 

@@ -8,8 +8,7 @@ from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import violation
 from photonpano_direct.curvature import MOMENTS_X, MOMENTS_Y, chance_level, curvatures, expected_px
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import Buffers, residuals_and_moments
+from photonpano_direct.moments import Buffers, Layer, residuals_and_moments
 from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
 # Exit status; DIVERGED is to an impossible homography.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano import BoolArray, Homography
-    from photonpano_direct.layers import Layer
+    from photonpano_direct.moments import Layer
     from photonpano_direct.pyramid import Pyramid
 
 JUDGED = 1  # layer on which parts are compared: coarse, so that noise and small errors of the motion do not matter

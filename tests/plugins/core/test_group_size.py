@@ -10,7 +10,7 @@ from photonpano import CaptureSummary, CaptureUnreadError, StageContext, StreamI
 from photonpano_core.configs import MidpointConfig
 from photonpano_core.group_size import choose_group_size, whole_periods
 from photonpano_core.hooks import photonpano_resamplers
-from photonpano_core.midpoint import MidpointResampler
+from photonpano_core.resamplers import MidpointResampler
 
 HOW = "the second fastest of 12 places, from sums of 64 frames"
 

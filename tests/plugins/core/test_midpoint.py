@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from photonpano import FrameSpan, Group
 from photonpano_core.configs import MidpointConfig
-from photonpano_core.midpoint import MidpointResampler
+from photonpano_core.resamplers import MidpointResampler
 
 
 def groups(n_frames: int, level: int, group_size: int = 100, **config: bool) -> tuple[Group, ...]:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, PackedSource, Source, SourceContext
 from photonpano.photometry import BinarySumResponse
-from photonpano_core.npy import NPY, NpyConfig
+from photonpano_core.sources.npy import NPY, NpyConfig
 
 BITS = np.random.default_rng(0).integers(0, 2, (40, 6, 19), dtype=np.uint8)
 SUMS = np.random.default_rng(1).integers(0, 301, (40, 6, 19), dtype=np.uint16)
@@ -67,7 +67,7 @@ def test_sums_have_the_response_of_their_number(tmp_path: Path, dtype: Any, last
 
 
 def test_long_span_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano_core.npy._READ_BYTES", 7 * 6 * 19)
+    monkeypatch.setattr("photonpano.reading.packed_files._READ_BYTES", 7 * 6 * 19)
     with opened(saved(tmp_path / "cube.npy", BITS), holds="bits") as source:
         np.testing.assert_array_equal(source.frames(source.info.span), BITS)
         np.testing.assert_array_equal(source.counts(FrameSpan(1, 40)), BITS[1:].sum(axis=0))

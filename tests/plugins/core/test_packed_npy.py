@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from photonpano import FrameSpan, InputError, OutputError, SourceContext
 from photonpano.reading import PackedFileSource
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
+from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 
 
 def cube(n: int = 40, height: int = 6, width: int = 24, seed: int = 0) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
+from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 
 
 def problem_of(path: Path, array: np.ndarray, **config: Any) -> str | None:

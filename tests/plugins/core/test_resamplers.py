@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from photonpano import FrameSpan, Group, InputError, StageContext, StreamInfo
 from photonpano_core.configs import MidpointConfig
 from photonpano_core.hooks import photonpano_resamplers
-from photonpano_core.midpoint import MidpointResampler
+from photonpano_core.resamplers import MidpointResampler
 
 NAMES = ("constant-groups", "sliding-window", "stratified")
 CONTRIBUTIONS = {each.name: each for each in photonpano_resamplers()}

@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 pytest.importorskip("kornia")
 
 from photonpano_kornia.configs import KorniaFeaturesConfig
-from photonpano_kornia.features import FeatureLocator, SiftFeatures
+from photonpano_kornia.matched import FeatureLocator, SiftFeatures
 
 SHAPE = (120, 176)
 STILL = np.eye(3)

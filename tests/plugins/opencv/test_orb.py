@@ -8,8 +8,7 @@ import numpy as np
 from photonpano import Located
 from photonpano.geometry import corner_displacements, translation
 from photonpano_opencv.configs import OpencvOrbConfig
-from photonpano_opencv.keypoints import Keypoints
-from photonpano_opencv.orb import OrbLocator
+from photonpano_opencv.keypoints import Keypoints, OrbLocator
 
 SHAPE = (160, 240)
 

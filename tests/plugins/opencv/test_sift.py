@@ -8,8 +8,7 @@ import pytest
 from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano_opencv.configs import OpencvSiftConfig
-from photonpano_opencv.keypoints import Keypoints
-from photonpano_opencv.sift import SiftLocator
+from photonpano_opencv.keypoints import Keypoints, SiftLocator
 
 SHAPE = (160, 240)
 

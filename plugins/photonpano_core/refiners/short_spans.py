@@ -10,7 +10,7 @@ from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals,
 from photonpano.filtering import SIGNIFICANT, SLOW, SYSTEMATIC_PX, WINDOW, Filtered, exceeding_noise
 from photonpano.geometry import BLOCK_FRAMES, apply, corners, inverse, normalised, step_motions
 from photonpano_core.configs import ShortSpansConfig
-from photonpano_core.uneven_noise import separated
+from photonpano_core.refiners.uneven_noise import separated
 
 _FEWEST_SPANS = 16  # fewest spans that have a spectrum
 # The light goes out, as between two flickers, if 5 % of the steps have 10 times the usual variance.

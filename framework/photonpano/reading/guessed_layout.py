@@ -1,17 +1,27 @@
-"""What the values of an array of frames are: packed bits, single bits, or sums; and which axis is that of the frames."""
+"""Guess the layout of an array of frames from samples: packed bits, bits or sums, the axis of the frames, the channel."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.reading.pixel_order import other_order
-from photonpano.reading.significance import MIN_SCORE, score, units_of
+from photonpano.errors import InputError
+from photonpano.paths import Location, Url
+from photonpano.reading.files import OpenFiles, is_gzip, size_of
+from photonpano.reading.gzipped import local, unpacked_start
+from photonpano.reading.npy import NpyHeader
+from photonpano.reading.pixel_order import MIN_SCORE, other_order, score, units_of
+from photonpano.values import FrameSpan
 
+Capture = TypeVar("Capture")
+
+_VALUES = 3 * 1024**2  # values read, about
+_RUN = 128  # most frames of a run of consecutive frames
+_SHORTEST_RUN = 16  # frames of a run, even if only some of their columns can be read
 _MIN_BITS = 20  # fewest lit pixels by which an array of zeros and ones is recognised
 _MIN_SUMS = 200  # fewest nonzero pixels by which an array without values of 128 and more is recognised
 _BRIGHT = 0.9  # pixels above this quantile are left out: hot pixels must not outweigh the scene
@@ -25,6 +35,7 @@ _BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated
 _TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
 
 _MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
+_MIDDLE = 1  # the channel of three that is chosen
 
 
 class Content(NamedTuple):
@@ -41,6 +52,47 @@ class Content(NamedTuple):
     lowest: int
     highest: int
     n_values: int
+
+
+def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
+    """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
+
+    Args:
+        path: the file.
+        header: its header; the array has three dimensions or more, in C order.
+
+    Returns:
+        Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
+        list where the file is cut short, or the beginning of a .npy.gz file holds no whole frame.
+    """
+    n_frames, n_rows, n_columns, *_ = header.shape
+    values_of_frame = int(np.prod(header.shape[1:]))
+    if is_gzip(path):
+        start = unpacked_start(local(path), header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
+        whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
+        frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
+        return [frames.reshape(whole, *header.shape[1:])] if whole else []
+    if size_of(path) < header.file_bytes:
+        return []
+    columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))
+    spans = sampled_spans(n_frames, n_rows * columns)
+    if isinstance(path, Url):
+        files = OpenFiles()
+        samples = [np.empty((len(span), *header.shape[1:]), header.dtype) for span in spans]
+        for span, sample in zip(spans, samples, strict=True):
+            files.read(path, header.offset + span.start * sample[0].nbytes, sample.view(np.uint8))
+        return [sample[:, :, :columns] for sample in samples]
+    stored = np.memmap(path, header.dtype, "r", header.offset, header.shape)
+    return [np.array(stored[each.start : each.stop, :, :columns]) for each in spans]
+
+
+def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:
+    """Return spans of up to 128 frames, evenly spaced over a capture, that hold about 3 million values together."""
+    most = max(1, _VALUES // frame_values)
+    length = min(_RUN, n_frames, most)
+    n_spans = max(1, min(most // length, n_frames // length))
+    starts = np.linspace(0, n_frames - length, n_spans).astype(int).tolist()
+    return [FrameSpan(start, start + length) for start in starts]
 
 
 def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
@@ -159,3 +211,35 @@ def _correlation(moments: NDArray[np.float64]) -> float:
     x, y, xx, yy, xy = moments[1:] / moments[0]
     scatter = float(np.sqrt(max(0.0, (xx - x * x) * (yy - y * y))))
     return float(xy - x * y) / scatter if scatter > 0 else 0.0
+
+
+class Channel(NamedTuple):
+    """The channel that a recognised capture is read with.
+
+    Attributes:
+        keys: the key `channel` of the source, if the capture has channels.
+        clause: follows the reason why the capture was recognised.
+    """
+
+    keys: dict[str, int]
+    clause: str
+
+
+def with_channel(read: Callable[[int | None], Capture]) -> tuple[Capture, Channel] | None:
+    """Read a capture without channels, or the middle one of three.
+
+    Args:
+        read: reads the capture with a `channel`, and raises an `InputError` if the capture does not have it.
+
+    Returns:
+        What `read` returned, and the channel; None if it raised for both.
+    """
+    for channel in (None, _MIDDLE):
+        try:
+            found = read(channel)
+        except InputError:
+            continue
+        if channel is None:
+            return found, Channel({}, "")
+        return found, Channel({"channel": channel}, ", of whose channels the middle one is used")
+    return None

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from photonpano import FloatArray, LocationError
 from photonpano.geometry import from_parameters, normalised
-from photonpano_core.sl3 import exponential, logarithm, unimodular
+from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
 
 
 def interpolating_spline(instants: FloatArray, values: FloatArray, degree: int = 3) -> BSpline:

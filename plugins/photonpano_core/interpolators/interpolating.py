@@ -1,4 +1,4 @@
-"""Cubic spline interpolation in the group of the homographies."""
+"""Interpolators whose curves pass through every knot: `lucas-kanade`, `geodesic` and `lie`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,47 @@ from scipy.interpolate import BSpline
 from scipy.sparse.linalg import splu
 
 from photonpano import FloatArray, LocationError
-from photonpano.geometry import apply, corners, inverse
+from photonpano.geometry import apply, corners, inverse, parameters
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.sl3 import exponential, logarithm, unimodular
-from photonpano_core.trajectories import GroupTrajectory, interpolating_spline
+from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
+from photonpano_core.interpolators.trajectories import GroupTrajectory, ParameterTrajectory, interpolating_spline
 
 DEGREE = 3
 MAX_ITERATIONS = 50
 TOLERANCE_PX = 1e-7  # converged when the residual of the knots, at the corners of the frame, is below this
+
+
+class LucasKanadeInterpolator:
+    """Fits a cubic spline of p1..p8 through the knots (paper, section 4, "Interpolate")."""
+
+    def __init__(self, config: InterpolatorConfig) -> None:
+        self._config = config
+
+    def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
+        """Interpolate; the information is not used, since the spline passes through every knot."""
+        del information
+        spline = interpolating_spline(instants, parameters(homographies))
+        return ParameterTrajectory(instants, spline, self._config.hold_frames)
+
+
+class GeodesicInterpolator:
+    """Moves from each knot to the next along a power of the motion between them (Fragneto et al. 2012).
+
+    Between the knots G and H the curve is G (G^-1 H)^s, with s from 0 to 1: the velocity is constant, with a kink at each knot.
+    It is the cumulative B-spline of degree 1 whose control points are the knots.
+    """
+
+    def __init__(self, config: InterpolatorConfig) -> None:
+        self._config = config
+
+    def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> GroupTrajectory:
+        """Interpolate; the information is not used, since the curve passes through every knot.
+
+        Raises:
+            LocationError: two knots are half a turn or more apart, so that the motion between them has no real logarithm.
+        """
+        del information
+        return GroupTrajectory(instants, homographies, 1, self._config.hold_frames)
 
 
 class LieInterpolator:

@@ -1,4 +1,4 @@
-"""Write the panorama as OpenEXR: flux, weight, standard deviation and saturated pixels as channels of 32 bits."""
+"""Exporters: OpenEXR, with flux, weight, standard deviation and saturated pixels as channels of 32 bits, and Radiance."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import OpenEXR
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,8 +14,7 @@ if TYPE_CHECKING:
     from photonpano_core.configs import ExrConfig
 
 _BLOCK_ROWS = 256
-_COLOURS = "RGB"
-_COMPRESSIONS = {"none": OpenEXR.NO_COMPRESSION, "zip": OpenEXR.ZIP_COMPRESSION, "zips": OpenEXR.ZIPS_COMPRESSION}
+_COMPRESSIONS = {"none": "NO_COMPRESSION", "zip": "ZIP_COMPRESSION", "zips": "ZIPS_COMPRESSION"}
 
 
 class ExrExporter:
@@ -26,11 +24,14 @@ class ExrExporter:
     """
 
     def __init__(self, config: ExrConfig) -> None:
-        self._compression = _COMPRESSIONS[config.compression]
+        import OpenEXR
+
+        self._library = OpenEXR
+        self._compression = getattr(OpenEXR, _COMPRESSIONS[config.compression])
 
     def export(self, panorama: FinishedPanorama, path: Path) -> None:
         """Write the file: see `Exporter`. The channels are held in memory."""
-        names = list(_COLOURS) if panorama.in_colour else ["Y"]
+        names = list("RGB") if panorama.in_colour else ["Y"]
         layers = {name: np.zeros((len(names), *panorama.shape), np.float32) for name in ("flux", "weight", "std", "saturated")}
         seen = np.zeros(panorama.shape, np.float32)
         for start in range(0, panorama.shape[0], _BLOCK_ROWS):
@@ -47,10 +48,10 @@ class ExrExporter:
                 channels[_channel(layer_name, name)] = image
         header = {
             "compression": self._compression,
-            "type": OpenEXR.scanlineimage,
+            "type": self._library.scanlineimage,
             "comments": "flux in photons per pixel per frame; weight in frames; std: standard deviation of the flux",
         }
-        with OpenEXR.File(header, channels) as file:
+        with self._library.File(header, channels) as file:
             file.write(str(path))
 
 
@@ -59,3 +60,34 @@ def _channel(layer: str, name: str) -> str:
     if layer == "flux":
         return name
     return layer if name == "Y" else f"{layer}.{name}"
+
+
+class RadianceExporter:
+    """Writes flux as .hdr, with an error of 0.4 % of the brightest colour of a pixel at most; unseen pixels are black."""
+
+    def export(self, panorama: FinishedPanorama, path: Path) -> None:
+        """Write the file: see `Exporter`."""
+        height, width = panorama.shape
+        with path.open("wb") as file:
+            file.write(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode())
+            for start in range(0, height, _BLOCK_ROWS):
+                file.write(encoded(panorama.rows(start, min(start + _BLOCK_ROWS, height)).flux).tobytes())
+
+
+def encoded(flux: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return red, green, blue and exponent of each pixel (Ward 1991): (h, w, 4).
+
+    Args:
+        flux: (h, w), or (h, w, 3) of red, green and blue; negative and unknown flux becomes 0.
+    """
+    colours = np.maximum(np.nan_to_num(flux), 0)
+    colours = np.repeat(colours[..., None], 3, axis=-1) if colours.ndim == 2 else colours
+    brightest = colours.max(axis=-1)
+    # Rounding must not lift a mantissa to 256.
+    mantissa, exponent = np.frexp(brightest)
+    exponent = np.where(mantissa > 255.5 / 256, exponent + 1, exponent)
+    pixels = np.zeros((*brightest.shape, 4), np.uint8)
+    lit = (brightest > 0) & (exponent > -128)
+    pixels[lit, :3] = np.rint(np.ldexp(colours[lit], (8 - exponent[lit])[:, None])).astype(np.uint8)
+    pixels[lit, 3] = np.clip(exponent[lit] + 128, 1, 255)
+    return pixels

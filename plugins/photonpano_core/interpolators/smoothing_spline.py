@@ -12,7 +12,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_ban
 from photonpano import FloatArray
 from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.trajectories import ParameterTrajectory, SplinePath, interpolating_spline
+from photonpano_core.interpolators.trajectories import ParameterTrajectory, SplinePath, interpolating_spline
 
 ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three knots, are not
 # Candidates for the scale of the jerk, from a parabola to interpolation. The number of knots averaged grows with the sixth
