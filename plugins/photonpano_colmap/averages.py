@@ -31,8 +31,8 @@ from photonpano.geometry import Camera, camera_matrix
 from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
-from photonpano_colmap.pose_spline import PoseSpline, left_out, positions_of
 from photonpano_colmap.posing.merging import lit_counts
+from photonpano_colmap.posing.path import PoseSpline, left_out, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
 from photonpano_colmap.reversal import Readings
 
@@ -169,7 +169,7 @@ class _Assembly:
         apart, angles = left_out(instants, piece.poses)
         std_position = _between(frames, instants, noise.std_position, apart, located)
         std_rotation = _between(frames, instants, noise.std_rotation, angles, located)
-        length = float(np.linalg.norm(np.diff(positions_of(piece.poses), axis=0), axis=1).sum())
+        views = tuple(self._view(place) for place in range(len(piece.images)))
         return PoseEstimate(
             camera_matrix=camera.matrix,
             distortion=camera.distortion,
@@ -178,10 +178,10 @@ class _Assembly:
             located=located,
             std_position=std_position,
             std_rotation_deg=np.rad2deg(std_rotation),
-            points=ScenePoints(piece.points, self._flux()),
-            views=tuple(self._view(place) for place in range(len(piece.images))),
+            points=ScenePoints(piece.points, flux_of_points(views, len(piece.points))),
+            views=views,
             lost=self._lost(located),
-            levels=(self._level(noise, length),),
+            levels=(self._level(noise),),
             doubts=tuple(self._doubts(noise)),
         )
 
@@ -206,18 +206,6 @@ class _Assembly:
 
         return PosedView(span, span.centre, self.piece.poses[place], points, xy, flux)
 
-    def _flux(self) -> FluxImage:
-        """Return the mean flux of the pixels in which averages show each point: (M,)."""
-        total, times = np.zeros(len(self.piece.points)), np.zeros(len(self.piece.points))
-        for image, (indices, xy) in zip(self.piece.images.tolist(), self.piece.observed, strict=True):
-            flux = _exposure(self.source, self.spans[image]).flux
-            column, row = (np.clip(np.rint(xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
-            seen = flux[row, column]
-            known = np.isfinite(seen)
-            np.add.at(total, indices[known], seen[known])
-            np.add.at(times, indices[known], 1)
-        return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
-
     def _lost(self, located: BoolArray) -> tuple[LostFrames, ...]:
         """Return the frames without a pose: those of averages that COLMAP left out, and the rest at the end."""
         others = {int(image): number for number, piece in enumerate(self.found.pieces[1:], 2) for image in piece.images}
@@ -240,7 +228,7 @@ class _Assembly:
             lost.append(LostFrames(FrameSpan(start, stop), reason))
         return tuple(lost)
 
-    def _level(self, noise: PoseNoise, length: float) -> dict[str, float | int | str | None]:
+    def _level(self, noise: PoseNoise) -> dict[str, float | int | str | None]:
         return {
             "group_frames": len(self.spans[0]),
             "averages": len(self.spans),
@@ -249,7 +237,7 @@ class _Assembly:
             "keypoints": float(np.median(self.found.n_keypoints)),
             "parallax_deg": float(np.rad2deg(np.median(parallax(self.piece)))),
             "residual_px": noise.residual_px,
-            "std_position": float(np.sqrt(np.mean(noise.std_position**2))) / length if length else None,
+            "std_position": relative_std(noise.std_position, self.piece.poses),
         }
 
     def _std_focal(self, noise: PoseNoise) -> float:
@@ -273,6 +261,25 @@ class _Assembly:
                 f"only {len(self.piece.images)} of {len(self.spans)} averages have a pose; choose another pose.with.group_size"
             )
         return doubts
+
+
+def flux_of_points(views: Sequence[PosedView], n_points: int) -> FluxImage:
+    """Return the mean flux of the pixels in which views show each point: (n_points,); NaN where none does."""
+    total, times = np.zeros(n_points), np.zeros(n_points)
+    for view in views:
+        flux = view.flux()
+        column, row = (np.clip(np.rint(view.xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
+        seen = flux[row, column]
+        known = np.isfinite(seen)
+        np.add.at(total, view.points[known], seen[known])
+        np.add.at(times, view.points[known], 1)
+    return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
+
+
+def relative_std(std_position: FloatArray, poses: FloatArray) -> float | None:
+    """Return the root mean square error of positions, as a fraction of the path through them; None if the camera rests."""
+    length = float(np.linalg.norm(np.diff(positions_of(poses), axis=0), axis=1).sum())
+    return float(np.sqrt(np.mean(std_position**2))) / length if length else None
 
 
 def chosen_size(capture: CaptureSummary, n_frames: int) -> tuple[int, str]:

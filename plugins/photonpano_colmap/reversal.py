@@ -14,7 +14,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from photonpano import FloatArray
-from photonpano_colmap.pose_spline import positions_of
+from photonpano_colmap.posing.path import positions_of
 
 _NEAREST = 0.1  # minimum distance of reversed points, in median depths
 _FARTHEST_OFF_PX = 4.0  # points of a reversed reading with a larger residual are removed, as COLMAP removes them

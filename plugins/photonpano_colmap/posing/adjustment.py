@@ -14,8 +14,7 @@ from scipy.stats import chi2
 
 from photonpano import FloatArray
 from photonpano_colmap.pose_noise import without_gauge
-from photonpano_colmap.pose_spline import positions_of
-from photonpano_colmap.posing.path import posed, projected
+from photonpano_colmap.posing.path import posed, positions_of, projected
 
 _ROBUST = 2.0  # scale of the Cauchy loss, in standard deviations
 _FLOOR_PX = 0.02  # error of observations beside photon noise, from interpolation and errors of depth

@@ -15,8 +15,7 @@ from photonpano_colmap.posing.adjustment import Adjusted, Sightings, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
-from photonpano_colmap.posing.path import Path, between, moves
-from photonpano_colmap.posing.smoothing import exceeding_noise_of_poses
+from photonpano_colmap.posing.path import Path, between, exceeding_noise_of_poses, moves
 from photonpano_colmap.posing.tremor import Tremor, find_tremor
 
 _PATCHES = 300  # patches of a key exposure

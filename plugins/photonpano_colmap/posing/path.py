@@ -1,4 +1,4 @@
-"""The path of a camera through space: a pose for every frame.
+"""The path of a camera through space: a spline through some poses, or a pose for every frame.
 
 Convention:
     A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead.
@@ -10,11 +10,46 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from photonpano import FloatArray
+from photonpano.filtering import exceeding_noise
 from photonpano.geometry import rotation_matrices, rotation_vectors
-from photonpano_colmap.pose_spline import positions_of
+
+_DEGREE = 5  # degree of the polynomial in time that is always kept: gauge and drift
+
+
+class PoseSpline:
+    """Cubic splines of positions and of rotations; beyond the first and the last pose the camera keeps its velocity."""
+
+    def __init__(self, instants: FloatArray, poses: FloatArray) -> None:
+        """Fit (N, 3, 4) poses at increasing instants, in frames; N is at least 2."""
+        self._ends = float(instants[0]), float(instants[-1])
+        self._positions = CubicSpline(instants, positions_of(poses))
+        self._rotations = RotationSpline(instants, Rotation.from_matrix(poses[:, :, :3]))
+
+    def at(self, instants: ArrayLike) -> FloatArray:
+        """Return the poses of N instants: (N, 3, 4)."""
+        instants = np.asarray(instants, dtype=np.float64)
+        inside = np.clip(instants, *self._ends)
+        beyond = (instants - inside)[:, None]
+        places = self._positions(inside) + beyond * self._positions(inside, 1)
+        # Rates are those of the camera in the world, in its own axes.
+        turned = Rotation.from_rotvec(beyond * self._rotations(inside, 1))
+        rotations = (self._rotations(inside) * turned).as_matrix()
+        return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+
+
+def left_out(instants: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far each inner pose is from the spline through the others: distances and angles in radians, (N - 2,) each."""
+    apart, angles = [], []
+    for place in range(1, len(instants) - 1):
+        others = np.delete(np.arange(len(instants)), place)
+        [predicted] = PoseSpline(instants[others], poses[others]).at(instants[place : place + 1])
+        apart.append(float(np.linalg.norm(positions_of(predicted) - positions_of(poses[place]))))
+        angles.append(float(Rotation.from_matrix(predicted[:, :3] @ poses[place, :, :3].T).magnitude()))
+    return np.array(apart), np.array(angles)
 
 
 class Path:
@@ -58,6 +93,11 @@ class Path:
         return Path(rotation_matrices(turns) @ self.poses)
 
 
+def positions_of(poses: FloatArray) -> FloatArray:
+    """Return the positions of cameras in the world, -R^T t: (..., 3, 4) to (..., 3)."""
+    return np.asarray(-np.einsum("...ji,...j->...i", poses[..., :3], poses[..., 3]))
+
+
 def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:
     """Return the poses of cameras with (N, 3, 3) rotations from the world, at (N, 3) places of the world: (N, 3, 4)."""
     shifts = -np.einsum("nij,nj->ni", rotations, centres)
@@ -93,3 +133,23 @@ def projected(poses: FloatArray, points: FloatArray, camera_matrix: FloatArray) 
     seen = np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
     depth = np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
     return np.asarray((seen @ camera_matrix.T)[:, :2] / depth)
+
+
+def exceeding_noise_of_poses(moves: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return what of some moves of poses is slow, or exceeds the noise: the prior of a smooth motion.
+
+    Args:
+        moves: (N, 6) px, in order of time.
+        covariance: (N, 6, 6) of the noise of each, whatever that of the others.
+
+    Returns:
+        (N, 6).
+    """
+    times = np.linspace(-1, 1, len(moves))
+    basis = np.polynomial.legendre.legvander(times, min(_DEGREE, len(moves) - 1))
+    slow = basis @ np.linalg.lstsq(basis, moves, rcond=None)[0]
+    # In these modes, errors are independent of each other.
+    _, modes = np.linalg.eigh(np.linalg.inv(covariance).mean(axis=0))
+    variances = np.einsum("ka,nkl,la->na", modes, covariance, modes)
+    rest = [exceeding_noise(*columns).signal for columns in zip(((moves - slow) @ modes).T, variances.T, strict=True)]
+    return np.asarray(slow + np.stack(rest, axis=1) @ modes.T)
