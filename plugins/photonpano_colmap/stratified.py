@@ -82,12 +82,12 @@ class _Assembly:
         if level.tremor is not None:
             stds = [np.hypot(stds[0], level.tremor.shift), np.hypot(stds[1], level.tremor.std)]
         moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)
-        turned = _left(_turns(self.before, poses), frames, instants)
+        rotated = _left(_rotations_between(self.before, poses), frames, instants)
         located = level.scene.located
         poses[~located] = np.nan
         std_position, std_rotation = (
             np.where(located, np.hypot(std, _MISSED * missed), np.nan)
-            for std, missed in zip(stds, (moved, turned), strict=True)
+            for std, missed in zip(stds, (moved, rotated), strict=True)
         )
         views = self._views()
         return replace(
@@ -112,9 +112,9 @@ class _Assembly:
         level, views = self.level, []
         kept = [each for each, located in zip(level.exposures, level.is_located, strict=True) if located]
         for number, (posed, pose) in enumerate(zip(kept, level.adjusted.poses, strict=True)):
-            seen = level.sightings.views == number
+            seen = level.observations.views == number
             # A point is sought from several key exposures, but is one point of one of them: it is seen once.
-            points, pixels = level.sightings.points[seen], level.sightings.pixels[seen]
+            points, pixels = level.observations.points[seen], level.observations.pixels[seen]
             group = posed.exposure.group
             views.append(PosedView(group.span, group.reference, pose, points, pixels, _flux_of(posed)))
         return tuple(views)
@@ -128,7 +128,7 @@ def _frames(source: Source) -> FloatArray:
     return np.arange(source.info.n_frames, dtype=np.float64)
 
 
-def _turns(before: FloatArray, after: FloatArray) -> FloatArray:
+def _rotations_between(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return small rotations from some poses to others, as rotation vectors in radians: (T, 3)."""
     between = after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2)
     return np.stack([between[:, j, i] - between[:, i, j] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1) / 2

@@ -110,7 +110,7 @@ def _determined(outcome: Located | NotLocated) -> bool:
 
 
 class _Alignment:
-    """Estimates of the parameters of a homography, or of a turn."""
+    """Estimates of the parameters of a homography, or of a rotation."""
 
     def __init__(self, config: DirectConfig, camera_matrix: FloatArray | None) -> None:
         """Estimate all eight parameters without `camera_matrix`, and three with it."""
@@ -118,7 +118,7 @@ class _Alignment:
         self._camera = None if camera_matrix is None else Camera(camera_matrix)
 
     def aligned(self, moving: Pyramid, fixed: Pyramid, start: Homography, searches: bool) -> Located | NotLocated:
-        """Align from a start; `searches` tells whether other motions are tried where the image has several."""
+        """Align from a start; `searches`: whether other motions are tried where the image has several."""
         n_layers = len(moving.layers)
         if self._camera is not None:
             start = scaled_ahead(self._camera.homographies(nearest_rotations(self._camera.rotations(start))))

@@ -70,10 +70,10 @@ def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
     middle = np.isfinite(squares).sum(axis=0, keepdims=True) // 2
     usual = np.maximum(np.nan_to_num(np.take_along_axis(ordered, middle, axis=0)), np.float32(1e-12))
     relative = np.minimum(squares / usual, _DIFFERENT)
-    misfit = np.nansum(relative, axis=(1, 2)) / np.maximum(np.isfinite(relative).sum(axis=(1, 2)), 1)
-    misfit[n_seen < _LEAST_SEEN * height * width] = np.inf
+    cost = np.nansum(relative, axis=(1, 2)) / np.maximum(np.isfinite(relative).sum(axis=(1, 2)), 1)
+    cost[n_seen < _LEAST_SEEN * height * width] = np.inf
     found: list[tuple[int, int]] = []
-    for index in np.argsort(misfit):
+    for index in np.argsort(cost):
         y, x = shifts[index]
         if all(max(abs(y - other_y), abs(x - other_x)) >= _NEAR_PX for other_y, other_x in found):
             found.append((y, x))

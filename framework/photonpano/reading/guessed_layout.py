@@ -102,7 +102,7 @@ def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
         samples: runs of consecutive frames, each (n, rows, columns), of integers or bool.
 
     Returns:
-        None for packed pixels, and where too few pixels are lit to tell.
+        None for packed pixels, and where too few pixels are lit.
     """
     lowest, highest = (int(edge) for edge in (min(each.min() for each in samples), max(each.max() for each in samples)))
     n_values = sum(each.size for each in samples)

@@ -85,7 +85,7 @@ def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORD
         expected: the order that the capture is read with.
 
     Returns:
-        None where the expected order fits, or where the frames are too dark or too plain to tell.
+        None where the expected order fits, or where the frames are too dark or too plain.
     """
     found = [_other(_Likeness(products), ORDERS.index(expected)) for products in _products_of(samples)]
     scored = [each for each in found if each is not None]

@@ -36,8 +36,7 @@ def merge_through_depth(
 ) -> PosedExposure:
     """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
 
-    Each chunk of frames is interpolated once, at the places where the frames see the points of the reference view; what only
-    one of the two sees is not told apart.
+    Each chunk of frames is interpolated once, where its frames see the points of the reference view. Occlusions are ignored.
 
     Args:
         source: the capture.
@@ -59,7 +58,7 @@ def merge_through_depth(
 
 
 class _Plane:
-    """The motion of a plane before a view, at the median depth: it tells how fast frames move."""
+    """The motion of a plane before a view at the median depth, by which frames are divided into chunks."""
 
     def __init__(self, path: Path, pose: FloatArray, inverse_depth: float, camera_matrix: FloatArray) -> None:
         self._path, self._pose, self._inverse_depth, self._matrix = path, pose, inverse_depth, camera_matrix

@@ -36,8 +36,8 @@ class PoseSpline:
         beyond = (instants - inside)[:, None]
         places = self._positions(inside) + beyond * self._positions(inside, 1)
         # Rates are those of the camera in the world, in its own axes.
-        turned = Rotation.from_rotvec(beyond * self._rotations(inside, 1))
-        rotations = (self._rotations(inside) * turned).as_matrix()
+        rotated = Rotation.from_rotvec(beyond * self._rotations(inside, 1))
+        rotations = (self._rotations(inside) * rotated).as_matrix()
         return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
 
 
@@ -66,7 +66,7 @@ class Path:
         first = np.minimum(at.astype(int), len(self.poses) - 2)
         share = (at - first)[:, None, None]
         rotations = (1 - share) * self.poses[first, :, :3] + share * self.poses[first + 1, :, :3]
-        # A mean of two rotations is one that shrinks; a step of Newton's method undoes that.
+        # The mean of two rotation matrices is not orthogonal; a step of Newton's method makes it so.
         rotations = rotations @ (3 * np.eye(3) - np.swapaxes(rotations, 1, 2) @ rotations) / 2
         centres = (1 - share[:, 0]) * self._centres[first] + share[:, 0] * self._centres[first + 1]
         return posed(rotations, centres)
@@ -74,9 +74,9 @@ class Path:
     def corrected(self, borders: FloatArray, means: FloatArray) -> Path:
         """Return this path, corrected where groups of frames were located along it.
 
-        The frames of a group were merged along the path, so that where the group is located tells the mean correction of all of
-        its frames, and not that of one instant. The correction is the smoothest function with these means, that of the least
-        second derivative: the derivative of the natural quintic spline through its integral at the borders of the groups.
+        The frames of a group were merged along the path, so a group's pose gives the mean correction of its frames, not that of
+        one instant. The correction is the function with these means and the least second derivative: the derivative of the
+        natural quintic spline through its integral at the borders of the groups.
 
         Args:
             borders: (N + 1,) increasing, in frames: where groups begin and end, side by side.
@@ -88,9 +88,9 @@ class Path:
         correction = make_interp_spline(borders, integral, k=5, bc_type=ends).derivative()(np.arange(len(self.poses)))
         return Path(posed(rotation_matrices(correction[:, :3]) @ self.poses[:, :, :3], self._centres + correction[:, 3:]))
 
-    def turned(self, turns: FloatArray) -> Path:
-        """Return this path with the camera turned on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
-        return Path(rotation_matrices(turns) @ self.poses)
+    def rotated(self, rotations: FloatArray) -> Path:
+        """Return this path with the camera rotated on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
+        return Path(rotation_matrices(rotations) @ self.poses)
 
 
 def positions_of(poses: FloatArray) -> FloatArray:
@@ -106,8 +106,8 @@ def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:
 
 def moves(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return how poses differ, (N, 3, 4) each: rotation vectors of the camera, and shifts of its place in the world; (N, 6)."""
-    turns = rotation_vectors(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
-    return np.concatenate([turns, positions_of(after) - positions_of(before)], axis=1)
+    rotations = rotation_vectors(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
+    return np.concatenate([rotations, positions_of(after) - positions_of(before)], axis=1)
 
 
 def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -136,11 +136,11 @@ def projected(poses: FloatArray, points: FloatArray, camera_matrix: FloatArray) 
 
 
 def exceeding_noise_of_poses(moves: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return what of some moves of poses is slow, or exceeds the noise: the prior of a smooth motion.
+    """Denoise corrections of poses with a Wiener filter, and keep their slow part.
 
     Args:
         moves: (N, 6) px, in order of time.
-        covariance: (N, 6, 6) of the noise of each, whatever that of the others.
+        covariance: (N, 6, 6) of the noise of each.
 
     Returns:
         (N, 6).

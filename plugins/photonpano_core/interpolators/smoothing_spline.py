@@ -57,9 +57,10 @@ class SmoothingSplineInterpolator:
     def fit_turns(
         self, instants: FloatArray, turns: FloatArray, information: FloatArray | None
     ) -> Callable[[FloatArray], FloatArray]:
-        """Smooth the turns of a camera in the same way: see `photonpano.InterpolatesTurns`.
+        """Smooth the rotations of a camera in the same way: see `photonpano.InterpolatesTurns`.
 
-        The information is taken at its word. Without it, all turns have equal and independent errors, whose size is estimated.
+        The scale of the information is trusted. Without it, all rotations have equal and independent errors, whose size is
+        estimated.
         """
         if len(instants) > ORDER:
             covariances: FloatArray = np.broadcast_to(np.eye(3), (len(instants), 3, 3))

@@ -88,7 +88,7 @@ def _expected(values: FloatArray, noise: FloatArray, allowed: BoolArray) -> tupl
         if round_ == _ROUNDS:
             break
         amplitude = np.abs(np.fft.rfft(inverted @ values, period)) ** 2
-        # The sums along the diagonals of the inverse have the spectrum of what the values tell of each frequency.
+        # The sums along the diagonals of the inverse have the spectrum of the information about each frequency.
         sums = np.bincount((lag % period).ravel(), inverted.ravel(), period)
         power = np.maximum(power + power**2 * (amplitude - np.fft.rfft(sums).real) / period, 0)
     mean = covariance @ (inverted @ values)

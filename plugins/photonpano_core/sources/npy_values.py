@@ -89,7 +89,7 @@ class NpySums(Closing):
     """Sums of binary frames: a `photonpano.Source`.
 
     Raises:
-        InputError: when frames are read: a value cannot be a sum of so many binary frames.
+        InputError: when frames are read: a value exceeds the number of binary frames in a sum.
     """
 
     def __init__(self, values: Values, binary_frames: int, frame_rate_hz: float | None) -> None:

@@ -68,7 +68,7 @@ class IntensitySource(Closing, ABC):
         """Sum the frames of a span: (H, W) uint32.
 
         Raises:
-            InputError: the sum of so many frames might not fit into uint32.
+            InputError: the sum might not fit into uint32.
         """
         self.info.require(span)
         most = _MOST_COUNT // (2**self.info.bit_depth - 1)
