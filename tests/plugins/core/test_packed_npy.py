@@ -34,18 +34,52 @@ def opened(path: Path, **config: Any) -> PackedFileSource:
     return source
 
 
-@pytest.mark.parametrize("width", [24, 19])
-def test_frames_and_counts_equal_the_array(tmp_path: Path, width: int) -> None:
-    frames = cube(width=width)
-    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=-1))
-    with opened(path, width=width, frame_rate_hz=96800) as source:
-        assert (source.info.n_frames, source.info.frame_shape, source.info.frame_rate_hz) == (40, (6, width), 96800)
-        assert (source.info.kind, source.info.bit_depth) == ("binary", 1)
+ALONG = {"packed_along": "height"}
+LITTLE = {"bit_order": "little"}
+# Frames, how they are stored, and the keys that read them.
+LAYOUTS: dict[str, tuple[np.ndarray, Callable[[np.ndarray], np.ndarray], dict[str, Any]]] = {
+    "whole bytes": (cube(), lambda frames: np.packbits(frames, axis=2), {}),
+    "a width of 19": (cube(width=19), lambda frames: np.packbits(frames, axis=2), {"width": 19}),
+    "lowest bit first": (cube(width=19), lambda frames: np.packbits(frames, axis=2, bitorder="little"), LITTLE | {"width": 19}),
+    "along the height": (cube(height=16, width=21), lambda frames: np.packbits(frames, axis=1), ALONG),
+    "along a height of 13": (
+        cube(height=13, width=21),
+        lambda frames: np.packbits(frames, axis=1, bitorder="little"),
+        ALONG | LITTLE | {"height": 13},
+    ),
+    **{
+        f"channel {channel}": (
+            cube(width=19),
+            lambda frames, channel=channel: np.packbits(np.roll(in_colour(frames), channel, axis=-1), axis=2),
+            {"width": 19, "channel": channel},
+        )
+        for channel in range(3)
+    },
+    "a channel along the height": (
+        cube(height=16),
+        lambda frames: np.packbits(np.roll(in_colour(frames), 2, axis=-1), axis=1, bitorder="little"),
+        ALONG | LITTLE | {"channel": 2},
+    ),
+}
+
+
+def in_colour(frames: np.ndarray) -> np.ndarray:
+    """Return frames with two other channels after them: (n, H, W, 3)."""
+    return np.stack([frames, *(cube(*frames.shape, seed=seed) for seed in (1, 2))], axis=-1)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_frames_are_read_in_any_layout(tmp_path: Path, layout: str) -> None:
+    frames, store, keys = LAYOUTS[layout]
+    with opened(saved(tmp_path / "cube.npy", store(frames)), frame_rate_hz=96800, **keys) as source:
+        assert str(source.info) == f"40 binary frames of {frames.shape[1]}x{frames.shape[2]} at 96,800 Hz"
         assert source.valid.all()
-        assert source.valid.shape == (6, width)
+        assert source.valid.shape == frames.shape[1:]
         for span in (FrameSpan(0, 40), FrameSpan(7, 8), FrameSpan(13, 40)):
-            np.testing.assert_array_equal(source.frames(span), frames[span.start : span.stop])
-            np.testing.assert_array_equal(source.counts(span), frames[span.start : span.stop].sum(axis=0))
+            part = frames[span.start : span.stop]
+            np.testing.assert_array_equal(source.frames(span), part)
+            np.testing.assert_array_equal(source.counts(span), part.sum(axis=0))
+            np.testing.assert_array_equal(source.packed(span), np.packbits(part, axis=-1))
 
 
 def test_width_defaults_to_whole_bytes(tmp_path: Path) -> None:
@@ -71,44 +105,6 @@ def test_source_is_read_from_many_threads(tmp_path: Path) -> None:
 
     with opened(saved(tmp_path / "cube.npy", np.packbits(frames, axis=-1))) as source, ThreadPoolExecutor(4) as pool:
         assert all(pool.map(read, range(4)))
-
-
-@pytest.mark.parametrize("width", [24, 19])
-def test_channel_of_a_colour_capture_is_read(tmp_path: Path, width: int) -> None:
-    channels = [cube(width=width, seed=seed) for seed in range(3)]
-    path = saved(tmp_path / "cube.npy", np.packbits(np.stack(channels, axis=-1), axis=2))
-    for channel, frames in enumerate(channels):
-        with opened(path, width=width, channel=channel) as source:
-            np.testing.assert_array_equal(source.frames(source.info.span), frames)
-            np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), frames[3:30].sum(axis=0))
-            np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
-
-
-@pytest.mark.parametrize("bit_order", ["big", "little"])
-@pytest.mark.parametrize("height", [16, 13])
-def test_frames_packed_along_the_height_are_read(tmp_path: Path, bit_order: Any, height: int) -> None:
-    frames = cube(height=height, width=21)
-    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=1, bitorder=bit_order))
-    with opened(path, packed_along="height", bit_order=bit_order, height=height) as source:
-        assert source.info.frame_shape == (height, 21)
-        np.testing.assert_array_equal(source.frames(FrameSpan(3, 30)), frames[3:30])
-        np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), frames[3:30].sum(axis=0))
-        np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
-
-
-def test_colour_packed_along_the_height_is_read(tmp_path: Path) -> None:
-    frames = np.stack([cube(height=16, seed=seed) for seed in range(3)], axis=-1)
-    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=1, bitorder="little"))
-    with opened(path, packed_along="height", bit_order="little", channel=2) as source:
-        np.testing.assert_array_equal(source.frames(source.info.span), frames[..., 2])
-
-
-def test_frames_with_the_first_pixel_in_the_lowest_bit_are_read(tmp_path: Path) -> None:
-    frames = cube(width=19)
-    path = saved(tmp_path / "cube.npy", np.packbits(frames, axis=2, bitorder="little"))
-    with opened(path, bit_order="little", width=19) as source:
-        np.testing.assert_array_equal(source.frames(source.info.span), frames)
-        np.testing.assert_array_equal(source.packed(FrameSpan(3, 30)), np.packbits(frames[3:30], axis=-1))
 
 
 @pytest.fixture
