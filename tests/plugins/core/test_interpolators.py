@@ -54,12 +54,6 @@ def test_interpolators_do_not_depend_on_pixel_origin(name, gaps, seed, fit, moti
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_interpolators_return_still_camera_for_one_knot(name, fit):
-    trajectory = fit(name, [50], translation(3, 4)[None])
-    np.testing.assert_allclose(trajectory.at([0, 50, 1000]), [translation(3, 4)] * 3, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("n_knots", [2, 3, 4, 5, 12])
 def test_extrapolation_holds_velocity_then_stops(name, n_knots, fit):
     """By default for twice the mean distance of the knots: 200 frames, here at 0.5 px per frame."""
@@ -87,16 +81,6 @@ def test_extrapolation_continues_velocity_at_the_ends(name, fit, turning):
 def test_extrapolation_stops_at_once_for_hold_frames_0(name, fit):
     trajectory = fit(name, [0, 100], np.stack([np.eye(3), translation(50, 0)]), hold_frames=0)
     np.testing.assert_allclose(trajectory.at([-10, 130])[:, 0, 2], [0, 50], atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_at_returns_normalised_homographies_independent_of_other_instants(name, fit, motions):
-    instants = np.arange(8) * 70.0
-    trajectory = fit(name, instants, motions(8, 0))
-    frames = np.linspace(-200, 700, 57)
-    together = trajectory.at(frames)
-    assert np.all(together[:, 2, 2] == 1)
-    np.testing.assert_array_equal(together, np.concatenate([trajectory.at(frame) for frame in frames]))
 
 
 @pytest.mark.parametrize(("n_knots", "degree"), [(1, 0), (2, 1), (3, 2), (4, 3), (9, 3)])

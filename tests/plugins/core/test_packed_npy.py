@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import gzip
 import os
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,19 +92,6 @@ def test_lit_padding_bits_are_ignored(tmp_path: Path) -> None:
         assert source.frames(FrameSpan(0, 3)).shape == (3, 2, 11)
 
 
-def test_source_is_read_from_many_threads(tmp_path: Path) -> None:
-    frames = cube(n=400)
-    start = threading.Barrier(4)
-
-    def read(offset: int) -> bool:
-        start.wait()
-        spans = [FrameSpan(first, first + 50) for first in range(offset, 350, 4)]
-        return all(np.array_equal(source.counts(s), frames[s.start : s.stop].sum(axis=0)) for s in spans)
-
-    with opened(saved(tmp_path / "cube.npy", np.packbits(frames, axis=-1))) as source, ThreadPoolExecutor(4) as pool:
-        assert all(pool.map(read, range(4)))
-
-
 @pytest.fixture
 def gzipped(tmp_path: Path) -> Path:
     path = tmp_path / "cube.npy.gz"
@@ -145,14 +130,6 @@ def test_full_disk_is_reported_before_unpacking(gzipped: Path, monkeypatch: pyte
         f"cannot write {beside}: it takes 848 B, and its disk has 847 B free; free some space or choose another folder"
     )
     assert list(gzipped.parent.iterdir()) == [gzipped]
-
-
-def test_span_beyond_the_end_is_refused(tmp_path: Path) -> None:
-    with opened(saved(tmp_path / "cube.npy", np.packbits(cube(), axis=-1))) as source:
-        for read in (source.counts, source.frames):
-            with pytest.raises(InputError) as caught:
-                read(FrameSpan(30, 41))
-            assert str(caught.value) == "frames 30 to 40 were requested, but the capture has 40 frames (0 to 39)"
 
 
 PACKED = np.packbits(cube(), axis=-1)
