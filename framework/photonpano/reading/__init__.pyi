@@ -45,6 +45,7 @@ from .pixel_order import other_order as other_order
 from .remote import library as library
 from .remote import read_range as read_range
 from .sources import BinarySource as BinarySource
+from .sources import BlockSource as BlockSource
 from .sources import Closing as Closing
 from .sources import FrameLayout as FrameLayout
 from .sources import SingleFrameSource as SingleFrameSource

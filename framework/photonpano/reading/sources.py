@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,14 +144,43 @@ class BinarySource(Closing, ABC):
         self.files.close()
 
 
-class SingleFrameSource(Closing, ABC):
-    """Sums and spans of single frames. A subclass gives a frame, and what is missing for a `photonpano.Source`.
+class BlockSource(Closing, ABC):
+    """Sums and spans of frames of values. A subclass yields frames, and has what is missing for a `photonpano.Source`.
 
     Attributes:
         info: frames, size, rate; the subclass sets it.
     """
 
     info: StreamInfo
+
+    @abstractmethod
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield some frames of a span at a time, (n, H, W), whose values fit into the bits of `info`, and their place in it.
+
+        Raises:
+            InputError: the frames cannot be read.
+        """
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        for _, values in self.blocks(span):
+            counts += values.sum(axis=0, dtype=np.uint32)
+        return counts
+
+    def frames(self, span: FrameSpan) -> Frames:
+        """Return the frames of a span: (n, H, W) uint8, or uint16 of more than eight bits."""
+        self.info.require(span)
+        shape = len(span), *self.info.frame_shape
+        frames: Frames = np.empty(shape, np.uint8) if self.info.bit_depth <= 8 else np.empty(shape, np.uint16)
+        for place, values in self.blocks(span):
+            frames[place] = values
+        return frames
+
+
+class SingleFrameSource(BlockSource):
+    """Frames that are made or read one by one. A subclass gives a frame."""
 
     @abstractmethod
     def frame(self, index: int) -> NDArray[np.bool_] | Frames:
@@ -161,19 +190,7 @@ class SingleFrameSource(Closing, ABC):
             InputError: the frame cannot be read.
         """
 
-    def counts(self, span: FrameSpan) -> Counts:
-        """Sum the frames of a span: (H, W) uint32."""
-        self.info.require(span)
-        counts = np.zeros(self.info.frame_shape, np.uint32)
-        for index in range(span.start, span.stop):
-            counts += self.frame(index)
-        return counts
-
-    def frames(self, span: FrameSpan) -> Frames:
-        """Return the frames of a span: (n, H, W) uint8, or uint16 of more than eight bits."""
-        self.info.require(span)
-        shape = len(span), *self.info.frame_shape
-        frames: Frames = np.empty(shape, np.uint8) if self.info.bit_depth <= 8 else np.empty(shape, np.uint16)
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the frames of a span one by one."""
         for place, index in enumerate(range(span.start, span.stop)):
-            frames[place] = self.frame(index)
-        return frames
+            yield slice(place, place + 1), self.frame(index)[None]

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import uniform_filter
 
 from photonpano import BoolArray, FloatArray
+from photonpano.filtering import Filtered
 
 _ROUNDS = 6  # steps of expectation maximisation; more change the motion by less than its noise
 _UNKNOWN = 1e6  # variance of an unknown value, relative to the median of the others
 _NEIGHBOURS = 3, 5  # windows and frequencies over which the power is averaged to test it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Separated:
-    """A motion without its noise.
-
-    Attributes:
-        signal: (S,) expected motion, given the values and the spectrum.
-        std: (S,) its standard deviation.
-    """
-
-    signal: FloatArray
-    std: FloatArray
-
-
-def separated(values: FloatArray, variances: FloatArray, size: int, significant: float, slow: tuple[int, float]) -> Separated:
+def separated(values: FloatArray, variances: FloatArray, size: int, significant: float, slow: tuple[int, float]) -> Filtered:
     """Estimate a motion whose spectrum is not known, in windows that overlap by half.
 
     In each window the motion is a Gaussian process. Its power at the frequencies that stand out from the noise is estimated by
@@ -55,7 +41,7 @@ def separated(values: FloatArray, variances: FloatArray, size: int, significant:
         signal[window] += taper * mean
         variance[window] += taper * spread
         total[window] += taper
-    return Separated(signal / total, np.sqrt(np.maximum(variance / total, 0)))
+    return Filtered(signal / total, np.sqrt(np.maximum(variance / total, 0)))
 
 
 def _standing_out(windows: list[tuple[FloatArray, FloatArray]], significant: float, slow: tuple[int, float]) -> BoolArray:

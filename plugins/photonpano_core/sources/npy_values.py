@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, Location, StreamInfo, Url
 from photonpano.photometry import BinarySumResponse
-from photonpano.reading import BinarySource, Closing, FrameFile, FrameLayout, NpyHeader, StoredFrames
+from photonpano.reading import BinarySource, BlockSource, FrameFile, FrameLayout, NpyHeader, StoredFrames
 
 _BLOCK_BYTES = 4 * 1024**2  # read at once of frames along the last axis, which are scattered over the file
 _NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
@@ -85,7 +85,7 @@ class NpyBits(BinarySource):
         self._values.close()
 
 
-class NpySums(Closing):
+class NpySums(BlockSource):
     """Sums of binary frames: a `photonpano.Source`.
 
     Raises:
@@ -99,24 +99,8 @@ class NpySums(Closing):
         self.valid.flags.writeable = False
         self._values = values
 
-    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
-        """Sum the frames of a span: (H, W) uint32."""
-        self.info.require(span)
-        counts = np.zeros(self.info.frame_shape, np.uint32)
-        for _, sums in self._pieces(span):
-            counts += sums.sum(axis=0, dtype=np.uint32)
-        return counts
-
-    def frames(self, span: FrameSpan) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Return the frames of a span: (n, H, W), each the sum of binary frames."""
-        self.info.require(span)
-        shape = len(span), *self.info.frame_shape
-        frames = np.empty(shape, np.uint8) if self.info.bit_depth <= 8 else np.empty(shape, np.uint16)
-        for place, sums in self._pieces(span):
-            frames[place] = sums
-        return frames
-
-    def _pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the frames of a span, a few at a time: see `BlockSource`."""
         most = self.response.n
         for place, values in self._values.blocks(span):
             if values.max() > most or values.min() < 0:
