@@ -166,10 +166,7 @@ def _map(
 
 
 def _apart(found: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """Return reconstructions, the largest first, without those whose images all belong to larger ones.
-
-    The mapper begins several times, and a later model may grow over the images of an earlier one.
-    """
+    """Return models, the largest first, without those whose images all belong to larger ones."""
     kept: list[pycolmap.Reconstruction] = []
     seen: set[int] = set()
     for each in sorted(found, key=lambda model: -model.num_reg_images()):

@@ -181,15 +181,8 @@ class _Alignment:
     ) -> tuple[Pyramid, _Descent]:
         """Restrict an alignment to the larger part that follows one motion, if the images do not follow it as a whole.
 
-        Of several motions, that of the camera fits most of the image.
-
-        Args:
-            moving: the template.
-            fixed: the other image.
-            first: the alignment of the coarse layers, down to the layer `judged`.
-            start: where it started; an object that stands out may have drawn it away from there.
-            judged: number of the layer on which parts are compared.
-            searches: whether other motions are tried.
+        `first` is the alignment of the coarse layers, down to the layer `judged` on which parts are compared, from `start`. Of
+        several motions, that of the camera fits most of the image.
         """
         n_layers = len(moving.layers)
 
@@ -222,13 +215,7 @@ class _Alignment:
         return restricted, found
 
     def _best(self, found: Sequence[tuple[float, Aligned]]) -> tuple[float, Homography, Quality]:
-        """Return the scale, the homography in pixels of the finest layer, and the quality of the layer with the least error.
-
-        Motion blur removes the details of a fine layer but not its noise, which a coarse layer averages out.
-
-        Args:
-            found: scales of layers and their alignments, coarsest first.
-        """
+        """Return scale, homography in px of the finest layer, and quality of the layer of least error: blur spoils others."""
         best: tuple[float, Homography, Quality] | None = None
         for scale, aligned in reversed(found):
             quality = aligned.quality(None if self._camera is None else self._camera.scaled(scale).matrix)

@@ -76,10 +76,7 @@ class EccLocator:
 
 
 def _sentence_of(error: cv2.error) -> str:
-    """Return OpenCV's message without the names of its files and functions.
-
-    It is taken from the text: attributes of `cv2.error` are shared by all threads.
-    """
+    """Return OpenCV's message without files and functions, from its text: threads share the attributes of the error."""
     found = re.search(r"error: \([^)]*\) (.*?)\.? in function", str(error))
     return found[1] if found else str(error)
 

@@ -108,12 +108,7 @@ AnySource: TypeAlias = PackedFileSource | NpyBits | NpySums
 
 
 def _open(config: AnyConfig) -> AnySource:
-    """Open a capture.
-
-    Raises:
-        InputError: the file is missing, damaged, or does not agree with the config.
-        OutputError: a compressed file cannot be unpacked.
-    """
+    """Open a capture; raises an `InputError`, or an `OutputError` where a compressed file cannot be unpacked."""
     header = _whole_header(config)
     return _source(config, unpacked(config.path) if is_gzip(config.path) else config.path, header)
 
@@ -264,11 +259,7 @@ def _frames_are_last(path: Location, header: NpyHeader) -> bool:
 
 
 def _require_order(config: PackedNpyConfig) -> None:
-    """Refuse frames that show that they are not packed, or in another order than is claimed by default.
-
-    Raises:
-        InputError: it is so, and the message has the line of the spec that reads them; or the capture cannot be opened.
-    """
+    """Refuse frames that are not packed, or in another order than by default, with the line of a spec that reads them."""
     header = _whole_header(config)
     path, samples = config.path, _samples(config.path, header, config.channel)
     if not samples or config.bit_order is not None or config.packed_along is not None:

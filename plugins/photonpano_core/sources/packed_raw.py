@@ -34,11 +34,7 @@ class PackedRawConfig(Config):
 
 
 def _open(config: PackedRawConfig) -> PackedFileSource:
-    """Open a capture.
-
-    Raises:
-        InputError: the file is missing, has no frame, or ends within a frame; or it is standard input.
-    """
+    """Open a capture; raises an `InputError` if it is missing, has no frame, ends within one, or is standard input."""
     path, frame_bytes = _file(config), config.layout.stored_bytes
     size = size_of(path)
     n_frames, rest = divmod(size - config.header_bytes, frame_bytes)

@@ -137,11 +137,7 @@ class _Pages:
 
 
 def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
-    """Return the form that all frames have.
-
-    Raises:
-        InputError: the frames differ.
-    """
+    """Return the form that all frames have; raises an `InputError` if they differ."""
     first: tuple[str, _Form] | None = None
     for name, form in forms:
         if first is None:

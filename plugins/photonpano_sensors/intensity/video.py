@@ -75,11 +75,7 @@ class _Decoder:
         self.next, self._seeks = self._index.key_before(frame), True
 
     def decode(self) -> tuple[int, Levels]:
-        """Decode the next frame, and return its index and its levels.
-
-        Raises:
-            InputError: the frame is damaged or missing.
-        """
+        """Decode the next frame: its index and its levels; raises an `InputError` if it is damaged or missing."""
         due = self.next
         try:
             if self._seeks:
