@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
 
+# Typical sizes of the entries of a matrix that maps pixels of an image of 300 px.
 PIXELS = np.array([[1, 1, 300], [1, 1, 300], [1 / 300, 1 / 300, 1]])
-"""Typical sizes of the entries of a matrix that maps pixels of an image of 300 px."""
 
 
 def matrices(size: float) -> np.ndarray:

@@ -22,12 +22,12 @@ SHAPE = (120, 176)
 STILL = np.eye(3)
 CONTEXT = StageContext(StreamInfo(1000, *SHAPE, frame_rate_hz=None), BinaryResponse())
 CONTRIBUTIONS = {each.name: each for each in photonpano_locators()}
+# Locators, their configs, and their tolerance in px at 0.5 photons per pixel per frame.
 BACKENDS = {
     "registrator": ("kornia-registrator", {}, 0.12),
     "smnn": ("kornia-features", {"max_keypoints": 400}, 0.3),
     "adalam": ("kornia-features", {"max_keypoints": 400, "matcher": "adalam"}, 0.3),
 }
-"""Locators, their configs, and their tolerance in px at 0.5 photons per pixel per frame."""
 
 
 @pytest.fixture(params=["registrator", "smnn"])

@@ -15,8 +15,7 @@ from photonpano import FrameSpan, InputError, SourceContext, discover
 
 CATALOG = discover()
 FRAMES = (np.random.default_rng(1).random((6, 48, 64)) * 255).astype(np.uint8)
-SAMPLE = 30
-"""Damaged files of each kind; `tests/benchmarks/fuzz.py` reads thousands."""
+SAMPLE = 30  # damaged files of each kind; `tests/benchmarks/fuzz.py` reads thousands
 
 
 def read(name: str, path: Path) -> str:
