@@ -31,31 +31,24 @@ from photonpano.geometry import Camera, camera_matrix
 from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
-from photonpano_colmap.pose_spline import PoseSpline, left_out, positions_of
 from photonpano_colmap.posing.merging import lit_counts
+from photonpano_colmap.posing.path import PoseSpline, left_out, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
 from photonpano_colmap.reversal import Readings
 
-_PHOTONS = 60.0
-"""Photons of a pixel in an average: with fewer, keypoints are noise."""
-_BLUR_PX = 6.0
-"""Blur of an average by motion that keypoints bear; the less of both decides."""
-_MOST = 150
-"""Averages of a capture, at most: matching all pairs takes minutes."""
-_FEWEST = 24
-"""Averages of a capture, at least, if it is long enough."""
+_PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise
+_BLUR_PX = 6.0  # motion blur of an average that keypoints tolerate; the shorter average of both limits is taken
+_MOST = 150  # most averages of a capture: matching all pairs of more takes many minutes
+_FEWEST = 24  # fewest averages of a capture that is long enough
 _SHORTEST = 4
-_TEXTURE = 60, 15
-"""Keypoints of an average, and matches with another one, below which it shows too little texture."""
+_TEXTURE = 60, 15  # keypoints of an average, and matches with another, below which there is too little texture
+# Fraction of matched keypoints below which noise or blur, not the path of the camera, is why there are no poses.
 _FEW_MATCH = 0.25
-"""Share of keypoints that match another average, below which noise or blur, and not the path, is why there are no poses."""
 _ANOTHER_SIZE = "choose a larger pose.with.group_size for less noise, or a smaller one for less blur"
-_FOCAL_SHARE = 0.02
-"""Expected error of a focal length that was found, relative to it, above which the poses are doubtful."""
+_FOCAL_SHARE = 0.02  # relative standard error of an estimated focal length above which poses are doubtful
+# Relative error of an estimated focal length that residuals do not show: blur shifts keypoints alike in many averages.
 _FOCAL_BIAS = 0.01
-"""Error of a found focal length that residuals do not show, relative to it: blur moves keypoints alike in many averages."""
-_PLANE = 0.01
-"""Smallest extent of the points, relative to their largest, below which they lie in a plane."""
+_PLANE = 0.01  # points lie in a plane if their smallest extent is below this fraction of the largest
 _SHOWN_PIECES = 4
 
 
@@ -176,7 +169,7 @@ class _Assembly:
         apart, angles = left_out(instants, piece.poses)
         std_position = _between(frames, instants, noise.std_position, apart, located)
         std_rotation = _between(frames, instants, noise.std_rotation, angles, located)
-        length = float(np.linalg.norm(np.diff(positions_of(piece.poses), axis=0), axis=1).sum())
+        views = tuple(self._view(place) for place in range(len(piece.images)))
         return PoseEstimate(
             camera_matrix=camera.matrix,
             distortion=camera.distortion,
@@ -185,10 +178,10 @@ class _Assembly:
             located=located,
             std_position=std_position,
             std_rotation_deg=np.rad2deg(std_rotation),
-            points=ScenePoints(piece.points, self._flux()),
-            views=tuple(self._view(place) for place in range(len(piece.images))),
+            points=ScenePoints(piece.points, flux_of_points(views, len(piece.points))),
+            views=views,
             lost=self._lost(located),
-            levels=(self._level(noise, length),),
+            levels=(self._level(noise),),
             doubts=tuple(self._doubts(noise)),
         )
 
@@ -213,18 +206,6 @@ class _Assembly:
 
         return PosedView(span, span.centre, self.piece.poses[place], points, xy, flux)
 
-    def _flux(self) -> FluxImage:
-        """Return the mean flux of the pixels in which averages show each point: (M,)."""
-        total, times = np.zeros(len(self.piece.points)), np.zeros(len(self.piece.points))
-        for image, (indices, xy) in zip(self.piece.images.tolist(), self.piece.observed, strict=True):
-            flux = _exposure(self.source, self.spans[image]).flux
-            column, row = (np.clip(np.rint(xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
-            seen = flux[row, column]
-            known = np.isfinite(seen)
-            np.add.at(total, indices[known], seen[known])
-            np.add.at(times, indices[known], 1)
-        return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
-
     def _lost(self, located: BoolArray) -> tuple[LostFrames, ...]:
         """Return the frames without a pose: those of averages that COLMAP left out, and the rest at the end."""
         others = {int(image): number for number, piece in enumerate(self.found.pieces[1:], 2) for image in piece.images}
@@ -247,7 +228,7 @@ class _Assembly:
             lost.append(LostFrames(FrameSpan(start, stop), reason))
         return tuple(lost)
 
-    def _level(self, noise: PoseNoise, length: float) -> dict[str, float | int | str | None]:
+    def _level(self, noise: PoseNoise) -> dict[str, float | int | str | None]:
         return {
             "group_frames": len(self.spans[0]),
             "averages": len(self.spans),
@@ -256,7 +237,7 @@ class _Assembly:
             "keypoints": float(np.median(self.found.n_keypoints)),
             "parallax_deg": float(np.rad2deg(np.median(parallax(self.piece)))),
             "residual_px": noise.residual_px,
-            "std_position": float(np.sqrt(np.mean(noise.std_position**2))) / length if length else None,
+            "std_position": relative_std(noise.std_position, self.piece.poses),
         }
 
     def _std_focal(self, noise: PoseNoise) -> float:
@@ -280,6 +261,25 @@ class _Assembly:
                 f"only {len(self.piece.images)} of {len(self.spans)} averages have a pose; choose another pose.with.group_size"
             )
         return doubts
+
+
+def flux_of_points(views: Sequence[PosedView], n_points: int) -> FluxImage:
+    """Return the mean flux of the pixels in which views show each point: (n_points,); NaN where none does."""
+    total, times = np.zeros(n_points), np.zeros(n_points)
+    for view in views:
+        flux = view.flux()
+        column, row = (np.clip(np.rint(view.xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
+        seen = flux[row, column]
+        known = np.isfinite(seen)
+        np.add.at(total, view.points[known], seen[known])
+        np.add.at(times, view.points[known], 1)
+    return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
+
+
+def relative_std(std_position: FloatArray, poses: FloatArray) -> float | None:
+    """Return the root mean square error of positions, as a fraction of the path through them; None if the camera rests."""
+    length = float(np.linalg.norm(np.diff(positions_of(poses), axis=0), axis=1).sum())
+    return float(np.sqrt(np.mean(std_position**2))) / length if length else None
 
 
 def chosen_size(capture: CaptureSummary, n_frames: int) -> tuple[int, str]:
@@ -333,8 +333,8 @@ def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: F
     return np.where(located, np.sqrt(at_poses**2 + _MISSED_SHARE * missed), np.nan)
 
 
+# Interpolation error of the spline between poses, as a fraction of the variance of leave-one-out errors.
 _MISSED_SHARE = 0.5
-"""Share of the variance about a spline with a gap that one without a gap misses between poses."""
 
 
 def _require_texture(found: Reconstruction) -> None:

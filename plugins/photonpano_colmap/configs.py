@@ -9,8 +9,9 @@ from pydantic import Field
 from photonpano import Config
 from photonpano.locating import KeypointConfig
 
-MIN_AVERAGES = 5
-"""Averages of a capture, at least: a spline through fewer poses would be a guess."""
+FIRST_CENTRE = 0.5  # position of the centre of the first pixel in COLMAP; ours is 0
+SEEDS = 2**31  # seeds of the library are below this
+MIN_AVERAGES = 5  # a spline through fewer poses would be a guess
 
 
 class PycolmapTwoViewConfig(KeypointConfig):

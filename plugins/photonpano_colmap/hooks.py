@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import photonpano_colmap as plugin
 from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, hookimpl
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from photonpano import Locator, PoseEstimator, StageContext, StreamInfo
+    from photonpano import StreamInfo
 
 _REQUIRES = (Requirement("pycolmap", "photonpano[colmap]"),)
 
@@ -22,7 +23,7 @@ def photonpano_locators() -> Iterator[LocatorContribution]:
         name="pycolmap-two-view",
         summary="COLMAP's SIFT and matcher, LO-RANSAC, and a least-squares fit of the inliers",
         config=PycolmapTwoViewConfig,
-        build=_build_two_view,
+        build=lambda config, context: plugin.TwoViewLocator(config, context.seed),
         requires=_REQUIRES,
     )
 
@@ -34,7 +35,7 @@ def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
         name="colmap-averages",
         summary="Averages of frames into COLMAP, and a spline through their poses (paper, section 6, Fig. 11)",
         config=ColmapAveragesConfig,
-        build=_build_averages,
+        build=lambda config, context: plugin.AveragesEstimator(config, context),
         check=_problems_of_averages,
         requires=_REQUIRES,
     )
@@ -42,28 +43,10 @@ def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
         name="stratified-pose",
         summary="Exposures merged through the depth of the scene, without tremor, and located; begins with colmap-averages",
         config=StratifiedPoseConfig,
-        build=_build_stratified,
+        build=lambda config, context: plugin.StratifiedEstimator(config, context),
         check=_problems_of_averages,
         requires=(*_REQUIRES, Requirement("gtsam", "photonpano[poses]")),
     )
-
-
-def _build_two_view(config: PycolmapTwoViewConfig, context: StageContext) -> Locator:
-    from photonpano_colmap.two_view import TwoViewLocator
-
-    return TwoViewLocator(config, context.seed)
-
-
-def _build_averages(config: ColmapAveragesConfig, context: StageContext) -> PoseEstimator:
-    from photonpano_colmap.averages import AveragesEstimator
-
-    return AveragesEstimator(config, context)
-
-
-def _build_stratified(config: StratifiedPoseConfig, context: StageContext) -> PoseEstimator:
-    from photonpano_colmap.stratified import StratifiedEstimator
-
-    return StratifiedEstimator(config, context)
 
 
 def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> list[str]:

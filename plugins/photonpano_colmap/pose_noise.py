@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray
 
-_POSE = 6
-"""Unknowns of a pose: rotation vector, and position."""
-_SMALLEST = 1e-12
-"""Eigenvalues of the information below this share of the largest count as directions that nothing determines."""
+_POSE = 6  # unknowns of a pose: rotation vector and position
+_SMALLEST = 1e-12  # eigenvalues of the information below this fraction of the largest are undetermined directions
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,17 +18,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from photonpano import CameraGuess, FloatArray
-from photonpano_colmap.configs import ColmapAveragesConfig
+from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, ColmapAveragesConfig
 from photonpano_colmap.reversal import Readings, likelier_reading
 
-_FIRST_CENTRE = 0.5
-"""Position of the first pixel's centre in COLMAP; ours is 0."""
-_SEEDS = 2**31
-"""Seeds of the library are below this."""
-_USUAL_FOCAL = 1.2
-"""Focal length to start from where none is given, as a share of the longer side of a frame."""
-_START_ANGLE_DEG = 4.0
-"""Parallax of the pair that COLMAP starts with: captures are short, so this is less than its own 16 degrees."""
+_USUAL_FOCAL = 1.2  # initial focal length where none is given, in longer sides of a frame
+_START_ANGLE_DEG = 4.0  # parallax of COLMAP's initial pair; its own 16 degrees are too much for short captures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +80,7 @@ def reconstruct(
     """
     # What it would print as an error, such as that it found no poses, becomes a message of ours.
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    seed %= _SEEDS
+    seed %= SEEDS
     pycolmap.set_random_seed(seed)
     with tempfile.TemporaryDirectory(prefix="photonpano-colmap-") as name:
         folder = Path(name)
@@ -111,7 +105,7 @@ def _extract(database: Path, folder: Path, camera: CameraGuess, shape: tuple[int
     x, y = camera.centre_px or ((width - 1) / 2, (height - 1) / 2)
     focal = camera.focal_px or _USUAL_FOCAL * max(height, width)
     reader = pycolmap.ImageReaderOptions(mask_path=str(folder / "masks"))
-    numbers: tuple[float, ...] = (focal, x + _FIRST_CENTRE, y + _FIRST_CENTRE)
+    numbers: tuple[float, ...] = (focal, x + FIRST_CENTRE, y + FIRST_CENTRE)
     if any(camera.distortion):
         reader.camera_model, numbers = "OPENCV", (focal, *numbers, *camera.distortion)
     else:
@@ -172,10 +166,7 @@ def _map(
 
 
 def _apart(found: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """Return reconstructions, the largest first, without those whose images all belong to larger ones.
-
-    The mapper begins several times, and a later model may grow over the images of an earlier one.
-    """
+    """Return models, the largest first, without those whose images all belong to larger ones."""
     kept: list[pycolmap.Reconstruction] = []
     seen: set[int] = set()
     for each in sorted(found, key=lambda model: -model.num_reg_images()):
@@ -195,7 +186,7 @@ def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:
     for image in images:
         seen = [point for point in image.points2D if point.has_point3D()]
         indices = np.array([numbers[point.point3D_id] for point in seen], np.intp)
-        xy = np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2) - _FIRST_CENTRE
+        xy = np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2) - FIRST_CENTRE
         observed.append((indices, xy))
     [camera] = found.cameras.values()
     return Piece(

@@ -1,7 +1,7 @@
-"""Two readings of one scene: as COLMAP found it, and with near and far exchanged.
+"""Resolve the depth reversal of a reconstruction (the ambiguity of Necker's cube).
 
-From afar, a scene and its mirror image in depth look alike while the camera turns the other way (the reversal of Necker's
-cube). A reconstruction may end in either; only perspective tells them apart, by the residuals that the wrong one leaves.
+From afar, a scene and its mirror image in depth look alike if the camera rotates the other way. A reconstruction may end in
+either; perspective leaves larger residuals in the wrong one.
 """
 
 from __future__ import annotations
@@ -14,16 +14,12 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from photonpano import FloatArray
-from photonpano_colmap.pose_spline import positions_of
+from photonpano_colmap.posing.path import positions_of
 
-_NEAREST = 0.1
-"""Reversed points are at least this far away, as a share of the median depth."""
-_FARTHEST_OFF_PX = 4.0
-"""Points further than this from where images show them are left out of a reversed reading, as COLMAP leaves them out."""
-_SAME = 0.2
-"""Two readings agree if turns of the camera differ by less than this share of them."""
-_ALIKE = 0.9
-"""Neither reading is likelier if the residuals of the better one are above this share of the other's."""
+_NEAREST = 0.1  # minimum distance of reversed points, in median depths
+_FARTHEST_OFF_PX = 4.0  # points of a reversed reading with a larger residual are removed, as COLMAP removes them
+_SAME = 0.2  # two readings agree if their rotations differ by less than this fraction
+_ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is above this
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +71,9 @@ def reversed_in_depth(poses: FloatArray, points: FloatArray) -> tuple[FloatArray
     rotations = poses[:, :, :3] @ towards.T
     target = np.array([0.0, 0.0, depth])
     # The camera pans and tilts the other way, and goes on to see the middle of the scene where it saw it.
-    turned = Rotation.from_rotvec(Rotation.from_matrix(rotations).as_rotvec() * (-1, -1, 1)).as_matrix()
+    rotated = Rotation.from_rotvec(Rotation.from_matrix(rotations).as_rotvec() * (-1, -1, 1)).as_matrix()
     looked = np.einsum("nij,nj->ni", rotations, target - (positions_of(poses) - middle) @ towards.T)
-    return np.concatenate([turned, (looked - turned @ target)[:, :, None]], axis=2), seen
+    return np.concatenate([rotated, (looked - rotated @ target)[:, :, None]], axis=2), seen
 
 
 def _reversed(found: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -113,10 +109,10 @@ def _adjust(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
 
 
 def _agree(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction) -> bool:
-    """Return whether the camera turns alike in two reconstructions from the same images."""
+    """Return whether the camera rotates alike in two reconstructions from the same images."""
     poses = [
         np.array([each.cam_from_world().matrix() for each in model.images.values() if each.has_pose])
         for model in (first, second)
     ]
-    turns = [Rotation.from_matrix(each[1:, :, :3] @ each[0, :, :3].T) for each in poses]
-    return bool(np.median((turns[0] * turns[1].inv()).magnitude()) < _SAME * np.median(turns[0].magnitude()))
+    rotations = [Rotation.from_matrix(each[1:, :, :3] @ each[0, :, :3].T) for each in poses]
+    return bool(np.median((rotations[0] * rotations[1].inv()).magnitude()) < _SAME * np.median(rotations[0].magnitude()))

@@ -21,15 +21,13 @@ from photonpano import (
     Source,
     StageContext,
 )
-from photonpano_colmap.averages import AveragesEstimator
+from photonpano_colmap.averages import AveragesEstimator, flux_of_points, relative_std
 from photonpano_colmap.configs import StratifiedPoseConfig
-from photonpano_colmap.pose_spline import PoseSpline, positions_of
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.merging import PosedExposure
-from photonpano_colmap.posing.path import Path
+from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 
-_MISSED = 0.5
-"""Share of the last change of a frame's pose, beyond that of its exposures, that the next level would change it by."""
+_MISSED = 0.5  # expected next pose update, as a fraction of the last one
 
 
 class StratifiedEstimator:
@@ -84,12 +82,12 @@ class _Assembly:
         if level.tremor is not None:
             stds = [np.hypot(stds[0], level.tremor.shift), np.hypot(stds[1], level.tremor.std)]
         moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)
-        turned = _left(_turns(self.before, poses), frames, instants)
+        rotated = _left(_rotations_between(self.before, poses), frames, instants)
         located = level.scene.located
         poses[~located] = np.nan
         std_position, std_rotation = (
             np.where(located, np.hypot(std, _MISSED * missed), np.nan)
-            for std, missed in zip(stds, (moved, turned), strict=True)
+            for std, missed in zip(stds, (moved, rotated), strict=True)
         )
         views = self._views()
         return replace(
@@ -98,7 +96,7 @@ class _Assembly:
             located=located,
             std_position=std_position,
             std_rotation_deg=np.rad2deg(std_rotation),
-            points=ScenePoints(level.adjusted.points, self._flux(views)),
+            points=ScenePoints(level.adjusted.points, flux_of_points(views, len(level.adjusted.points))),
             views=views,
             lost=self._lost(),
             levels=self.levels,
@@ -114,24 +112,12 @@ class _Assembly:
         level, views = self.level, []
         kept = [each for each, located in zip(level.exposures, level.is_located, strict=True) if located]
         for number, (posed, pose) in enumerate(zip(kept, level.adjusted.poses, strict=True)):
-            seen = level.sightings.views == number
+            seen = level.observations.views == number
             # A point is sought from several key exposures, but is one point of one of them: it is seen once.
-            points, pixels = level.sightings.points[seen], level.sightings.pixels[seen]
+            points, pixels = level.observations.points[seen], level.observations.pixels[seen]
             group = posed.exposure.group
             views.append(PosedView(group.span, group.reference, pose, points, pixels, _flux_of(posed)))
         return tuple(views)
-
-    def _flux(self, views: tuple[PosedView, ...]) -> FluxImage:
-        """Return the mean flux of the pixels in which exposures show each point: (N,)."""
-        number = len(self.level.adjusted.points)
-        total, times = np.zeros(number), np.zeros(number)
-        for view in views:
-            flux = view.flux()
-            column, row = (np.clip(np.rint(view.xy[:, axis]).astype(int), 0, flux.shape[1 - axis] - 1) for axis in (0, 1))
-            known = np.isfinite(flux[row, column])
-            np.add.at(total, view.points[known], flux[row, column][known])
-            np.add.at(times, view.points[known], 1)
-        return np.where(times > 0, total / np.maximum(times, 1), np.nan).astype(np.float32)
 
 
 def _flux_of(posed: PosedExposure) -> Callable[[], FluxImage]:
@@ -142,7 +128,7 @@ def _frames(source: Source) -> FloatArray:
     return np.arange(source.info.n_frames, dtype=np.float64)
 
 
-def _turns(before: FloatArray, after: FloatArray) -> FloatArray:
+def _rotations_between(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return small rotations from some poses to others, as rotation vectors in radians: (T, 3)."""
     between = after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2)
     return np.stack([between[:, j, i] - between[:, i, j] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1) / 2
@@ -156,13 +142,11 @@ def _left(changes: FloatArray, frames: FloatArray, instants: FloatArray) -> floa
 
 
 def _record(level: PosedLevel, scene: Scene) -> dict[str, float | int | str | None]:
-    places = positions_of(level.adjusted.poses)
-    length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     return {
         "group_frames": len(level.groups[0].span),
         "averages": len(level.groups),
         "located": int(level.is_located.sum()),
         "points": len(scene.points),
         "residual_px": level.adjusted.residual_px,
-        "std_position": float(np.sqrt(np.mean(level.adjusted.std_position**2))) / length if length else None,
+        "std_position": relative_std(level.adjusted.std_position, level.adjusted.poses),
     }

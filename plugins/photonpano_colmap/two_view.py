@@ -19,15 +19,10 @@ from photonpano.locating import (
     stabilised_8_bit,
     too_few_matches,
 )
-from photonpano_colmap.configs import PycolmapTwoViewConfig
+from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, PycolmapTwoViewConfig
 
-CENTRE_OF_FIRST_PIXEL = 0.5
-"""Position of the first pixel's centre in COLMAP; ours is 0."""
-MAX_TRIALS = 10_000
-"""RANSAC finds a homography with 20 % inliers in half as many trials; unrelated images would take far more."""
+MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
 _SIFT = pycolmap.FeatureExtractorType.SIFT
-_SEEDS = 2**31
-"""Seeds of the library are below this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +56,7 @@ class TwoViewLocator(PointLocator):
 
     def __init__(self, config: PycolmapTwoViewConfig, seed: int) -> None:
         self._config: PycolmapTwoViewConfig = config
-        self._seed = seed % _SEEDS
+        self._seed = seed % SEEDS
         # It would log every extractor and matcher on stderr.
         pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, int(pycolmap.logging.WARNING))
 
@@ -79,7 +74,7 @@ class TwoViewLocator(PointLocator):
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         found, descriptors = extractor.extract_from_uint8_array(image)
         positions = np.array([(each.x, each.y, each.compute_scale()) for each in found], dtype=np.float64).reshape(-1, 3)
-        positions[:, :2] -= CENTRE_OF_FIRST_PIXEL
+        positions[:, :2] -= FIRST_CENTRE
         x, y = (np.clip(np.rint(positions[:, axis]).astype(np.intp), 0, image.shape[1 - axis] - 1) for axis in (0, 1))
         # The library checks the limit after each scale, so there may be more.
         largest = np.argsort(-positions[:, 2], kind="stable")

@@ -1,1 +1,5 @@
-"""First-party components: packed .npy captures, midpoint resampling, maximum-likelihood merging, interpolators."""
+"""The components that ship with photonpano. A name is imported when it is first used, so that hooks import no heavy library."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,33 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from photonpano import CaptureSummary, Group, Resampler, StageContext
-from photonpano_core.grouping import shortest_of
+from photonpano import CaptureSummary, Group, Resampler, StageContext, StreamInfo
 
-_BLUR = 0.15
-"""Blur of a group at the first level, as a share of the shorter side of a frame. Twice as much spoils the result."""
-_DARK_PHOTONS = 3.0
-"""Below this many photons per pixel, noise harms more than blur, and groups get longer."""
-_DARK_BLUR = 2.0
-"""Factor on the blur that is allowed in the dark."""
-_DIM_PHOTONS = 8.0
-"""Below this many photons per pixel, groups are doubled once the motion is known, since it does not blur them any more."""
-_DOUBLED_FROM = 3
-"""First level of doubled groups: only then is the tremor of a hand known, whose period limits the length of groups before."""
-_BRIGHT_PHOTONS = 1000.0
-"""Above this many photons per pixel, groups get shorter, since less blur improves the result more than more light."""
-_BRIGHT_BLUR = 0.04
-"""Blur below which groups do not get shorter, as a share of the shorter side of a frame."""
-_MIN_GROUPS = 8
-"""Groups at the first level, at least, if the capture is long enough."""
-_NEARLY_WHOLE = 0.1
-"""A group that is longer than whole periods by this share of one is shortened to them."""
-_MOST_LENGTHENED = 4
-"""A group is not lengthened to a period of the light that is longer than it by more than this factor."""
-_EPSILON = 1e-9
-"""Floor on flux and speed, which are divided by."""
-_DEFAULT_SIZE = 500
-"""Frames of a group where the speed of the image is unknown."""
+_SHORTEST = {"binary": 16, "intensity": 1}  # frames of the shortest group that is chosen: fewer are too noisy
+_BLUR = 0.15  # blur of a group at level 1, in shorter sides of a frame; twice as much spoils the result
+_DARK_PHOTONS = 3.0  # photons per pixel below which groups get longer, since noise harms more than blur
+_DARK_BLUR = 2.0  # factor on the blur that is allowed in the dark
+_DIM_PHOTONS = 8.0  # photons per pixel below which groups are doubled once the motion is known
+_DOUBLED_FROM = 3  # first level of doubled groups: by then tremor is known, whose period limits earlier groups
+_BRIGHT_PHOTONS = 1000.0  # photons per pixel above which groups get shorter: less blur is worth more than more light
+_BRIGHT_BLUR = 0.04  # blur below which groups do not get shorter, in shorter sides of a frame
+_MIN_GROUPS = 8  # fewest groups at level 1 of a capture that is long enough
+_NEARLY_WHOLE = 0.1  # a group that exceeds whole periods by less than this fraction of one is shortened to them
+_MOST_LENGTHENED = 4  # longest period of the light that a group is lengthened to, in groups
+_EPSILON = 1e-9  # floor on flux and speed in divisions
+_DEFAULT_SIZE = 500  # frames of a group if the speed of the image is unknown
 
 
 class AutoResampler:
@@ -74,6 +62,11 @@ class AutoResampler:
             # Twice the length, at the density of this level.
             return self._of_size(2 * self._size).groups(n_frames, level + 1)
         return self._of_size(self._size).groups(n_frames, level)
+
+
+def shortest_of(stream: StreamInfo) -> int:
+    """Return the frames of the shortest group that is chosen."""
+    return _SHORTEST[stream.kind]
 
 
 def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: int, shortest: int) -> tuple[int, str]:

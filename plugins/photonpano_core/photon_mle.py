@@ -15,8 +15,7 @@ from photonpano_core.configs import PhotonMleConfig
 
 Decide = Callable[[str, float, str], None]
 
-_CACHE_BYTES = 64 * 1024**2
-"""Memory for the sums that overlapping groups share: about those of one group."""
+_CACHE_BYTES = 64 * 1024**2  # for the sums that overlapping groups share: about those of one group
 
 
 class PhotonMleMerger:

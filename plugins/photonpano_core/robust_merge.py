@@ -15,8 +15,7 @@ from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure,
 
 Image = NDArray[np.float32]
 
-_MIN_WEIGHT = 1e-3
-"""Blocks are compared where the smoothed weight of their overlap is above this."""
+_MIN_WEIGHT = 1e-3  # smoothed weight of the overlap above which blocks are compared
 
 
 class RobustMerger:

@@ -1,6 +1,8 @@
-"""Merging by splatting: each lit pixel is warped along the motion of its own frame."""
+"""Merger `splat`: each lit pixel is warped along the motion of its own frame; most pixels of a binary frame are dark."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +17,16 @@ from photonpano import (
     VirtualExposure,
     capture_of,
 )
-from photonpano.geometry import apply, corners, inverse
+from photonpano.compiling import compiled
+from photonpano.geometry import apply, corners, inverse, visible_columns
 from photonpano.merging import PhotonSum, gain_image
 from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
-from photonpano_core.splatting import add_coverage, splat
 
-_READ_BYTES = 1024**2
-"""Bytes of unpacked frames that are read at a time: about the cache of a core."""
-_RIGID = 0.01
-"""Bound on the deviation of the pixel spacing from 1 px, below which splat weights sum to 1 within its square."""
+Frames = NDArray[np.unsignedinteger[Any]]
+
+_WORD = np.uint64
+_READ_BYTES = 1024**2  # unpacked frames read at a time: about the cache of a core
+_RIGID = 0.01  # deviation of the pixel spacing from 1 px below which splat weights sum to 1 within its square
 
 
 class SplatMerger:
@@ -103,3 +106,107 @@ def _with_margin(shape: tuple[int, int]) -> NDArray[np.float32]:
 
 def _without_margin(grid: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(grid[1:-1, 1:-1])
+
+
+def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64], total: NDArray[np.float32]) -> None:
+    """Add the counts of frames to a grid, each with bilinear weights to four pixels, times the area of a frame's pixel there.
+
+    This is the adjoint of bilinear interpolation: a pixel of a frame adds to a pixel of the grid with the weight with which it
+    would interpolate from it.
+
+    Convention:
+        Points are (x, y), integers are pixel centres. The depth `h31 x + h32 y + h33` is positive in front of the camera.
+
+    Args:
+        frames: (n, h, w) counts, most of them 0.
+        used: (h, w), false for pixels to leave out.
+        to_grid: (n, 3, 3), pixels of each frame to pixels of the grid; of determinant 1, so that the area is `1 / depth^3`.
+        total: (H + 2, W + 2), the grid to add to, with a margin of a pixel for photons that cross its border.
+    """
+    lanes = _WORD().itemsize // frames.itemsize
+    missing = -frames.shape[2] % lanes
+    rows: Frames = np.pad(frames, ((0, 0), (0, 0), (0, missing))) if missing else np.ascontiguousarray(frames)
+    _splat(rows, rows.view(_WORD), used, to_grid, total)
+
+
+@compiled
+def _splat(
+    frames: Frames,
+    words: NDArray[np.uint64],
+    used: NDArray[np.bool_],
+    to_grid: NDArray[np.float64],
+    total: NDArray[np.float32],
+) -> None:
+    """Splat rows of whole words, and skip words that are 0."""
+    n_frames, height, width = frames.shape
+    words_a_row = words.shape[2]
+    lanes = width // words_a_row
+    columns, down, one = total.shape[1], np.uint64(total.shape[1]), np.uint64(1)
+    right, bottom = total.shape[1] - 1.0, total.shape[0] - 1.0
+    grid = total.reshape(-1)
+    busy, lit = np.empty(words_a_row + 1, np.int64), np.empty(width + 1, np.int64)
+    for index in range(n_frames):
+        h00, h01, h02 = to_grid[index, 0]
+        h10, h11, h12 = to_grid[index, 1]
+        h20, h21, h22 = to_grid[index, 2]
+        image, packed = frames[index].reshape(-1), words[index].reshape(-1)
+        for y in range(height):
+            # Photons are random, so that branches would be mispredicted: lit pixels are collected without a branch.
+            n_busy = n_lit = 0
+            for word in range(words_a_row):
+                busy[np.uint64(n_busy)] = word
+                n_busy += packed[np.uint64(y * words_a_row + word)] != 0
+            for number in range(n_busy):
+                first = busy[np.uint64(number)] * lanes
+                for x in range(first, first + lanes):
+                    lit[np.uint64(n_lit)] = x
+                    n_lit += image[np.uint64(y * width + x)] != 0
+            x_0, y_0, depth_0 = h01 * y + h02, h11 * y + h12, h21 * y + h22
+            for number in range(n_lit):
+                x = lit[np.uint64(number)]
+                if not used[y, x]:
+                    continue
+                inverse_depth = 1 / (h20 * x + depth_0)
+                # Relative to the corner of the margin, so that coordinates on the grid are not negative.
+                u, v = (h00 * x + x_0) * inverse_depth + 1, (h10 * x + y_0) * inverse_depth + 1
+                if not (inverse_depth > 0 and 0 <= u < right and 0 <= v < bottom):
+                    continue
+                left, top = int(u), int(v)
+                mass = image[np.uint64(y * width + x)] * inverse_depth * inverse_depth * inverse_depth
+                a, b = u - left, mass * (v - top)
+                place = np.uint64(top * columns + left)
+                grid[place] += np.float32((1 - a) * (mass - b))
+                grid[place + one] += np.float32(a * (mass - b))
+                grid[place + down] += np.float32((1 - a) * b)
+                grid[place + down + one] += np.float32(a * b)
+
+
+@compiled
+def add_coverage(
+    shape: tuple[int, int], to_frame: NDArray[np.float64], total: NDArray[np.float32], steps: NDArray[np.float32]
+) -> None:
+    """Add the sum of splats of frames of ones whose pixels stay 1 px apart: 1 inside a frame, less at its border.
+
+    Args:
+        shape: (h, w) of a frame.
+        to_frame: (n, 3, 3), pixels of the grid to pixels of each frame.
+        total: (H, W) the grid.
+        steps: (H, W + 1), row-wise differences, whose cumulative sums are to be added to it in the end.
+    """
+    height, width = shape
+    rows, columns = total.shape
+    for h in to_frame:
+        for y in range(rows):
+            first, last = visible_columns(h, y, -1.0, width, -1.0, height, columns)
+            inside, outside = visible_columns(h, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
+            if inside >= outside:
+                inside = outside = last
+            steps[y, inside] += 1
+            steps[y, outside] -= 1
+            for part in ((first, inside), (outside, last)):
+                for x in range(part[0], part[1]):
+                    inverse_depth = 1 / (h[2, 0] * x + h[2, 1] * y + h[2, 2])
+                    u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) * inverse_depth
+                    v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) * inverse_depth
+                    along, across = 1 + min(u, width - 1 - u, 0.0), 1 + min(v, height - 1 - v, 0.0)
+                    total[y, x] += max(along, 0.0) * max(across, 0.0)

@@ -14,10 +14,8 @@ from photonpano import ExecutorContext, InputError
 from photonpano.execution import differences
 from photonpano_dask.configs import DaskConfig
 
-_AHEAD = 2
-"""Tasks under way for each thread of a worker: one is worked on while the next travels."""
-_PATIENCE_S = 10
-"""How long a scheduler may take to answer."""
+_AHEAD = 2  # tasks under way per thread of a worker: the next travels while one is computed
+_PATIENCE_S = 10  # how long a scheduler may take to answer
 _SETTINGS = {
     "distributed.worker.daemon": True,
     "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",

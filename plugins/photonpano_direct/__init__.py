@@ -1,1 +1,5 @@
 """Locator `direct`: alignment of brightness at the limit of photon noise."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,12 +13,11 @@ from photonpano.geometry import corners, generators, slopes, unit_coordinates, w
 from photonpano.locating import NO_TEXTURE, PRIOR_STD, information_on_turn
 from photonpano_direct import descent
 from photonpano_direct.curvature import information_of
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import Buffers
+from photonpano_direct.moments import Buffers, Layer
 
+# (8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
+# rolls by 1 or 2 degrees and changes the perspective by little.
 _PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
-"""(8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
-rolls by 1 or 2 degrees and changes the perspective by little."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.locating import MIN_COMMON_CURVATURE
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import Buffers, derivative_moments, differentiate
+from photonpano_direct.moments import Buffers, Layer, derivative_moments, differentiate
 from photonpano_direct.small_matrices import cholesky, dot, product, solve_lower, transposed
 
 
@@ -46,9 +45,9 @@ def _moments_of_products() -> FloatArray:
     return np.stack(along, axis=2).reshape(64, 75)
 
 
+# Coefficients of moments: (8, 9) of those of `residuals_and_moments` along x and y in the derivative by a parameter, and (64,
+# 75) of those of `derivative_moments` in the second derivative by two parameters.
 MOMENTS_X, MOMENTS_Y, _MOMENTS_OF_PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _moments_of_products()
-"""Coefficients of moments: (8, 9) of those of `residuals_and_moments` along x and y in the derivative by a parameter, and
-(64, 75) of those of `derivative_moments` in the second derivative by two parameters."""
 
 
 @compiled

@@ -8,21 +8,17 @@ from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import violation
 from photonpano_direct.curvature import MOMENTS_X, MOMENTS_Y, chance_level, curvatures, expected_px
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import Buffers, residuals_and_moments
+from photonpano_direct.moments import Buffers, Layer, residuals_and_moments
 from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
+# Exit status; DIVERGED is to an impossible homography.
 CONVERGED, NO_TEXTURE, MAX_STEPS, DIVERGED = 0, 1, 2, 3
-"""Exit status: converged, no common texture, step limit reached, diverged to an impossible homography."""
-_MIN_CURVATURE = 5.0
-"""Floor on the common curvature, relative to what noise has in common by chance. It bounds the steps."""
+_MIN_CURVATURE = 5.0  # floor on the common curvature, relative to that of noise by chance; it bounds the steps
+# Levenberg-Marquardt damping after a step that raised the cost, as a fraction of the Hessian of the template; multiplied by 4
+# on each further failure, and halved by each step that lowers the cost.
 _DAMPING = 0.1
-"""Levenberg-Marquardt damping after a step that raised the cost, as a fraction of the Hessian of the template; multiplied by 4
-on each further failure, and halved by each step that lowers the cost."""
-_NEGLIGIBLE = 0.02
-"""Converged when the step is below this fraction of the expected error: in the dark, steps stay small for long."""
-_HESSIAN_PX = 0.25
-"""The Hessian is updated after steps above this."""
+_NEGLIGIBLE = 0.02  # converged below this fraction of the expected error: in the dark, steps stay small for long
+_HESSIAN_PX = 0.25  # the Hessian is updated after steps above this
 
 
 @compiled

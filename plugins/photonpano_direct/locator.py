@@ -21,30 +21,22 @@ from photonpano.locating import (
 from photonpano.photometry import Similarity, hann_window
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
-from photonpano_direct.layers import Layer
 from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
+from photonpano_direct.moments import Layer
 from photonpano_direct.pyramid import Pyramid, pyramid_of
 from photonpano_direct.similarity import similarity_under
 from photonpano_direct.small_matrices import rescaled
 
-_EXACT_PX = 0.1
-"""Coarser layers are not considered if the expected error of a corner is below this."""
-_COARSE_TOLERANCE = 12
-"""Tolerance of the coarser layers, which only initialise the finest, relative to `converged_px`."""
-_PEAK_PX = 0.5
-"""Standard deviation of the peaks of the phase correlation, px of the coarsest layer."""
-_RIVAL = 0.7
-"""Peaks of at least this share of the highest one are hypotheses, too."""
-_RESTRICTED = 2
-"""A motion that is tried is aligned twice, each time where the last one fits."""
-_TRUST = 3.0
-"""The part that follows the motion known so far counts three times: many pairs have gone into that motion."""
+_EXACT_PX = 0.1  # expected corner error below which coarser layers are not considered
+_COARSE_TOLERANCE = 12  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`
+_PEAK_PX = 0.5  # standard deviation of the peaks of the phase correlation, px of the coarsest layer
+_RIVAL = 0.7  # peaks of at least this fraction of the highest are hypotheses, too
+_RESTRICTED = 2  # alignments of a hypothesis, each restricted to where the last one fits
+_TRUST = 3.0  # weight of the part that follows the motion known so far, which many pairs have determined
+# Corner error above which a pair does not determine eight parameters; for a rotating camera, three are estimated instead.
 _DETERMINED_PX = 1.0
-"""A pair whose corners are less certain than this does not determine eight parameters; of a camera that turns, it is aligned
-again with three."""
+# Largest residual that different motion blur explains, as a fraction of the contrast; in much light, many times the noise.
 _BLUR_DIFFERENCE = 0.1
-"""Largest residual that different motion blur explains, as a fraction of the contrast. In much light this is many times the
-photon noise."""
 
 
 class _Descent(NamedTuple):
@@ -118,7 +110,7 @@ def _determined(outcome: Located | NotLocated) -> bool:
 
 
 class _Alignment:
-    """Estimates of the parameters of a homography, or of a turn."""
+    """Estimates of the parameters of a homography, or of a rotation."""
 
     def __init__(self, config: DirectConfig, camera_matrix: FloatArray | None) -> None:
         """Estimate all eight parameters without `camera_matrix`, and three with it."""
@@ -126,7 +118,7 @@ class _Alignment:
         self._camera = None if camera_matrix is None else Camera(camera_matrix)
 
     def aligned(self, moving: Pyramid, fixed: Pyramid, start: Homography, searches: bool) -> Located | NotLocated:
-        """Align from a start; `searches` tells whether other motions are tried where the image has several."""
+        """Align from a start; `searches`: whether other motions are tried where the image has several."""
         n_layers = len(moving.layers)
         if self._camera is not None:
             start = scaled_ahead(self._camera.homographies(nearest_rotations(self._camera.rotations(start))))
@@ -189,15 +181,8 @@ class _Alignment:
     ) -> tuple[Pyramid, _Descent]:
         """Restrict an alignment to the larger part that follows one motion, if the images do not follow it as a whole.
 
-        Of several motions, that of the camera fits most of the image.
-
-        Args:
-            moving: the template.
-            fixed: the other image.
-            first: the alignment of the coarse layers, down to the layer `judged`.
-            start: where it started; an object that stands out may have drawn it away from there.
-            judged: number of the layer on which parts are compared.
-            searches: whether other motions are tried.
+        `first` is the alignment of the coarse layers, down to the layer `judged` on which parts are compared, from `start`. Of
+        several motions, that of the camera fits most of the image.
         """
         n_layers = len(moving.layers)
 
@@ -230,13 +215,7 @@ class _Alignment:
         return restricted, found
 
     def _best(self, found: Sequence[tuple[float, Aligned]]) -> tuple[float, Homography, Quality]:
-        """Return the scale, the homography in pixels of the finest layer, and the quality of the layer with the least error.
-
-        Motion blur removes the details of a fine layer but not its noise, which a coarse layer averages out.
-
-        Args:
-            found: scales of layers and their alignments, coarsest first.
-        """
+        """Return scale, homography in px of the finest layer, and quality of the layer of least error: blur spoils others."""
         best: tuple[float, Homography, Quality] | None = None
         for scale, aligned in reversed(found):
             quality = aligned.quality(None if self._camera is None else self._camera.scaled(scale).matrix)

@@ -16,19 +16,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano import BoolArray, Homography
-    from photonpano_direct.layers import Layer
+    from photonpano_direct.moments import Layer
     from photonpano_direct.pyramid import Pyramid
 
-JUDGED = 1
-"""Number of the layer on which parts are compared: coarse, so that neither noise nor a small error of the motion matters."""
-_DIFFERENT = 0.5
-"""Largest misfit of a pixel in a search for shifts, relative to its usual one."""
+JUDGED = 1  # layer on which parts are compared: coarse, so that noise and small errors of the motion do not matter
+_DIFFERENT = 0.5  # cap on the residual of a pixel in a search for shifts, relative to its usual one
+# Side of the squares compared in a search for shifts, and spacing of the shifts that are tried.
 _SEARCH_PX, _NEAR_PX = 5, 2
-"""Side of the squares that are compared in a search for shifts, and the distance of two shifts that are tried, px."""
-_LEAST_SEEN = 0.3
-"""Least share of the template that both images show under a shift."""
-_TRIED = 3
-"""Number of shifts that a search returns."""
+_LEAST_SEEN = 0.3  # minimum overlap under a shift, as a fraction of the template
+_TRIED = 3  # number of shifts that a search returns
 
 
 def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
@@ -74,10 +70,10 @@ def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
     middle = np.isfinite(squares).sum(axis=0, keepdims=True) // 2
     usual = np.maximum(np.nan_to_num(np.take_along_axis(ordered, middle, axis=0)), np.float32(1e-12))
     relative = np.minimum(squares / usual, _DIFFERENT)
-    misfit = np.nansum(relative, axis=(1, 2)) / np.maximum(np.isfinite(relative).sum(axis=(1, 2)), 1)
-    misfit[n_seen < _LEAST_SEEN * height * width] = np.inf
+    cost = np.nansum(relative, axis=(1, 2)) / np.maximum(np.isfinite(relative).sum(axis=(1, 2)), 1)
+    cost[n_seen < _LEAST_SEEN * height * width] = np.inf
     found: list[tuple[int, int]] = []
-    for index in np.argsort(misfit):
+    for index in np.argsort(cost):
         y, x = shifts[index]
         if all(max(abs(y - other_y), abs(x - other_x)) >= _NEAR_PX for other_y, other_x in found):
             found.append((y, x))

@@ -10,12 +10,10 @@ import numpy as np
 
 from photonpano import VirtualExposure
 from photonpano.locating import SMALLEST_SIDE, View, view_pyramid
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import differentiate
+from photonpano_direct.moments import Layer, differentiate
 from photonpano_direct.similarity import Details, details_of
 
-_COMPARED = 2
-"""Number of the layer on which aligned images are compared: coarse, so that noise is small and motion blur hardly matters."""
+_COMPARED = 2  # layer on which aligned images are compared: coarse, so that noise and motion blur hardly matter
 
 
 class Pyramid(NamedTuple):

@@ -11,7 +11,7 @@ from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import run_from, sample_run, visible_columns
 from photonpano.photometry import Similarity, autocorrelation, similarity_of, without_local_mean
-from photonpano_direct.layers import Layer
+from photonpano_direct.moments import Layer
 
 
 class Details(NamedTuple):

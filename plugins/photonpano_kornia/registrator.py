@@ -41,10 +41,8 @@ from photonpano.locating import (
 from photonpano_kornia.configs import KorniaRegistratorConfig
 from photonpano_kornia.runtime import device_of, images_on, one_thread
 
-_COARSE_TOLERANCE = 4
-"""Tolerance of the coarser layers, which only initialise the finest, relative to `converged_px`."""
-_ROUNDS = 3
-"""Largest number of descents on a layer; the weights of pixels are updated between them."""
+_COARSE_TOLERANCE = 4  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`
+_ROUNDS = 3  # most descents on a layer; the weights of pixels are updated in between
 
 
 def unit_square(shape: tuple[int, int]) -> FloatArray:

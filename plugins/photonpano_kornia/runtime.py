@@ -15,8 +15,7 @@ from threadpoolctl import ThreadpoolController
 
 from photonpano import InputError
 
-_GENERATOR = Lock()
-"""Held while the global generator is seeded, since all threads share it."""
+_GENERATOR = Lock()  # held while the global random generator is seeded, which all threads share
 
 
 def device_of(name: str) -> torch.device:

@@ -1,23 +1,35 @@
-"""From the keypoints of two exposures to a motion: matching, MAGSAC, more matches near the motion, least squares."""
+"""Locators `opencv-sift` and `opencv-orb`: keypoints, matching, MAGSAC, more matches near the motion, least squares."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import Homography, Located, NotLocated
+from photonpano import Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import apply, why_implausible
-from photonpano.locating import KeypointConfig, Matches, PointLocator, consensus_of, motion_from_points
-from photonpano_opencv.matching import match_everywhere, match_nearby
+from photonpano.locating import (
+    KeypointConfig,
+    Matches,
+    PointLocator,
+    blur_against_noise,
+    consensus_of,
+    motion_from_points,
+    stabilised_8_bit,
+)
+from photonpano_opencv.configs import OpencvOrbConfig, OpencvSiftConfig
+from photonpano_opencv.matching import match_everywhere, match_nearby, unit_bits, unit_descriptors
 
-GUIDED_RADII = (1.5, 1.0)
-"""Search radii around the positions that the current fit predicts, one a round, in units of `threshold_px`."""
+GUIDED_RADII = (1.5, 1.0)  # of the search around predicted positions, one a round, in units of `threshold_px`
+# Lowe's ratio within these radii
 GUIDED_RATIO = 0.9
-"""Lowe's ratio within these radii."""
+# Standard deviation of rounding to whole pixels. Where a camera only shifts, all keypoints are rounded alike, so that the
+# error does not decrease with the number of matches.
+_ROUNDING_PX = math.sqrt(1 / 12)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,3 +155,45 @@ class KeypointMatcher(PointLocator):
         found, _ = cv2.findHomography(moving, fixed, settings)
         # Without a model OpenCV returns None, or an empty matrix.
         return np.asarray(found, np.float64) if np.shape(found) == (3, 3) else None
+
+
+class SiftLocator(KeypointMatcher):
+    """SIFT features, the off-the-shelf locator of the paper, with a least-squares fit of all inliers."""
+
+    def __init__(self, config: OpencvSiftConfig, seed: int) -> None:
+        super().__init__(config, seed, unit_descriptors, config.ratio)
+        self._sift = config
+
+    def describe(self, exposure: VirtualExposure) -> Keypoints:
+        """Detect keypoints on the variance-stabilised image, outside of masked areas."""
+        config = self._sift
+        blur_px = blur_against_noise(exposure, config.blur_px)
+        threshold = config.contrast_threshold / max(1.0, blur_px)
+        # A detector for each call: OpenCV does not guarantee thread safety.
+        sift = cv2.SIFT.create(config.max_keypoints, 3, threshold, enable_precise_upscale=True)
+        return detected(sift, *stabilised_8_bit(exposure, blur_px), config.max_keypoints)[1]
+
+
+class OrbLocator(KeypointMatcher):
+    """ORB features, the fastest of the classical ones and the least accurate."""
+
+    def __init__(self, config: OpencvOrbConfig, seed: int) -> None:
+        # The Hamming distance is proportional to the squared distance of the unit vectors.
+        super().__init__(config, seed, unit_bits, math.sqrt(config.ratio), _ROUNDING_PX)
+        self._orb = config
+
+    def describe(self, exposure: VirtualExposure) -> Keypoints:
+        """Detect keypoints on the variance-stabilised image, outside of masked areas."""
+        config = self._orb
+        blur_px = blur_against_noise(exposure, config.blur_px)
+        # A detector for each call: OpenCV does not guarantee thread safety.
+        orb = cv2.ORB.create(
+            config.max_keypoints, config.pyramid_scale, config.pyramid_levels, fastThreshold=config.fast_threshold
+        )
+        image, mask = stabilised_8_bit(exposure, blur_px)
+        found, keypoints = detected(orb, image, mask, config.max_keypoints)
+        # OpenCV multiplies positions in a coarse level by its nominal scale, as if the centre of pixel (0, 0) were its corner.
+        scales = np.array([config.pyramid_scale**keypoint.octave for keypoint in found], dtype=np.float32).reshape(-1, 1)
+        size = np.array(image.shape[::-1], dtype=np.float32)
+        centres = (keypoints.points / scales + 0.5) * (size / np.rint(size / scales)) - 0.5
+        return replace(keypoints, points=np.asarray(centres, np.float32))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from pathlib import Path
 
 from pydantic import Field
 
-from photonpano import Arrived, Config, InputError, Location, SpecLocation, Url
+from photonpano import Arrived, Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, objections, size_of
 
 
@@ -19,25 +20,48 @@ class BinConfig(Config):
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
 
 
-def opened(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> PackedFileSource:
-    """Open a capture. Raises what `frame_files` raises."""
-    return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
+def bin_source(
+    name: str,
+    summary: str,
+    config: type[BinConfig],
+    layout: FrameLayout,
+    recognise: Callable[[Path], Recognised | None],
+    footer_bytes: int = 0,
+) -> SourceContribution:
+    """Return the contribution of a source of .bin files.
 
+    Args:
+        name: the source.
+        summary: a line about it.
+        config: its keys.
+        layout: order of the pixels of a frame in its bytes.
+        recognise: see `SourceContribution`.
+        footer_bytes: number of bytes that may follow the frames of a file.
+    """
 
-def arrived(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Arrived:
-    """Open the frames that are there of a capture that is still being written: more files appear, and the last one grows."""
-    path = config.path
-    if isinstance(path, Url):
-        raise InputError(f"{path} is a URL, which cannot be followed: follow a folder, or a pipe")
-    if not path.exists() or (path.is_dir() and not sizes_of(path)):
-        return Arrived(None)
-    files = frame_files(path, layout, footer_bytes, growing=True)
-    return Arrived(PackedFileSource(files, layout, config.frame_rate_hz) if files else None)
+    def opened(config: BinConfig) -> PackedFileSource:
+        return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
 
+    def arrived(config: BinConfig) -> Arrived:
+        """Open the frames that are there of a capture that is still being written: files appear, and the last one grows."""
+        path = config.path
+        if isinstance(path, Url):
+            raise InputError(f"{path} is a URL, which cannot be followed: follow a folder, or a pipe")
+        if not path.exists() or (path.is_dir() and not sizes_of(path)):
+            return Arrived(None)
+        files = frame_files(path, layout, footer_bytes, growing=True)
+        return Arrived(PackedFileSource(files, layout, config.frame_rate_hz) if files else None)
 
-def checked(config: BinConfig, layout: FrameLayout, footer_bytes: int = 0) -> Sequence[str]:
-    """Return the message of the error that opening the capture would raise, if any."""
-    return objections(frame_files, config.path, layout, footer_bytes)
+    return SourceContribution(
+        name=name,
+        summary=summary,
+        config=config,
+        build=lambda config, _: opened(config),
+        check=lambda config: objections(frame_files, config.path, layout, footer_bytes),
+        recognise=recognise,
+        arrived=arrived,
+        suffixes=(".bin",),
+    )
 
 
 def frame_files(path: Location, layout: FrameLayout, footer_bytes: int = 0, *, growing: bool = False) -> list[FrameFile]:

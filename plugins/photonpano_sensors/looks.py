@@ -8,12 +8,11 @@ from typing import Any, TypeVar
 
 ItemT = TypeVar("ItemT")
 
-_MOST = 16
-"""Frames of a file, or files of a capture, that are looked at, and a few more."""
+_MOST = 16  # about how many frames of a file, or files of a capture, are read
 
 
 def spread(items: Sequence[ItemT]) -> Sequence[ItemT]:
-    """Return some items: all of few, and every so many of others."""
+    """Return all of a few items, and about 16 evenly spaced ones of more."""
     return items[:: max(1, len(items) // _MOST)]
 
 

@@ -16,12 +16,11 @@ from pydantic import BaseModel, Field
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.reading import BinarySource, FrameLayout, look_first, objections, read_json, require_readable
 from photonpano_sensors.looks import spread
-from photonpano_sensors.mat_file import MatFrames, is_hdf
+from photonpano_sensors.matlab import MatFrames, is_hdf
 
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
-_MOST_PARTS = 4
-"""Parts kept in memory, eight pixels to a byte: compressed files can only be read from the beginning."""
+_MOST_PARTS = 4  # packed parts kept in memory: compressed files can only be read from the beginning
 
 
 class MatPartsConfig(Config):
@@ -116,13 +115,8 @@ def _size(shape: tuple[int, int, int]) -> str:
     return f"{shape[1]}x{shape[2]}"
 
 
-def _check(config: MatPartsConfig) -> Sequence[str]:
-    """Check the names of the parts; reading one takes seconds."""
-    return objections(_parts, config.path)
-
-
 def _recognise(path: Path) -> Recognised | None:
-    return None if _check(MatPartsConfig(path=path)) else Recognised({"path": str(path)}, "a folder with part_1.mat")
+    return None if objections(_parts, path) else Recognised({"path": str(path)}, "a folder with part_1.mat")
 
 
 MAT_PARTS = SourceContribution(
@@ -130,7 +124,7 @@ MAT_PARTS = SourceContribution(
     summary="Binary frames in a folder of MATLAB files, part_1.mat and so on",
     config=MatPartsConfig,
     build=lambda config, _: MatPartsSource(config),
-    check=_check,
+    check=lambda config: objections(_parts, config.path),  # the names alone: reading a part takes seconds
     recognise=_recognise,
     suffixes=(".mat",),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
 
@@ -15,11 +15,9 @@ from photonpano.reading import BinarySource, FrameLayout, files_in, objections, 
 
 _SIZE = 512
 _PIXELS = _SIZE**2
-_END = _PIXELS
-"""The address that ends a frame."""
+_END = _PIXELS  # the address that ends a frame
 _WORD = np.dtype("<u4")
-_MOST_FRAMES = 32
-"""Frames unpacked at once."""
+_MOST_FRAMES = 32  # frames unpacked at once
 _BLOCK_WORDS = 1024**2
 
 
@@ -113,10 +111,6 @@ def _frame_ends(path: Path) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-def _check(config: Spad512SparseConfig) -> Sequence[str]:
-    return objections(_files, config.path)
-
-
 def _recognise(path: Path) -> Recognised | None:
     try:
         files = _files(path)
@@ -133,7 +127,7 @@ SPAD512_SPARSE = SourceContribution(
     summary="Binary frames of the SPAD512, 512 x 512 px, as the addresses of their lit pixels",
     config=Spad512SparseConfig,
     build=lambda config, _: Spad512SparseSource(config),
-    check=_check,
+    check=lambda config: objections(_files, config.path),
     recognise=_recognise,
     suffixes=(".bin",),
 )

@@ -8,21 +8,17 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import Recognised, SourceContribution
+from photonpano import Recognised
 from photonpano.reading import FrameLayout, files_in
-from photonpano_sensors.bin_files import BinConfig, arrived, checked, opened, sizes_of
+from photonpano_sensors.bin_files import BinConfig, bin_source, sizes_of
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 
 _ZONES = 4
-_FILE_BYTES = 512 * 256 * 64
-"""Bytes of a file, of 512 frames of the half array or 256 of the full one."""
-_COMPARED = 64
-"""To distinguish the arrays, 64 frames of the full array, or pairs of the half array, are compared."""
-_CLIP_QUANTILE = 0.9
-"""Brightness is clipped at this quantile, because hot pixels must not outweigh the scene."""
-_STANDARD_ERRORS = 5.0
-"""Difference of the two correlations, in standard errors, from which the array is decided."""
+_FILE_BYTES = 512 * 256 * 64  # of 512 frames of the half array, or 256 of the full one
+_COMPARED = 64  # frames of the full array, or pairs of frames of the half array, compared to tell them apart
+_CLIP_QUANTILE = 0.9  # brightness is clipped at this quantile: hot pixels must not outweigh the scene
+_STANDARD_ERRORS = 5.0  # minimum difference of the two correlations
 
 
 class SwissSpadHalfConfig(BinConfig):
@@ -91,23 +87,17 @@ def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> flo
     return float(np.arctanh(min(np.corrcoef(first.ravel(), second.ravel())[0, 1], 0.999999)))
 
 
-SWISSSPAD_HALF = SourceContribution(
-    name="swissspad-half",
-    summary="Binary frames of half of SwissSPAD2, 256 x 512 px, in .bin files of 512",
-    config=SwissSpadHalfConfig,
-    build=lambda config, _: opened(config, HALF),
-    check=lambda config: checked(config, HALF),
-    recognise=lambda path: _recognise(path, "half"),
-    arrived=lambda config: arrived(config, HALF),
-    suffixes=(".bin",),
+SWISSSPAD_HALF = bin_source(
+    "swissspad-half",
+    "Binary frames of half of SwissSPAD2, 256 x 512 px, in .bin files of 512",
+    SwissSpadHalfConfig,
+    HALF,
+    lambda path: _recognise(path, "half"),
 )
-SWISSSPAD_FULL = SourceContribution(
-    name="swissspad-full",
-    summary="Binary frames of all of SwissSPAD2, 512 x 512 px, in .bin files of 256",
-    config=SwissSpadFullConfig,
-    build=lambda config, _: opened(config, FULL),
-    check=lambda config: checked(config, FULL),
-    recognise=lambda path: _recognise(path, "full"),
-    arrived=lambda config: arrived(config, FULL),
-    suffixes=(".bin",),
+SWISSSPAD_FULL = bin_source(
+    "swissspad-full",
+    "Binary frames of all of SwissSPAD2, 512 x 512 px, in .bin files of 256",
+    SwissSpadFullConfig,
+    FULL,
+    lambda path: _recognise(path, "full"),
 )

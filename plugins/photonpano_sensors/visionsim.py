@@ -161,10 +161,6 @@ def _layout(transforms: _Transforms, packed_dim: int | None, channel: int | None
     return FrameLayout((height, width), (*stored, transforms.c), to_rows=to_rows)
 
 
-def _check(config: VisionsimConfig) -> Sequence[str]:
-    return objections(_read, config)
-
-
 def _recognise(path: Path) -> Recognised | None:
     """Take a folder with a transforms.json, that file, and a .npy file that it names."""
     transforms = (path if path.is_dir() else path.parent) / _TRANSFORMS
@@ -192,7 +188,7 @@ VISIONSIM = SourceContribution(
     summary="Binary frames simulated by visionsim: a .npy file and its transforms.json",
     config=VisionsimConfig,
     build=lambda config, _: _open(config),
-    check=_check,
+    check=lambda config: objections(_read, config),
     recognise=_recognise,
     suffixes=(".json",),
 )

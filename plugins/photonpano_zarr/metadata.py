@@ -12,11 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from photonpano import InputError, Location, StreamInfo, Url
 from photonpano.reading import read_range, reading
 
-VERSION = 1
-"""The version of the attributes."""
+VERSION = 1  # of the attributes
 _FILE = "zarr.json"
-_MOST_BYTES = 1024**2
-"""The longest metadata that are read."""
+_MOST_BYTES = 1024**2  # the longest metadata that are read
 _CODECS = ("bytes", "zstd", "blosc", "gzip", "crc32c")
 _AGAIN = "write it again with photonpano convert"
 

@@ -27,8 +27,7 @@ from photonpano.reading import (
 from photonpano_zarr.configs import ZarrConfig
 from photonpano_zarr.metadata import Metadata, read_attributes, read_metadata
 
-_MOST_BYTES = 2 * 1024**3
-"""The largest chunk that is read: a larger one is a mistake, or damage."""
+_MOST_BYTES = 2 * 1024**3  # the largest chunk that is read: a larger one is a mistake, or damage
 
 
 def opened(config: ZarrConfig) -> Source:

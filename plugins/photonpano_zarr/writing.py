@@ -14,10 +14,8 @@ from photonpano import StreamInfo
 from photonpano.reading import library
 from photonpano_zarr.metadata import written
 
-_CHUNK_BYTES = 4 * 1024**2
-"""Bytes of a chunk before compression, at most, unless a frame has more."""
-_LEVEL = 1
-"""The level of zstd: higher ones take longer, and gain little on photon noise."""
+_CHUNK_BYTES = 4 * 1024**2  # most bytes of a chunk before compression, unless a frame has more
+_LEVEL = 1  # of zstd: higher ones take longer, and gain little on photon noise
 
 
 def write(folder: Path, info: StreamInfo, frames: Iterable[NDArray[np.uint8]], *, compressed: bool) -> None:

@@ -33,9 +33,9 @@ from photonpano.geometry import FrameTrajectory, apply, inverse
 from photonpano_core.configs import BurstConfig, LocalFlowConfig, PhotonMleConfig, RobustMergeConfig
 from photonpano_core.dense_motion.burst import BurstMerger
 from photonpano_core.dense_motion.local_flow import LocalFlowMerger
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.source import SimulatorSource
 from photonpano_simulator.travel.config import TravelConfig

@@ -21,9 +21,9 @@ from pages import write_tables
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
-from photonpano_core.packed_npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.photon_mle import PhotonMleMerger
 from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 from photonpano_core.splat import SplatMerger
 from photonpano_simulator.config import StreetScene
 from photonpano_simulator.scenes import scene_flux

@@ -13,7 +13,7 @@ from picture_parts import drawn
 
 from photonpano import PhotonpanoError
 from photonpano_core.configs import MidpointConfig
-from photonpano_core.midpoint import MidpointResampler
+from photonpano_core.resamplers import MidpointResampler
 
 if TYPE_CHECKING:
     from paper.figures.study import Numbers, Study

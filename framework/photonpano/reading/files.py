@@ -16,14 +16,14 @@ from pydantic import BaseModel, ValidationError
 
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.paths import Location, Url, refusal
+from photonpano.paths import as_written as as_written
 from photonpano.reading.remote import read_range, remote_files_in
 from photonpano.reading.remote import size_of as remote_size
 
 Model = TypeVar("Model", bound=BaseModel)
 P = ParamSpec("P")
 
-_MOST_OPEN = 16
-"""Files that are kept open: a capture may consist of hundreds, and a process may often open 1024."""
+_MOST_OPEN = 16  # files kept open: a capture may have hundreds, and a process may often open 1024
 _TEXT_AND_NUMBER = re.compile("([^0-9]*)([0-9]*)")
 
 
@@ -188,6 +188,11 @@ def read_start(path: Location, n_bytes: int) -> bytes:
             return file.read(n_bytes)
     except OSError:
         return b""
+
+
+def is_gzip(path: Location) -> bool:
+    """Return whether a file is compressed with gzip, by its first bytes."""
+    return read_start(path, 2) == b"\x1f\x8b"
 
 
 class OpenFiles:

@@ -13,17 +13,13 @@ from photonpano.errors import InputError
 from photonpano.reading.files import reading
 from photonpano.text import byte_size
 
-CPU_S = 2.0
-"""Seconds of the processor that a look at a small file may take, imports included."""
-CPU_BYTES_PER_S = 50e6
-"""For each so many bytes of a file, the look may take a second more."""
-MEMORY_BYTES = 2 * 1024**3
-"""Address space of a look, beside the size of the largest file."""
-_WAIT_S = 60.0
-"""How long a look may wait, as for a slow disk, beside its seconds of the processor."""
-_TOO_MUCH_MEMORY = 99
-"""The exit code of a process that ran out of memory."""
+CPU_S = 2.0  # seconds of the processor for a small file, imports included
+CPU_BYTES_PER_S = 50e6  # a larger file gets a second more for each 50 MB
+MEMORY_BYTES = 2 * 1024**3  # address space of the process, beside the size of the largest file
+_WAIT_S = 60.0  # seconds to wait beside those of the processor, as for a slow disk
+_TOO_MUCH_MEMORY = 99  # exit code of a process that ran out of memory
 
+# The program of the process: it sets its own limits, and prints the number of each file before it reads it.
 _PROCESS = f"""
 import importlib, os, resource, signal, sys
 memory, module, function, *files = sys.argv[1:]
@@ -43,7 +39,6 @@ for number in range(0, len(files), 2):
     look(number // 2, *files[number:number + 2])
 os._exit(0)
 """
-"""What the process does: it sets its limits itself, and says which file comes next."""
 
 
 def look_first(paths: Path | Sequence[Path], look: str) -> None:

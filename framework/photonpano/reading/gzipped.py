@@ -13,17 +13,12 @@ from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError
 from photonpano.locks import hold
 from photonpano.paths import Location, Url
-from photonpano.reading.files import read_start, reading
-from photonpano.reading.npy import NpyHeader, read_npy_header
+from photonpano.reading.files import is_gzip, read_start, reading
+from photonpano.reading.npy import NpyHeader, npy_header, read_npy_header
 
 logger = logging.getLogger(__name__)
 
 _BLOCK_BYTES = 1024**2
-
-
-def is_gzip(path: Location) -> bool:
-    """Return whether a file is compressed with gzip, by its first bytes."""
-    return read_start(path, 2) == b"\x1f\x8b"
 
 
 def local(path: Location) -> Path:
@@ -46,6 +41,11 @@ def unpacked_start(path: Path, n_bytes: int) -> bytes:
             return file.read(n_bytes)
     except (OSError, EOFError, zlib.error):
         return b""
+
+
+def any_npy_header(path: Location) -> NpyHeader:
+    """Read the header of a .npy or .npy.gz file; raises as `npy_header` and `gzipped_npy_header`."""
+    return gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
 
 
 def gzipped_npy_header(path: Location) -> NpyHeader:

@@ -1,4 +1,4 @@
-"""Read and check headers of .npy files, without their data."""
+"""Read and check headers of .npy files, without their data, and count the frames of those that are still being written."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.paths import Location, Url
-from photonpano.reading.files import read_start, reading, size_of
+from photonpano.reading.files import is_gzip, read_start, reading, size_of
 from photonpano.reading.remote import read_range
 
-_HEADER_BYTES = 4096
-"""Bytes of a URL that are read for the header, which has 128 for any capture."""
+_HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
+_SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
 
 
 class NpyHeader(NamedTuple):
@@ -106,6 +106,24 @@ def require_frames(path: Location, header: NpyHeader, axes: str) -> None:
         raise InputError(f"{path} is empty: its shape is {header.shape} ({axes})")
     if header.fortran_order:
         raise InputError(f"{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)")
+
+
+def arrived_frames(path: Location) -> int | None:
+    """Return how many whole frames of a .npy file are there that is still being written: None if not even its header is.
+
+    Raises:
+        InputError: the file cannot be read, is something else, or cannot be read before it is whole.
+    """
+    if isinstance(path, Url):
+        raise InputError(f"{path} is a URL, which cannot be followed: follow a file, or a pipe")
+    if is_gzip(path):
+        raise InputError(f"{path} is compressed, so that no frame can be read before all are there; follow a .npy file")
+    if not path.exists() or size_of(path) < _SHORTEST_HEADER:
+        return None
+    header = npy_header(path)
+    n_frames, *of_frame = header.shape
+    frame_bytes = math.prod(of_frame) * header.dtype.itemsize
+    return min(n_frames, (size_of(path) - header.offset) // frame_bytes) if frame_bytes else 0
 
 
 def _guess(start: bytes) -> str:

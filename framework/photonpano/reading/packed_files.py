@@ -1,7 +1,8 @@
-"""A source of binary frames that lie one after the other in files."""
+"""Frames that lie one after the other in files, and the source of those that are binary."""
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,15 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.paths import Location, Url
-from photonpano.reading.binary_source import BinarySource
-from photonpano.reading.packed_layout import FrameLayout
+from photonpano.reading.files import OpenFiles
 from photonpano.reading.pieces import Pieces
+from photonpano.reading.sources import BinarySource, FrameLayout
 from photonpano.values import FrameSpan
 
-_READ_BYTES = 1024**2
-"""Bytes read at once: they stay in the cache of a core until they are summed."""
-_PIECE_BYTES = 4 * 1024**2
-"""Bytes fetched from a URL at once: a request takes milliseconds, whatever it asks for."""
+_READ_BYTES = 1024**2  # read at once: they stay in the cache of a core until they are summed
+_PIECE_BYTES = 4 * 1024**2  # fetched from a URL at once: a request takes milliseconds, whatever its size
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,61 +37,53 @@ class FrameFile:
     offset: int = 0
 
 
-class PackedFileSource(BinarySource):
-    """Binary frames in one file or in many.
+class StoredFrames:
+    """The bytes of frames in one file or in many, for any number of threads.
 
     Files are read in pieces, because memory-mapped files would fill the memory of the process.
     """
 
-    def __init__(
-        self,
-        files: Sequence[FrameFile],
-        layout: FrameLayout,
-        frame_rate_hz: float | None = None,
-    ) -> None:
+    def __init__(self, files: Sequence[FrameFile], shape: tuple[int, ...]) -> None:
         """Take files in the order of their frames.
 
         Args:
             files: at least one, each long enough for its frames, of which it has at least one.
-            layout: order of the pixels of a frame in its bytes.
-            frame_rate_hz: frames per second; None if unknown.
+            shape: that of the bytes of a frame.
         """
-        self._parts = tuple(files)
+        self._parts, self._shape, self._frame_bytes = tuple(files), shape, math.prod(shape)
         self._starts = list(accumulate((file.n_frames for file in files), initial=0))
-        self._buffers = local()
-        super().__init__(self._starts[-1], layout, frame_rate_hz)
+        self.n_frames = self._starts[-1]
+        self._files, self._buffers = OpenFiles(), local()
         self._remote = None
         if any(isinstance(file.path, Url) for file in files):
-            step = max(1, _PIECE_BYTES // layout.stored_bytes)
+            step = max(1, _PIECE_BYTES // self._frame_bytes)
             starts = [first for start, stop in pairwise(self._starts) for first in range(start, stop, step)]
-            self._remote = Pieces([*starts, self._starts[-1]], self._fetched)
+            self._remote = Pieces([*starts, self.n_frames], self._fetched)
 
-    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
-        """Yield the frames of a span, a few at a time: see `BinarySource`."""
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield some frames of a span at a time, (n, *shape), and their place in it; the next step may overwrite them."""
         if self._remote is not None:
-            yield from ((place, self.layout.rows(stored)) for place, stored in self._remote.of(span))
+            yield from self._remote.of(span)
             return
-        step = max(1, _READ_BYTES // self.layout.stored_bytes)
-        index, start = bisect_right(self._starts, span.start) - 1, span.start
+        step = max(1, _READ_BYTES // self._frame_bytes)
+        index, start = self._file_of(span.start), span.start
         while start < span.stop:
             stop = min(start + step, self._starts[index + 1], span.stop)
-            yield slice(start - span.start, stop - span.start), self._rows(index, start - self._starts[index], stop - start)
+            target = self._buffer((stop - start) * self._frame_bytes).reshape(stop - start, *self._shape)
+            yield slice(start - span.start, stop - span.start), self._read(index, start, target)
             index += stop == self._starts[index + 1]
             start = stop
 
-    def _rows(self, index: int, first: int, n_frames: int) -> NDArray[np.uint8]:
-        target = self._buffer(n_frames * self.layout.stored_bytes)
-        return self.layout.rows(self._read(index, first, target).reshape(n_frames, *self.layout.stored_shape))
+    def _file_of(self, frame: int) -> int:
+        return bisect_right(self._starts, frame) - 1
 
     def _fetched(self, span: FrameSpan) -> NDArray[np.uint8]:
-        """Return the stored frames of a span within one file: (n, *stored_shape)."""
-        index = bisect_right(self._starts, span.start) - 1
-        stored = np.empty((len(span), *self.layout.stored_shape), np.uint8)
-        return self._read(index, span.start - self._starts[index], stored)
+        """Return the frames of a span within one file."""
+        return self._read(self._file_of(span.start), span.start, np.empty((len(span), *self._shape), np.uint8))
 
     def _read(self, index: int, first: int, target: NDArray[np.uint8]) -> NDArray[np.uint8]:
         file = self._parts[index]
-        self.files.read(file.path, file.offset + first * self.layout.stored_bytes, target)
+        self._files.read(file.path, file.offset + (first - self._starts[index]) * self._frame_bytes, target)
         return target
 
     def _buffer(self, size: int) -> NDArray[np.uint8]:
@@ -104,6 +95,29 @@ class PackedFileSource(BinarySource):
 
     def close(self) -> None:
         """Close the files."""
-        super().close()
+        self._files.close()
         if self._remote is not None:
             self._remote.close()
+
+
+class PackedFileSource(BinarySource):
+    """Binary frames in one file or in many."""
+
+    def __init__(self, files: Sequence[FrameFile], layout: FrameLayout, frame_rate_hz: float | None = None) -> None:
+        """Take files in the order of their frames; see `StoredFrames`.
+
+        Args:
+            files: at least one.
+            layout: order of the pixels of a frame in its bytes.
+            frame_rate_hz: frames per second; None if unknown.
+        """
+        self._stored = StoredFrames(files, layout.stored_shape)
+        super().__init__(self._stored.n_frames, layout, frame_rate_hz)
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span, a few at a time: see `BinarySource`."""
+        yield from ((place, self.layout.rows(stored)) for place, stored in self._stored.blocks(span))
+
+    def close(self) -> None:
+        """Close the files."""
+        self._stored.close()

@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 
 from photonpano.values import FrameSpan
 
-_KEPT = 32
-"""Pieces that are kept, the latest ones."""
-_AHEAD = 6
-"""Pieces that are fetched ahead of the one that is read."""
+_KEPT = 32  # pieces kept, the latest ones
+_AHEAD = 6  # pieces fetched ahead of the one that is read
 _FETCHED_AT_ONCE = 8
-_ENDS = 64
-"""Ends of spans that are remembered: a span that begins at one of them goes on from it."""
-_SMALL = 4
-"""A span of less than this fraction of a piece is fetched alone, unless it goes on from another one."""
+_ENDS = 64  # ends of spans remembered: a span that begins at one of them continues it
+_SMALL = 4  # a span below 1/4 of a piece is fetched alone, unless it continues another
 
 Fetch = Callable[[FrameSpan], NDArray[np.uint8]]
 

@@ -14,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.photometry import BitOrder
-from photonpano.reading.significance import MIN_SCORE, score, units_of
 
+# Minimum score of a difference that is not chance. Scores of noise scatter by 1.2: one in 60,000 exceeds 5.
+MIN_SCORE = 5.0
+_ROWS = 8  # rows of a unit
+_MIN_UNITS = 30  # fewest units whose scatter can be trusted
+# Frames of a sum; both are tried: short sums are sharp, long ones less noisy.
 _LENGTHS = (16, 128)
-"""Frames of a sum. Short sums are sharp, long ones less noisy; each length is tried."""
-_CLIP_QUANTILE = 0.95
-"""Sums are clipped at this quantile, because hot pixels must not outweigh the scene."""
+_CLIP_QUANTILE = 0.95  # sums are clipped at this quantile: hot pixels must not outweigh the scene
+# Minimum score of the best order against each other one, and of pixels within bytes against the expected order.
 _MIN_LEAD = 3.0
-"""Least score by which the best order differs from each other one, and the expected order from pixels within bytes."""
-_FLOOR = 0.2
-"""Units are weighted by their variance, plus this fraction of its mean."""
+_FLOOR = 0.2  # units are weighted by their variance, plus this fraction of the mean variance
 
 
 class PixelOrder(NamedTuple):
@@ -84,7 +85,7 @@ def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORD
         expected: the order that the capture is read with.
 
     Returns:
-        None where the expected order fits, or where the frames are too dark or too plain to tell.
+        None where the expected order fits, or where the frames are too dark or too plain.
     """
     found = [_other(_Likeness(products), ORDERS.index(expected)) for products in _products_of(samples)]
     scored = [each for each in found if each is not None]
@@ -177,3 +178,19 @@ def _smoothed(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
     summed[1:] += values[:-1]
     summed[:-1] += values[1:]
     return np.moveaxis(summed, 0, axis)
+
+
+def units_of(images: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Sum images over units of eight rows and one column, which are nearly independent: (k, H, W) becomes (k, units)."""
+    bands = images.shape[1] // _ROWS
+    if bands >= 2:
+        images = images[:, : bands * _ROWS].reshape(len(images), bands, _ROWS, -1).sum(axis=2)
+    return images.reshape(len(images), -1)
+
+
+def score(values: NDArray[np.floating]) -> float:
+    """Return the mean of the values of units in its standard errors; 0 if there are fewer than 30 units, or no scatter."""
+    if len(values) < _MIN_UNITS:
+        return 0.0
+    scatter = float(values.std(ddof=1))
+    return float(values.mean()) / scatter * float(np.sqrt(len(values))) if scatter > 0 else 0.0

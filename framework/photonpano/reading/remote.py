@@ -14,6 +14,7 @@ from photonpano.errors import InputError, PhotonpanoError
 from photonpano.paths import Url
 from photonpano.text import install_line
 
+# The library that fsspec needs for each scheme, and what installs both.
 LIBRARIES = {
     "s3": ("s3fs", "photonpano[s3]"),
     "s3a": ("s3fs", "photonpano[s3]"),
@@ -22,13 +23,12 @@ LIBRARIES = {
     "http": ("aiohttp", "photonpano[http]"),
     "https": ("aiohttp", "photonpano[http]"),
 }
-"""The library that reads each scheme, beside fsspec, and what installs both."""
+# Errors of the libraries by the names of their classes, since none of the libraries need be installed.
 _NO_RIGHTS = {"PermissionError", "NoCredentialsError", "PartialCredentialsError", "RefreshError", "DefaultCredentialsError"}
 _NO_ANSWER = {
     *("ClientConnectionError", "EndpointConnectionError", "ConnectTimeoutError", "ReadTimeoutError"),
     *("ConnectionError", "TimeoutError", "FSTimeoutError", "HTTPClientError", "gaierror"),
 }
-"""Errors of the libraries, by the names of their classes: none of them need be installed."""
 
 
 class RemoteFile(NamedTuple):

@@ -10,37 +10,28 @@ from gtsam.symbol_shorthand import L as POINT
 from gtsam.symbol_shorthand import X as POSE
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import chi2
 
 from photonpano import FloatArray
 from photonpano_colmap.pose_noise import without_gauge
-from photonpano_colmap.pose_spline import positions_of
-from photonpano_colmap.posing.path import posed, projected
+from photonpano_colmap.posing.path import posed, positions_of, projected
 
-_ROBUST = 2.0
-"""Sightings further off than this many standard deviations count by their distance, not by its square."""
-_FLOOR_PX = 0.02
-"""Error that sightings have beside photon noise: interpolation, and depth that is not quite right."""
+_ROBUST = 2.0  # scale of the Cauchy loss, in standard deviations
+_FLOOR_PX = 0.02  # error of observations beside photon noise, from interpolation and errors of depth
+# Prior standard deviation of poses: in radians, and in mean distances of the cameras from their centroid.
 _PRIOR_RAD, _PRIOR_SHIFT = 0.02, 0.2
-"""How far poses may be from where they begin: in radians, and in mean distances of the cameras from their middle."""
-_PRIOR_POINT = 100.0
-"""The same of points, whose depth sightings may not tell."""
-_OUTLIER = 3.0
-"""Points are kept if they are seen within this many standard deviations, ..."""
-_SEEN_BY = 3
-"""... by at least this many exposures."""
+_PRIOR_POINT = 100.0  # the same for points, whose depth may be undetermined, in those mean distances
+_OUTLIER = 3.0  # standard deviations within which an observation confirms its point
+_SEEN_BY = 3  # fewest exposures that confirm a point
 _MOST_STEPS = 30
-_REWEIGHTINGS = 3
-"""After the first solution, sightings are weighted by the residuals of their point."""
-_MEDIAN_OF_TWO = 2 * np.log(2)
-"""Median of the sum of the squares of two normal numbers."""
-_SHARED_PX = 6.0
-"""Patches nearer to each other have most of their photons in common."""
-_FAR_PX = 1e3
-"""Residual of a point behind a camera."""
+_REWEIGHTINGS = 3  # solutions; after each, observations are weighted by the residuals of their point
+_MEDIAN_OF_TWO = float(chi2.median(2))  # of the squared norm of two standard normal numbers
+_SHARED_PX = 6.0  # patches nearer to each other share most of their photons
+_FAR_PX = 1e3  # residual of a point behind a camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class Observations:
     """Points that exposures see.
 
     Attributes:
@@ -55,14 +46,14 @@ class Sightings:
     pixels: FloatArray
     covariance: FloatArray
 
-    def kept(self, which: NDArray[np.bool_]) -> Sightings:
-        """Return some of the sightings."""
-        return Sightings(self.points[which], self.views[which], self.pixels[which], self.covariance[which])
+    def kept(self, which: NDArray[np.bool_]) -> Observations:
+        """Return some of the observations."""
+        return Observations(self.points[which], self.views[which], self.pixels[which], self.covariance[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """Poses and points that agree best with all sightings.
+    """Poses and points that agree best with all observations.
 
     Attributes:
         poses: (V, 3, 4).
@@ -71,7 +62,7 @@ class Adjusted:
         information: (V, 6, 6) of each pose while the others rest: a rotation vector of the camera, and a shift in the world.
         std_position: (V,) expected distance of a camera from its true place, after the best alignment of all.
         std_rotation: (V,) expected angle in radians, after that alignment.
-        residual_px: median distance of a sighting from where its point is seen.
+        residual_px: median distance of a observation from where its point is seen.
     """
 
     poses: FloatArray
@@ -83,35 +74,35 @@ class Adjusted:
     residual_px: float
 
 
-def adjust(poses: FloatArray, points: FloatArray, sightings: Sightings, camera_matrix: FloatArray) -> Adjusted:
-    """Solve for the poses and points that agree best with the sightings.
+def adjust(poses: FloatArray, points: FloatArray, observations: Observations, camera_matrix: FloatArray) -> Adjusted:
+    """Solve for the poses and points that agree best with the observations.
 
     Args:
         poses: (V, 3, 4) to begin with.
         points: (N, 3) to begin with.
-        sightings: each of the points is seen at least twice.
+        observations: each of the points is seen at least twice.
         camera_matrix: (3, 3) K.
     """
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(_MOST_STEPS)
     settings.setRelativeErrorTol(1e-4)
-    covariance, shared = sightings.covariance + _FLOOR_PX**2 * np.eye(2), _shared(sightings)
+    covariance, shared = observations.covariance + _FLOOR_PX**2 * np.eye(2), _shared(observations)
     for _ in range(_REWEIGHTINGS):
-        graph, values = _problem(poses, points, sightings, covariance * shared[:, None, None], camera_matrix)
+        graph, values = _problem(poses, points, observations, covariance * shared[:, None, None], camera_matrix)
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
         found = [values.atPose3(POSE(view)) for view in range(len(poses))]
         poses = posed(
             np.array([each.rotation().matrix().T for each in found]), np.array([each.translation() for each in found])
         )
         points = np.array([values.atPoint3(POINT(point)) for point in range(len(points))])
-        residuals = sightings.pixels - projected(poses[sightings.views], points[sightings.points], camera_matrix)
+        residuals = observations.pixels - projected(poses[observations.views], points[observations.points], camera_matrix)
         residuals = np.where(np.isfinite(residuals), residuals, _FAR_PX)
         squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(covariance), residuals)
         # Patches at the edges of things show two depths, and wander between them.
-        of_point = _median_by(sightings.points, squares, len(points)) / _MEDIAN_OF_TWO
-        covariance = covariance * of_point[sightings.points, None, None] + _FLOOR_PX**2 * np.eye(2)
-    fits = squares < _OUTLIER**2 * of_point[sightings.points]
-    confirmed = np.bincount(sightings.points[fits], minlength=len(points)) >= _SEEN_BY
+        of_point = _median_by(observations.points, squares, len(points)) / _MEDIAN_OF_TWO
+        covariance = covariance * of_point[observations.points, None, None] + _FLOOR_PX**2 * np.eye(2)
+    fits = squares < _OUTLIER**2 * of_point[observations.points]
+    confirmed = np.bincount(observations.points[fits], minlength=len(points)) >= _SEEN_BY
     information = _information(graph, values, poses, len(points))
     of_views = information.reshape(len(poses), 6, len(poses), 6)[np.arange(len(poses)), :, np.arange(len(poses))]
     variances = np.diag(without_gauge(information, poses)).reshape(len(poses), 2, 3).sum(axis=2)
@@ -127,7 +118,7 @@ def adjust(poses: FloatArray, points: FloatArray, sightings: Sightings, camera_m
 
 
 def _problem(
-    poses: FloatArray, points: FloatArray, sightings: Sightings, covariance: FloatArray, camera_matrix: FloatArray
+    poses: FloatArray, points: FloatArray, observations: Observations, covariance: FloatArray, camera_matrix: FloatArray
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Return the factors of a bundle adjustment, and the values that it begins with."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -145,7 +136,7 @@ def _problem(
         values.insert(POINT(point), place)
         graph.add(gtsam.PriorFactorPoint3(POINT(point), place, somewhere))
     robust = gtsam.noiseModel.mEstimator.Cauchy.Create(_ROBUST)
-    rows = zip(sightings.points, sightings.views, sightings.pixels, np.linalg.inv(covariance), strict=True)
+    rows = zip(observations.points, observations.views, observations.pixels, np.linalg.inv(covariance), strict=True)
     for point, view, pixel, information in rows:
         noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Information(information))
         graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, POSE(int(view)), POINT(int(point)), calibration))
@@ -171,12 +162,12 @@ def _information(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, poses:
     return np.asarray(to_own.T @ information @ to_own)
 
 
-def _shared(sightings: Sightings) -> FloatArray:
-    """Return how many sightings share the photons of each, since points of several key exposures coincide: (M,)."""
-    shared = np.ones(len(sightings.points))
-    for view in np.unique(sightings.views):
-        of_view = np.flatnonzero(sightings.views == view)
-        pixels = sightings.pixels[of_view]
+def _shared(observations: Observations) -> FloatArray:
+    """Return how many observations share the photons of each, since points of several key exposures coincide: (M,)."""
+    shared = np.ones(len(observations.points))
+    for view in np.unique(observations.views):
+        of_view = np.flatnonzero(observations.views == view)
+        pixels = observations.pixels[of_view]
         shared[of_view] = cKDTree(pixels).query_ball_point(pixels, _SHARED_PX, return_length=True)
     return shared
 

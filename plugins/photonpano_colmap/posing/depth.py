@@ -10,15 +10,12 @@ from scipy.spatial import cKDTree
 
 from photonpano import FloatArray
 
-_STEP_PX = 8
-"""Spacing of the grid on which depth is interpolated."""
-_MARGIN = 0.05
-"""Points this far outside of a frame are used as well, in its sides."""
+_STEP_PX = 8  # spacing of the grid on which depth is interpolated
+_MARGIN = 0.05  # points up to this far outside of the frame are used, in its longer side
+# A point is an outlier if its inverse depth differs from the median of its 7 neighbours by half of it.
 _NEIGHBOURS = 7
 _APART = 0.5
-"""A point whose inverse depth differs by this share from the median of its neighbours is left out."""
-_LEAST = 4
-"""Points that a depth needs at least."""
+_LEAST = 4  # fewest points of a depth map
 
 
 def inverse_depth_of(

@@ -11,38 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Source
-from photonpano_colmap.posing.adjustment import Adjusted, Sightings, adjust
+from photonpano_colmap.posing.adjustment import Adjusted, Observations, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
-from photonpano_colmap.posing.path import Path, between, moves
-from photonpano_colmap.posing.smoothing import exceeding_noise_of_poses
+from photonpano_colmap.posing.path import Path, between, exceeding_noise_of_poses, moves
 from photonpano_colmap.posing.tremor import Tremor, find_tremor
 
-_PATCHES = 300
-"""Patches of a key exposure."""
+_PATCHES = 300  # patches of a key exposure
+# Patches are chosen in about 12 key exposures, at least in every 10th exposure.
 _KEYS = 12
-"""Key exposures, whose patches are sought in others: about so many, and at least every 10th exposure."""
 _EVERY = 10
+# They are searched in the 12 exposures before and after, and in every 6th of the others.
 _NEIGHBOURS = 12
-"""Patches are sought in so many exposures before and after, and in every 6th of all others."""
 _FURTHER = 6
-_SEEN_BY = 4
-"""A point must be seen by so many exposures."""
-_LEAST_SIGHTINGS = 20
-"""An exposure with fewer sightings is not located."""
-_LEAST_LOCATED = 5
-"""Exposures that a path needs at least."""
+_SEEN_BY = 4  # minimum number of exposures that observe a point
+_LEAST_OBSERVATIONS = 20  # minimum number of observations in a located exposure
+_LEAST_LOCATED = 5  # minimum number of located exposures
+# Corrections of tremor in a level end after 4, below 0.02 px, or when they grow: then depth is wrong, not the path.
 _MOST_TREMORS, _LEFT_PX = 4, 0.02
-"""Corrections of a tremor in a level, at most; fewer if the next would move the image by less than this, or by more than the
-last: then it is not tremor that spans show, but depth that is wrong."""
-_OUT_OF_SIGHT = 0.8
-"""Exposures are not compared if the middle of one lies further than this from that of the other, in sides of a frame."""
+_OUT_OF_SIGHT = 0.8  # exposures are compared if their centres are closer than this, in sides of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is known of capture and scene before a level.
+    """Path and scene before a level.
 
     Attributes:
         path: of the camera.
@@ -62,7 +55,7 @@ class Merged:
     Attributes:
         exposures: of all groups.
         path: along which they are merged.
-        tremor: what was last found; None if the capture is too short to tell.
+        tremor: the last one found; None if the capture is too short.
     """
 
     exposures: Sequence[PosedExposure]
@@ -78,7 +71,7 @@ class PosedLevel:
         groups: of the exposures.
         is_located: (V,) bool.
         adjusted: poses of the located exposures, and points.
-        sightings: of these points, in the located exposures.
+        observations: of these points, in the located exposures.
         exposures: all of them.
         path: of the camera.
         tremor: what was found last before the exposures were located.
@@ -87,7 +80,7 @@ class PosedLevel:
     groups: Sequence[Group]
     is_located: BoolArray
     adjusted: Adjusted
-    sightings: Sightings
+    observations: Observations
     exposures: Sequence[PosedExposure]
     path: Path
     tremor: Tremor | None
@@ -105,8 +98,8 @@ def refine(source: Source, scene: Scene, group_size: int, camera_matrix: FloatAr
     """Locate groups (paper, section 4) that are merged and registered through the depth of the scene."""
     groups = resample(scene.located, group_size)
     merged = merge(source, groups, scene, camera_matrix, pool)
-    points, sightings = locate(merged.exposures, camera_matrix, pool)
-    return interpolate(groups, merged, points, sightings, camera_matrix)
+    points, observations = locate(merged.exposures, camera_matrix, pool)
+    return interpolate(groups, merged, points, observations, camera_matrix)
 
 
 def resample(located: BoolArray, group_size: int) -> tuple[Group, ...]:
@@ -127,7 +120,7 @@ def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: 
     def depth_of(group: Group) -> NDArray[np.float32]:
         pose, shape = scene.path.at([group.reference])[0], source.info.frame_shape
         depth = inverse_depth_of(pose, scene.points, camera_matrix, shape)
-        if depth is None:  # the sightings tell whether this view is of any use
+        if depth is None:  # a view of no use will have no observations
             seen = scene.points @ pose[2, :3] + pose[2, 3]
             depth = np.full(shape, 1 / np.median(seen[seen > 0]) if (seen > 0).any() else 0, np.float32)
         return depth
@@ -141,14 +134,14 @@ def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: 
         before, tremor = tremor, find_tremor(source, exposures, path, camera_matrix, pool)
         if tremor is None or tremor.rms_px < _LEFT_PX or (before and tremor.rms_px > before.rms_px):
             break
-        path = path.turned(tremor.turns)
+        path = path.rotated(tremor.rotations)
         exposures = along(path)
     return Merged(exposures, path, tremor)
 
 
 def locate(
     exposures: Sequence[PosedExposure], camera_matrix: FloatArray, pool: ThreadPoolExecutor
-) -> tuple[FloatArray, Sightings]:
+) -> tuple[FloatArray, Observations]:
     """Choose points in key exposures, and find them in the others.
 
     Returns:
@@ -180,43 +173,43 @@ def locate(
             parts.append((each.patches + first, np.full(len(each.patches), other), each.pixels, each.covariance))
         points.append(places)
         first += len(places)
-    if sum(len(part[0]) for part in parts) < _LEAST_SIGHTINGS:
+    if sum(len(part[0]) for part in parts) < _LEAST_OBSERVATIONS:
         raise LocationError(
             f"of {len(exposures)} exposures, no patch of one was found in another along the poses of the averages; they are "
             "wrong, or the exposures too dark: choose a larger pose.with.group_size"
         )
-    sightings = Sightings(*(np.concatenate([part[k] for part in parts]) for k in range(4)))
-    return _seen_often(np.concatenate(points), sightings)
+    observations = Observations(*(np.concatenate([part[k] for part in parts]) for k in range(4)))
+    return _seen_often(np.concatenate(points), observations)
 
 
 def interpolate(
-    groups: Sequence[Group], merged: Merged, points: FloatArray, sightings: Sightings, camera_matrix: FloatArray
+    groups: Sequence[Group], merged: Merged, points: FloatArray, observations: Observations, camera_matrix: FloatArray
 ) -> PosedLevel:
-    """Adjust exposures and points to the sightings, and correct the path by the poses of the exposures.
+    """Adjust exposures and points to the observations, and correct the path by the poses of the exposures.
 
     Raises:
         LocationError: few exposures show points of others.
     """
     exposures = merged.exposures
-    located = np.bincount(sightings.views, minlength=len(exposures)) >= _LEAST_SIGHTINGS
+    located = np.bincount(observations.views, minlength=len(exposures)) >= _LEAST_OBSERVATIONS
     if located.sum() < _LEAST_LOCATED:
         raise LocationError(
-            f"of {len(exposures)} exposures, {located.sum()} show {_LEAST_SIGHTINGS} points of others or more; choose a larger "
-            "pose.with.group_size"
+            f"of {len(exposures)} exposures, {located.sum()} show {_LEAST_OBSERVATIONS} points of others or more; choose a "
+            "larger pose.with.group_size"
         )
-    sightings = sightings.kept(located[sightings.views])
-    points, sightings = _seen_often(points, sightings)
+    observations = observations.kept(located[observations.views])
+    points, observations = _seen_often(points, observations)
     number = np.cumsum(located) - 1
-    sightings = Sightings(sightings.points, number[sightings.views], sightings.pixels, sightings.covariance)
+    observations = Observations(observations.points, number[observations.views], observations.pixels, observations.covariance)
     poses = np.array([exposure.pose for exposure in exposures])[located]
-    adjusted = adjust(poses, points, sightings, camera_matrix)
+    adjusted = adjust(poses, points, observations, camera_matrix)
     kept = [group for group, is_located in zip(groups, located, strict=True) if is_located]
     depth = np.median([np.median(each.inverse_depth) for each in exposures])
     units = float(camera_matrix[0, 0]) * np.array([1, 1, 1, depth, depth, depth])
     covariance = np.linalg.inv(adjusted.information / units[:, None] / units).astype(np.float64)
     means = exceeding_noise_of_poses(moves(poses, adjusted.poses) * units, covariance)
     return PosedLevel(
-        groups, located, adjusted, sightings, exposures, merged.path.corrected(_borders(kept), means / units), merged.tremor
+        groups, located, adjusted, observations, exposures, merged.path.corrected(_borders(kept), means / units), merged.tremor
     )
 
 
@@ -240,9 +233,9 @@ def _overlap(here: PosedExposure, there: PosedExposure, camera_matrix: FloatArra
     return bool((away < _OUT_OF_SIGHT * np.array([width, height])).all())
 
 
-def _seen_often(points: FloatArray, sightings: Sightings) -> tuple[FloatArray, Sightings]:
+def _seen_often(points: FloatArray, observations: Observations) -> tuple[FloatArray, Observations]:
     """Leave out points that few exposures see, and number the others anew."""
-    seen = np.bincount(sightings.points, minlength=len(points)) >= _SEEN_BY
-    kept = sightings.kept(seen[sightings.points])
+    seen = np.bincount(observations.points, minlength=len(points)) >= _SEEN_BY
+    kept = observations.kept(seen[observations.points])
     number = np.cumsum(seen) - 1
-    return points[seen], Sightings(number[kept.points], kept.views, kept.pixels, kept.covariance)
+    return points[seen], Observations(number[kept.points], kept.views, kept.pixels, kept.covariance)

@@ -13,8 +13,7 @@ from photonpano.geometry import inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
 from photonpano_colmap.posing.path import Path, between
 
-_CHUNK_PX = 1.0
-"""Frames that move less than this are summed before they are warped."""
+_CHUNK_PX = 1.0  # frames that move less than this are summed before they are warped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,8 +36,7 @@ def merge_through_depth(
 ) -> PosedExposure:
     """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
 
-    Each chunk of frames is interpolated once, at the places where the frames see the points of the reference view; what only
-    one of the two sees is not told apart.
+    Each chunk of frames is interpolated once, where its frames see the points of the reference view. Occlusions are ignored.
 
     Args:
         source: the capture.
@@ -60,7 +58,7 @@ def merge_through_depth(
 
 
 class _Plane:
-    """The motion of a plane before a view, at the median depth: it tells how fast frames move."""
+    """The motion of a plane before a view at the median depth, by which frames are divided into chunks."""
 
     def __init__(self, path: Path, pose: FloatArray, inverse_depth: float, camera_matrix: FloatArray) -> None:
         self._path, self._pose, self._inverse_depth, self._matrix = path, pose, inverse_depth, camera_matrix

@@ -14,25 +14,19 @@ from photonpano.locating import view_of
 from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import between
 
-_BLUR_PX = 1.0
-"""Standard deviation of the blur against photon noise."""
-_HALF = 9
-"""Patches have 19 x 19 pixels, with Gaussian weights."""
+_BLUR_PX = 1.0  # standard deviation of the blur against photon noise
+_HALF = 9  # patches have 19 x 19 pixels, with Gaussian weights
 _BORDER = _HALF + 3
+# Corners are at least 9 px apart, with at least this fraction of the strongest corner's curvature.
 _APART_PX = 9
 _QUALITY = 0.002
-"""Corners are at least 9 px apart, and have this share of the curvature of the best."""
 _STEPS = 15
 _CONVERGED_PX = 0.01
 _LARGEST_STEP_PX = 2.0
-_LARGEST_SHIFT_PX = 8.0
-"""Patches are sought this far from where they are predicted."""
-_MISFIT = 2.0
-"""A patch differs by more than noise if the mean square of its residuals is this many times that of photon noise."""
-_LARGEST_STD_PX = 1.0
-"""Patches whose place is less certain are left out."""
-_SLOPE_PX = 3.0
-"""Standard deviation of the blur before slopes of the inverse depth are taken."""
+_LARGEST_SHIFT_PX = 8.0  # radius of the search around the predicted position
+_LARGEST_CHI_SQUARE = 2.0  # maximum reduced chi-square of a patch
+_LARGEST_STD_PX = 1.0  # maximum standard error of the position of a patch
+_SLOPE_PX = 3.0  # standard deviation of the blur before slopes of the inverse depth are computed
 
 
 class Stabilised(NamedTuple):
@@ -119,14 +113,16 @@ def find_patches(
     (posed, view), (other, image) = here, there
     turn, shift = between(posed.pose, other.pose, camera_matrix)
     number = len(patches.pixels)
-    pixels, hessian, misfit = np.full((number, 2), np.nan), np.zeros((number, 2, 2)), np.full(number, np.inf)
+    pixels, hessian, chi_square = np.full((number, 2), np.nan), np.zeros((number, 2, 2)), np.full(number, np.inf)
     noise = view.noise + image.noise
     # Central differences of noise, which the blur has correlated.
     gradient_noise = 0.5 * (1 - np.exp(-1 / _BLUR_PX**2)) * image.noise * image.noise_left
-    _find(view.image, image.image, patches.pixels, patches.inverse_depth, turn, shift, gradient_noise, pixels, hessian, misfit)
-    misfit /= noise * view.noise_left
+    _find(
+        view.image, image.image, patches.pixels, patches.inverse_depth, turn, shift, gradient_noise, pixels, hessian, chi_square
+    )
+    chi_square /= noise * view.noise_left
     determinant = np.linalg.det(hessian)
-    kept = np.isfinite(pixels[:, 0]) & (misfit < _MISFIT) & (determinant > 0) & (hessian[:, 0, 0] > 0)
+    kept = np.isfinite(pixels[:, 0]) & (chi_square < _LARGEST_CHI_SQUARE) & (determinant > 0) & (hessian[:, 0, 0] > 0)
     found = np.flatnonzero(kept)
     covariance = noise * np.linalg.inv(hessian[found])
     certain = np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]) < _LARGEST_STD_PX**2
@@ -144,7 +140,7 @@ def _find(
     gradient_noise: float,
     pixels: FloatArray,
     hessian: FloatArray,
-    misfit: FloatArray,
+    chi_square: FloatArray,
 ) -> None:
     """Find patches in an image; those that are lost stay NaN.
 
@@ -158,7 +154,7 @@ def _find(
         gradient_noise: variance of a gradient of the image that is noise.
         pixels: (N, 2) output, their middles in the image.
         hessian: (N, 2, 2) output, weighted sums of products of the gradients of the scene.
-        misfit: (N,) output, weighted mean square of the residuals, whose mean is subtracted.
+        chi_square: (N,) output, weighted mean square of the residuals, whose mean is subtracted.
     """
     size = (2 * _HALF + 1) ** 2
     values, us, vs, weights = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -214,7 +210,7 @@ def _find(
                 pixels[k, 0], pixels[k, 1] = us[middle] + u, vs[middle] + v
                 hessian[k, 0, 0], hessian[k, 1, 1] = xx - weight * gradient_noise, yy - weight * gradient_noise
                 hessian[k, 0, 1] = hessian[k, 1, 0] = xy
-                misfit[k] = squares / weight
+                chi_square[k] = squares / weight
                 break
 
 

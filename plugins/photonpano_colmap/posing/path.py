@@ -1,4 +1,4 @@
-"""The path of a camera through space: a pose for every frame.
+"""The path of a camera through space: a spline through some poses, or a pose for every frame.
 
 Convention:
     A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead.
@@ -10,11 +10,46 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from photonpano import FloatArray
+from photonpano.filtering import exceeding_noise
 from photonpano.geometry import rotation_matrices, rotation_vectors
-from photonpano_colmap.pose_spline import positions_of
+
+_DEGREE = 5  # degree of the polynomial in time that is always kept: gauge and drift
+
+
+class PoseSpline:
+    """Cubic splines of positions and of rotations; beyond the first and the last pose the camera keeps its velocity."""
+
+    def __init__(self, instants: FloatArray, poses: FloatArray) -> None:
+        """Fit (N, 3, 4) poses at increasing instants, in frames; N is at least 2."""
+        self._ends = float(instants[0]), float(instants[-1])
+        self._positions = CubicSpline(instants, positions_of(poses))
+        self._rotations = RotationSpline(instants, Rotation.from_matrix(poses[:, :, :3]))
+
+    def at(self, instants: ArrayLike) -> FloatArray:
+        """Return the poses of N instants: (N, 3, 4)."""
+        instants = np.asarray(instants, dtype=np.float64)
+        inside = np.clip(instants, *self._ends)
+        beyond = (instants - inside)[:, None]
+        places = self._positions(inside) + beyond * self._positions(inside, 1)
+        # Rates are those of the camera in the world, in its own axes.
+        rotated = Rotation.from_rotvec(beyond * self._rotations(inside, 1))
+        rotations = (self._rotations(inside) * rotated).as_matrix()
+        return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+
+
+def left_out(instants: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far each inner pose is from the spline through the others: distances and angles in radians, (N - 2,) each."""
+    apart, angles = [], []
+    for place in range(1, len(instants) - 1):
+        others = np.delete(np.arange(len(instants)), place)
+        [predicted] = PoseSpline(instants[others], poses[others]).at(instants[place : place + 1])
+        apart.append(float(np.linalg.norm(positions_of(predicted) - positions_of(poses[place]))))
+        angles.append(float(Rotation.from_matrix(predicted[:, :3] @ poses[place, :, :3].T).magnitude()))
+    return np.array(apart), np.array(angles)
 
 
 class Path:
@@ -31,7 +66,7 @@ class Path:
         first = np.minimum(at.astype(int), len(self.poses) - 2)
         share = (at - first)[:, None, None]
         rotations = (1 - share) * self.poses[first, :, :3] + share * self.poses[first + 1, :, :3]
-        # A mean of two rotations is one that shrinks; a step of Newton's method undoes that.
+        # The mean of two rotation matrices is not orthogonal; a step of Newton's method makes it so.
         rotations = rotations @ (3 * np.eye(3) - np.swapaxes(rotations, 1, 2) @ rotations) / 2
         centres = (1 - share[:, 0]) * self._centres[first] + share[:, 0] * self._centres[first + 1]
         return posed(rotations, centres)
@@ -39,9 +74,9 @@ class Path:
     def corrected(self, borders: FloatArray, means: FloatArray) -> Path:
         """Return this path, corrected where groups of frames were located along it.
 
-        The frames of a group were merged along the path, so that where the group is located tells the mean correction of all of
-        its frames, and not that of one instant. The correction is the smoothest function with these means, that of the least
-        second derivative: the derivative of the natural quintic spline through its integral at the borders of the groups.
+        The frames of a group were merged along the path, so a group's pose gives the mean correction of its frames, not that of
+        one instant. The correction is the function with these means and the least second derivative: the derivative of the
+        natural quintic spline through its integral at the borders of the groups.
 
         Args:
             borders: (N + 1,) increasing, in frames: where groups begin and end, side by side.
@@ -53,9 +88,14 @@ class Path:
         correction = make_interp_spline(borders, integral, k=5, bc_type=ends).derivative()(np.arange(len(self.poses)))
         return Path(posed(rotation_matrices(correction[:, :3]) @ self.poses[:, :, :3], self._centres + correction[:, 3:]))
 
-    def turned(self, turns: FloatArray) -> Path:
-        """Return this path with the camera turned on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
-        return Path(rotation_matrices(turns) @ self.poses)
+    def rotated(self, rotations: FloatArray) -> Path:
+        """Return this path with the camera rotated on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
+        return Path(rotation_matrices(rotations) @ self.poses)
+
+
+def positions_of(poses: FloatArray) -> FloatArray:
+    """Return the positions of cameras in the world, -R^T t: (..., 3, 4) to (..., 3)."""
+    return np.asarray(-np.einsum("...ji,...j->...i", poses[..., :3], poses[..., 3]))
 
 
 def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:
@@ -66,8 +106,8 @@ def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:
 
 def moves(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return how poses differ, (N, 3, 4) each: rotation vectors of the camera, and shifts of its place in the world; (N, 6)."""
-    turns = rotation_vectors(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
-    return np.concatenate([turns, positions_of(after) - positions_of(before)], axis=1)
+    rotations = rotation_vectors(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
+    return np.concatenate([rotations, positions_of(after) - positions_of(before)], axis=1)
 
 
 def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -93,3 +133,23 @@ def projected(poses: FloatArray, points: FloatArray, camera_matrix: FloatArray) 
     seen = np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
     depth = np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
     return np.asarray((seen @ camera_matrix.T)[:, :2] / depth)
+
+
+def exceeding_noise_of_poses(moves: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Denoise corrections of poses with a Wiener filter, and keep their slow part.
+
+    Args:
+        moves: (N, 6) px, in order of time.
+        covariance: (N, 6, 6) of the noise of each.
+
+    Returns:
+        (N, 6).
+    """
+    times = np.linspace(-1, 1, len(moves))
+    basis = np.polynomial.legendre.legvander(times, min(_DEGREE, len(moves) - 1))
+    slow = basis @ np.linalg.lstsq(basis, moves, rcond=None)[0]
+    # In these modes, errors are independent of each other.
+    _, modes = np.linalg.eigh(np.linalg.inv(covariance).mean(axis=0))
+    variances = np.einsum("ka,nkl,la->na", modes, covariance, modes)
+    rest = [exceeding_noise(*columns).signal for columns in zip(((moves - slow) @ modes).T, variances.T, strict=True)]
+    return np.asarray(slow + np.stack(rest, axis=1) @ modes.T)

@@ -1,8 +1,8 @@
 """Tremor within groups: short spans of frames against the merged exposures, through depth.
 
-Only turns are corrected. A hand that trembles by half a millimetre moves things at 4 m by a tenth of what its turns move them,
-and within a group a shift of the camera looks almost like a turn: noise, or depth that is wrong, would be taken for it. How
-much the camera shifts is told by the power of the shifts beyond their noise, which is the same at all frequencies.
+Only rotations are corrected. A tremor of half a millimetre moves things at 4 m by a tenth of what its rotations move them, and
+within a group a translation looks almost like a rotation: noise, or an error of depth, would be taken for it. The power of the
+translation is estimated from the spectrum of the shifts, above a noise floor that is the same at all frequencies.
 """
 
 from __future__ import annotations
@@ -25,24 +25,18 @@ from photonpano.photometry import flux_std
 from photonpano_colmap.posing.merging import PosedExposure, lit_counts
 from photonpano_colmap.posing.path import Path, between
 
-_NOISE_PX = 0.1
-"""Spans are long enough that photon noise moves their shift by no more than this, if the limits below allow it."""
-_SHORTEST, _LONGEST = 6, 32
-"""Fewest and most frames of a span."""
-_FEWEST = 16
-"""Fewer spans than this have no spectrum."""
-_BLUR_PX = 1.0
-"""Standard deviation of the blur of an exposure before its slopes are taken."""
+_NOISE_PX = 0.1  # standard error of the shift of a span that determines its length, within the limits below
+_SHORTEST, _LONGEST = 6, 32  # frames of a span
+_FEWEST = 16  # fewest spans that have a spectrum
+_BLUR_PX = 1.0  # standard deviation of the blur of an exposure before its gradient is computed
+# variance of the gradient of noise, relative to that of a pixel before the blur
 _SLOPE_NOISE = (1 - np.exp(-1 / _BLUR_PX**2)) / (8 * np.pi * _BLUR_PX**2)
-"""Variance of a slope that is noise, relative to that of a pixel before the blur."""
-_BORDER = 4
-"""Pixels nearer to unknown ones have no slope."""
-_TURNS, _MOTION, _GAIN = slice(3), slice(6), 6
-"""Unknowns of a span: turns about three axes and shifts along them, and last the gain of the light."""
+_BORDER = 4  # pixels nearer to masked ones have no gradient
+# Unknowns of a span: rotation about three axes, translation along them, and the gain of the light.
+_ROTATIONS, _MOTION, _GAIN = slice(3), slice(6), 6
+# The translations that are well determined; along the third axis the camera translates as much.
 _SIDEWAYS, _AXES = slice(3, 5), 3
-"""Shifts that are seen well; the camera shifts along the third axis as much."""
-_LEAST_INFORMATION = 1e-2
-"""Modes that a span shows with a noise of more than 10 px are unknown."""
+_LEAST_INFORMATION = 1e-2  # modes with a standard error above 10 px are unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +44,13 @@ class Tremor:
     """What the camera does faster than its path.
 
     Attributes:
-        turns: (T, 3) small rotation vectors of the camera at each frame.
+        rotations: (T, 3) small rotation vectors of the camera at each frame.
         std: (T,) their noise, in radians.
         rms_px: root mean square of what they move in the image.
         shift: root mean square of the shifts within groups, which are not corrected, in units of the world.
     """
 
-    turns: FloatArray
+    rotations: FloatArray
     std: FloatArray
     rms_px: float
     shift: float
@@ -67,8 +61,8 @@ def find_tremor(
 ) -> Tremor | None:
     """Find how the camera moves within groups that were merged along a path.
 
-    A span of a few frames shows what the exposure of its group shows, moved by a step of the camera: one step of weighted least
-    squares, of which is kept what exceeds the noise.
+    A span of a few frames shows the exposure of its group, moved by a step of the camera. Steps are estimated by weighted
+    least squares, and denoised with a Wiener filter.
 
     Args:
         source: the capture.
@@ -93,17 +87,17 @@ def find_tremor(
     if len(found) < _FEWEST:
         return None
     gradient, information = np.array([each.gradient for each in found]), np.array([each.information for each in found])
-    of_turns, mean = information[:, _TURNS, _TURNS], information[:, _TURNS, _TURNS].mean(axis=0)
+    of_rotations, mean = information[:, _ROTATIONS, _ROTATIONS], information[:, _ROTATIONS, _ROTATIONS].mean(axis=0)
     # In these modes, errors are independent of each other.
     _, modes = np.linalg.eigh(mean)
-    steps, variances = _solved(gradient[:, _TURNS] @ modes, modes.T @ of_turns @ modes)
+    steps, variances = _solved(gradient[:, _ROTATIONS] @ modes, modes.T @ of_rotations @ modes)
     filtered = [exceeding_noise(*columns) for columns in zip(steps.T, variances.T, strict=True)]
-    turns = np.stack([each.signal for each in filtered], axis=1) @ modes.T
+    rotations = np.stack([each.signal for each in filtered], axis=1) @ modes.T
     noise = np.sqrt(sum(each.std**2 for each in filtered))
     instants, frames = np.array([each.instant for each in found]), np.arange(source.info.n_frames)
-    at_frames = CubicSpline(instants, turns)(np.clip(frames, instants[0], instants[-1]))
+    at_frames = CubicSpline(instants, rotations)(np.clip(frames, instants[0], instants[-1]))
     # A turn about x or y moves all pixels alike, but for the corners.
-    moved_px = np.sqrt(np.mean(np.einsum("si,ij,sj->s", turns, mean, turns)) / max(np.trace(mean[:2, :2]) / 2, 1e-12))
+    moved_px = np.sqrt(np.mean(np.einsum("si,ij,sj->s", rotations, mean, rotations)) / max(np.trace(mean[:2, :2]) / 2, 1e-12))
     focal_px = float(camera_matrix[0, 0])
     shift = _beyond_noise(_solved(gradient, information)[0][:, _SIDEWAYS]) / (focal_px * inverse_depth)
     return Tremor(at_frames / focal_px, np.interp(frames, instants, noise) / focal_px, float(moved_px), shift)
@@ -142,7 +136,7 @@ class _Prediction(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations of the motion of a span, whatever its gain, for what turns and shifts move in the image, in px.
+    """Normal equations of the motion of a span with its gain eliminated; rotations and translations count in px of the image.
 
     Attributes:
         instant: centre of the span, in frames.
@@ -175,7 +169,7 @@ def _prediction(posed: PosedExposure, camera_matrix: FloatArray, mean_depth: flo
     inner = cv2.erode(known.astype(np.uint8), np.ones((2 * _BORDER + 1,) * 2, np.uint8), borderValue=0).astype(bool)
     smooth = cv2.GaussianBlur(mean, (0, 0), _BLUR_PX)
     slope_x, slope_y = (np.where(inner, cv2.filter2D(smooth, cv2.CV_32F, each), np.float32(0)) for each in _DIFFERENCES)
-    # Slopes that are noise would count as structure.
+    # The gradient of noise would count as structure.
     noise = np.where(inner, np.float32(_SLOPE_NOISE) / frames, np.float32(0))
     gain = np.where(inner, mean / variance, np.float32(0))
     information = np.zeros((_GAIN + 1, _GAIN + 1))
@@ -310,7 +304,7 @@ def _add_residuals(
             residual = lit - seen * mean
             _moves(row, column, q / predicted.mean_depth, predicted.to_ideal, along_x, along_y)
             by_x, by_y = residual * predicted.slope_x[row, column], residual * predicted.slope_y[row, column]
-            # What a camera moves by, its image moves against.
+            # The image moves against the camera.
             for k in range(6):
                 sums[k] -= by_x * along_x[k] + by_y * along_y[k]
             sums[6] += residual * gain
@@ -319,7 +313,7 @@ def _add_residuals(
 
 @compiled
 def _moves(row: int, column: int, q: float, to_ideal: FloatArray, along_x: FloatArray, along_y: FloatArray) -> None:
-    """Write where a pixel moves by turns of the camera about its three axes, and by shifts along them, in focal lengths.
+    """Write the motion of a pixel by rotations of the camera about its axes, and translations along them, in focal lengths.
 
     Args:
         row: of the pixel.

@@ -12,11 +12,11 @@ from photonpano import InputError
 from photonpano.reading import reading
 from photonpano_sensors.intensity.levels import Encoding
 
-_MOST_BYTES = 4 * 1024**2
-"""Headers have a few kB; larger files are something else."""
+_MOST_BYTES = 4 * 1024**2  # headers have a few kB; larger files are something else
 _BITS = (8, 12, 16)
 _COUNT = re.compile(r"\d{1,9}")
 _RATE = re.compile(r"\d{1,9}(\.\d{1,9})?")
+# The keys of .cih and .cihx files.
 _KEYS = {
     "width": ("Image Width", "imageDataInfo/resolution/width"),
     "height": ("Image Height", "imageDataInfo/resolution/height"),
@@ -28,7 +28,6 @@ _KEYS = {
     "rate": ("Record Rate(fps)", "recordInfo/recordRate"),
     "step": ("Save Step", "frameInfo/skipFrame"),
 }
-"""The keys of .cih and .cihx files."""
 
 
 @dataclass(frozen=True, slots=True)

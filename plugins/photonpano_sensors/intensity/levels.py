@@ -13,8 +13,7 @@ from photonpano.photometry import IntensityResponse, srgb_to_linear
 from photonpano.reading import reading
 from photonpano_sensors.intensity.configs import ResponseConfig
 
-_MOST = 2**16 - 1
-"""The highest linear level."""
+_MOST = 2**16 - 1  # the highest linear level
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,10 +24,9 @@ from photonpano_sensors.looks import spread
 Image = NDArray[np.generic]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}
-"""The colour types of PNG other than grey."""
+_PNG_COLOURS = {2: "colours", 3: "a palette", 4: "transparency", 6: "colours"}  # colour types other than grey
+# bytes that a byte of a file may unpack to: 1,032 in PNG, more in other formats, for black frames
 _MOST_SQUEEZED = 4096
-"""A byte of a file unpacks to so many at most: 1,032 with the compression of PNG, more with others, for black frames."""
 _DAMAGED = "is damaged: it is not a TIFF file that can be read; copy it again"
 
 
@@ -138,11 +137,7 @@ class _Pages:
 
 
 def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
-    """Return the form that all frames have.
-
-    Raises:
-        InputError: the frames differ.
-    """
+    """Return the form that all frames have; raises an `InputError` if they differ."""
     first: tuple[str, _Form] | None = None
     for name, form in forms:
         if first is None:

@@ -16,11 +16,9 @@ from photonpano_sensors.intensity.levels import Encoding, linear_levels
 
 Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
-_PART_BYTES = 4 * 1024**2
-"""Bytes of the frames that are read at once for a sum."""
+_PART_BYTES = 4 * 1024**2  # bytes of the frames that are read at once for a sum
 _MOST_COUNT = 2**32 - 1
-_BLOCK_PIXELS = 4096
-"""Pixels summed at once: their sums stay in the L1 cache."""
+_BLOCK_PIXELS = 4096  # pixels summed at once: their sums stay in the L1 cache
 
 
 class IntensitySource(Closing, ABC):
@@ -70,7 +68,7 @@ class IntensitySource(Closing, ABC):
         """Sum the frames of a span: (H, W) uint32.
 
         Raises:
-            InputError: the sum of so many frames might not fit into uint32.
+            InputError: the sum might not fit into uint32.
         """
         self.info.require(span)
         most = _MOST_COUNT // (2**self.info.bit_depth - 1)

@@ -16,8 +16,7 @@ from photonpano_sensors.intensity.configs import VideoConfig
 from photonpano_sensors.intensity.source import IntensitySource, Levels
 from photonpano_sensors.intensity.video_index import VideoIndex, index_of, open_video
 
-_KEPT_BYTES = 256 * 1024**2
-"""Size of the cache of decoded frames."""
+_KEPT_BYTES = 256 * 1024**2  # size of the cache of decoded frames
 
 
 class VideoSource(IntensitySource):
@@ -76,11 +75,7 @@ class _Decoder:
         self.next, self._seeks = self._index.key_before(frame), True
 
     def decode(self) -> tuple[int, Levels]:
-        """Decode the next frame, and return its index and its levels.
-
-        Raises:
-            InputError: the frame is damaged or missing.
-        """
+        """Decode the next frame: its index and its levels; raises an `InputError` if it is damaged or missing."""
         due = self.next
         try:
             if self._seeks:

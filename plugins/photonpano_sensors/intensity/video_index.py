@@ -19,12 +19,11 @@ from photonpano.reading import look_first, missing_file, reading
 from photonpano_sensors.intensity.levels import Encoding
 from photonpano_sensors.intensity.recognition import refuse_mdat
 
-_LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")
-"""Pixel formats whose first plane is the luma."""
+_LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")  # pixel formats whose first plane is the luma
 _FULL_RANGE = re.compile(r"yuvj|gray")
 _DAMAGED = "is damaged: FFmpeg finds contradictions in it; export or copy it again"
+# FFmpeg's colour range in which all levels are used
 _JPEG_RANGE = 2
-"""The colour range of FFmpeg in which all levels are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

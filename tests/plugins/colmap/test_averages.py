@@ -23,7 +23,7 @@ pytest.importorskip("pycolmap")
 from photonpano_colmap.averages import AveragesEstimator, chosen_size
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.pose_noise import pose_noise
-from photonpano_colmap.pose_spline import PoseSpline, positions_of
+from photonpano_colmap.posing.path import PoseSpline, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart
 from photonpano_colmap.reversal import Readings
 

@@ -18,12 +18,11 @@ pytest.importorskip("pycolmap")
 pytest.importorskip("gtsam")
 
 from photonpano_colmap.configs import StratifiedPoseConfig
-from photonpano_colmap.pose_spline import PoseSpline, positions_of
-from photonpano_colmap.posing.adjustment import Sightings, adjust
+from photonpano_colmap.posing.adjustment import Observations, adjust
 from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
 from photonpano_colmap.posing.merging import merge_through_depth
-from photonpano_colmap.posing.path import Path, between, moves, posed, projected
+from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, positions_of, projected
 from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
 from photonpano_colmap.stratified import StratifiedEstimator
 
@@ -111,7 +110,7 @@ def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
     frames = np.arange(N_FRAMES)
     turns = [np.sin(2 * np.pi * (frames / period + phase)) for period, phase in ((41, 0.1), (27, 0.4), (35, 0.7))]
     tremor = np.sqrt(2) * rms_px / FOCAL_PX * np.stack(turns, axis=1)
-    return TRUE.turned(-tremor), tremor
+    return TRUE.rotated(-tremor), tremor
 
 
 def test_tremor_within_a_group_is_found() -> None:
@@ -145,7 +144,7 @@ def test_shifts_beyond_white_noise_are_told() -> None:
 
 
 def test_noise_of_located_groups_does_not_move_the_path() -> None:
-    # Sightings with noise move exposures; along a path that is right, only what exceeds this noise is a correction.
+    # Observations with noise move exposures; along a path that is right, only what exceeds this noise is a correction.
     rng, points = np.random.default_rng(5), points_on_planes(150, seed=2)
     with ThreadPoolExecutor(2) as pool:
         merged = merge(capture(), resample(EVERYWHERE, 16), Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
@@ -153,8 +152,8 @@ def test_noise_of_located_groups_does_not_move_the_path() -> None:
     poses = TRUE.at([group.reference for group in groups])
     views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
     pixels = projected(poses[views], points[numbers], MATRIX) + rng.normal(0, 0.3, (3000, 2))
-    sightings = Sightings(numbers, views, pixels, np.tile(0.3**2 * np.eye(2), (3000, 1, 1)))
-    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, sightings, MATRIX)
+    observations = Observations(numbers, views, pixels, np.tile(0.3**2 * np.eye(2), (3000, 1, 1)))
+    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, observations, MATRIX)
     located = _after_similarity(positions_of(level.adjusted.poses), positions_of(poses))
     path = _after_similarity(positions_of(level.path.at([group.reference for group in groups])), positions_of(poses))
     assert np.sqrt(np.mean(path**2)) < 0.7 * np.sqrt(np.mean(located**2)), (path, located)
@@ -174,9 +173,9 @@ def test_adjustment_finds_poses_and_knows_its_errors() -> None:
     for _ in range(3):
         views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
         pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.1, (3000, 2))
-        sightings = Sightings(numbers, views, pixels, np.tile(0.1**2 * np.eye(2), (3000, 1, 1)))
+        observations = Observations(numbers, views, pixels, np.tile(0.1**2 * np.eye(2), (3000, 1, 1)))
         start = posed(rotation_matrices(rng.normal(0, 0.003, (20, 3))) @ true[:, :, :3], positions_of(true))
-        found = adjust(start, points + rng.normal(0, 0.02, points.shape), sightings, MATRIX)
+        found = adjust(start, points + rng.normal(0, 0.02, points.shape), observations, MATRIX)
         errors.append(_after_similarity(positions_of(found.poses), positions_of(true)))
         expected.append(found.std_position)
         assert found.confirmed.mean() > 0.95
@@ -186,14 +185,14 @@ def test_adjustment_finds_poses_and_knows_its_errors() -> None:
 
 
 def test_patches_at_edges_of_things_count_less() -> None:
-    # Sightings of a tenth of the points wander with the view, as those of two depths at once do.
+    # Observations of a tenth of the points wander with the view, as those of two depths at once do.
     rng = np.random.default_rng(3)
     true, points = true_poses()[::16], points_on_planes(150, seed=2)
     views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
     pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.05, (3000, 2))
     pixels[numbers < 15, 0] += 0.15 * (views[numbers < 15] - 10)
-    sightings = Sightings(numbers, views, pixels, np.tile(0.05**2 * np.eye(2), (3000, 1, 1)))
-    found = adjust(true, points, sightings, MATRIX)
+    observations = Observations(numbers, views, pixels, np.tile(0.05**2 * np.eye(2), (3000, 1, 1)))
+    found = adjust(true, points, observations, MATRIX)
     error = _after_similarity(positions_of(found.poses), positions_of(true))
     assert np.sqrt(np.mean(error**2)) < 0.003, error
     assert found.confirmed[15:].mean() > 0.9
@@ -203,10 +202,10 @@ def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
     source, groups = capture(), resample(EVERYWHERE, 40)
     with ThreadPoolExecutor(2) as pool:
         merged = merge(source, groups, Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
-        points, sightings = locate(merged.exposures, MATRIX, pool)
+        points, observations = locate(merged.exposures, MATRIX, pool)
     poses = merged.path.at([group.reference for group in groups])
-    away = sightings.pixels - projected(poses[sightings.views], points[sightings.points], MATRIX)
-    assert len(sightings.points) > 500
+    away = observations.pixels - projected(poses[observations.views], points[observations.points], MATRIX)
+    assert len(observations.points) > 500
     assert np.median(np.linalg.norm(away, axis=1)) < 0.5
 
 

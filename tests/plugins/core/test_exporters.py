@@ -8,7 +8,7 @@ import pytest
 
 from photonpano.testing.exporters import SHAPE, panorama
 from photonpano_core.configs import ExrConfig
-from photonpano_core.radiance import RadianceExporter, encoded
+from photonpano_core.exporters import RadianceExporter, encoded
 
 
 @pytest.mark.parametrize("in_colour", [False, True])
@@ -35,7 +35,7 @@ def test_hdr_encodes_any_flux(level: float) -> None:
 @pytest.mark.parametrize("in_colour", [False, True])
 def test_exr_holds_flux_weight_std_and_saturated_pixels(tmp_path: Path, in_colour: bool, compression: str) -> None:
     openexr = pytest.importorskip("OpenEXR")
-    from photonpano_core.exr import ExrExporter
+    from photonpano_core.exporters import ExrExporter
 
     stored = panorama(in_colour)
     ExrExporter(ExrConfig(compression=compression)).export(stored, tmp_path / "a.exr")

@@ -10,7 +10,7 @@ from photonpano import CaptureSummary, CaptureUnreadError, StageContext, StreamI
 from photonpano_core.configs import MidpointConfig
 from photonpano_core.group_size import choose_group_size, whole_periods
 from photonpano_core.hooks import photonpano_resamplers
-from photonpano_core.midpoint import MidpointResampler
+from photonpano_core.resamplers import MidpointResampler
 
 HOW = "the second fastest of 12 places, from sums of 64 frames"
 
@@ -24,64 +24,52 @@ def built(stream: StreamInfo, name: str = "midpoint", **context: Any) -> Any:
     return contribution.build(contribution.config(group_size="auto"), StageContext(stream, response=None, **context))
 
 
-def test_choose_group_size_limits_motion_blur_in_the_light() -> None:
-    assert choice(0.5, 0.15) == (
-        254,
-        f"at 0.15 px per frame ({HOW}) groups of 254 frames are blurred by 38.1 px, 0.15 of the shorter side of a frame, "
-        "and at a flux of 0.5 hold 127 photons per pixel",
-    )
+SPEED = f"px per frame ({HOW}) groups of"
+SIDE = "of the shorter side of a frame, and at a flux of"
+NO_SPEED = "no motion was found at any of 12 places"
 
 
-def test_choose_group_size_allows_twice_the_blur_in_the_dark() -> None:
-    size, reason = choice(0.02, 0.3)
-    assert size == 150
-    assert reason.endswith("hold 3 photons per pixel, so few that more blur is allowed")
-    assert choice(0.001, 0.3)[0] == 254
+@pytest.mark.parametrize(
+    ("capture", "size", "reason"),
+    [
+        ((0.5, 0.15), 254, f"at 0.15 {SPEED} 254 frames are blurred by 38.1 px, 0.15 {SIDE} 0.5 hold 127 photons per pixel"),
+        ((0.02, 0.3), 150, "hold 3 photons per pixel, so few that more blur is allowed"),
+        ((0.001, 0.3), 254, "so few that more blur is allowed"),
+        ((0.5, 0.0), 1250, "; of longer groups there would be fewer than 8"),
+        ((0.5, 0.001), 1250, "; of longer groups there would be fewer than 8"),
+        (
+            (0.5, 10.0),
+            16,
+            f"{SPEED} 16 frames are blurred by 160 px, 0.63 {SIDE} 0.5 hold 8 photons per pixel; shorter groups would be "
+            "mostly noise",
+        ),
+        (
+            (2000, 0.5, 10_000, HOW, 1),
+            20,
+            "hold 4e+04 photons per pixel, enough to shorten groups for less blur",
+        ),  # 0.04 of 254
+        ((25, 0.5, 10_000, HOW, 1), 40, ", enough to shorten groups for less blur"),  # 1000 photons
+        ((0.5, 0.05), 762, "photons per pixel"),  # which are too few
+        ((0.01, None, 10_000, NO_SPEED), 500, f"{NO_SPEED}, so 500 frames are assumed"),
+        ((0.01, None, 2000, NO_SPEED), 250, "so 500 frames are assumed; of longer groups there would be fewer than 8"),
+        # At 500 frames per second the image may move by tens of px per frame.
+        ((20, 10.0, 10_000, HOW, 1), 4, "photons per pixel"),
+        (
+            (2000, 100.0, 10_000, HOW, 1),
+            1,
+            f"at 1e+02 {SPEED} 1 frame are blurred by 100 px, 0.39 {SIDE} 2e+03 hold 2e+03 photons per pixel",
+        ),
+    ],
+)
+def test_group_size_weighs_light_against_motion_blur(capture: tuple[Any, ...], size: int, reason: str) -> None:
+    found, why = choice(*capture)
+    assert found == size
+    assert why.endswith(reason), why
 
 
-def test_choose_group_size_keeps_eight_groups_for_slow_motion() -> None:
-    for speed_px in (0.0, 0.001):
-        size, reason = choice(0.5, speed_px)
-        assert size == 1250
-        assert reason.endswith("; of longer groups there would be fewer than 8")
-
-
-def test_choose_group_size_keeps_sixteen_frames_for_fast_motion() -> None:
-    size, reason = choice(0.5, 10.0)
-    assert size == 16
-    assert reason.endswith(
-        "groups of 16 frames are blurred by 160 px, 0.63 of the shorter side of a frame, and at a flux of 0.5 hold 8 "
-        "photons per pixel; shorter groups would be mostly noise"
-    )
-
-
-def test_choose_group_size_allows_single_grey_frames() -> None:
-    """At 500 frames per second the image may move by tens of px per frame."""
-    assert choice(20, 10.0, shortest=1)[0] == 4
-    assert choice(2000, 100.0, shortest=1) == (
-        1,
-        f"at 1e+02 px per frame ({HOW}) groups of 1 frame are blurred by 100 px, 0.39 of the shorter side of a frame, "
-        "and at a flux of 2e+03 hold 2e+03 photons per pixel",
-    )
+def test_auto_resampler_allows_single_grey_frames() -> None:
     resampler = built(StreamInfo(80, 254, 496, None, "intensity", 8), capture=lambda: CaptureSummary(2000, 38.0, HOW))
     assert {len(group.span) for group in resampler.groups(80, 1)} == {1}
-
-
-def test_choose_group_size_reduces_blur_in_bright_light() -> None:
-    size, reason = choice(2000, 0.5, shortest=1)
-    assert size == 20  # 0.04 of 254 px
-    assert reason.endswith("hold 4e+04 photons per pixel, enough to shorten groups for less blur")
-    assert choice(25, 0.5, shortest=1)[0] == 40  # 1000 photons
-    assert choice(0.5, 0.05)[0] == 762  # which are too few
-
-
-def test_choose_group_size_assumes_500_frames_without_speed() -> None:
-    how = "no motion was found at any of 12 places"
-    assert choice(0.01, None, how=how) == (500, f"{how}, so 500 frames are assumed")
-    assert choice(0.01, None, 2000, how) == (
-        250,
-        f"{how}, so 500 frames are assumed; of longer groups there would be fewer than 8",
-    )
 
 
 @given(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import InputError, Piped, SourceContext
-from photonpano_core.packed_raw import PACKED_RAW, PackedRawConfig
+from photonpano_core.sources.packed_raw import PACKED_RAW, PackedRawConfig
 
 
 def written(folder: Path, n_bytes: int) -> Path:

@@ -47,11 +47,6 @@ def test_photon_mle_sums_unwarped_frames_without_trajectory(still: Source) -> No
     assert (exposure.group, exposure.scale, exposure.response) == (GROUP, 1.0, still.response)
 
 
-def test_photon_mle_sums_frames_of_group_only(still: Source) -> None:
-    exposure = merger().merge(still, Group(FrameSpan(10, 30), 15), None, 1.0)
-    np.testing.assert_array_equal(exposure.weight, np.full((40, 48), 20))
-
-
 def test_photon_mle_sharpens_edges_along_known_motion(panning: Source, scene: np.ndarray, pan: Callable) -> None:
     """At frame 29.5 the scene begins at 7 px: frames see whole pixels, so the true start is floor(29.5 / 4)."""
     motion = pan(SPEED_PX)
@@ -64,32 +59,11 @@ def test_photon_mle_sharpens_edges_along_known_motion(panning: Source, scene: np
     assert errors[1] > 2 * errors[0]
 
 
-def test_photon_mle_warps_relative_to_reference_instant(panning: Source, pan: Callable) -> None:
-    """A translation of the reference plane does not change the exposure."""
-    motion = pan(SPEED_PX)
-    there = type(motion)(lambda frame: translation(5000, -300) @ motion.at([frame])[0])
-    np.testing.assert_allclose(
-        merger().merge(panning, GROUP, there, 1.0).flux, merger().merge(panning, GROUP, motion, 1.0).flux, atol=1e-3
-    )
-
-
 def test_photon_mle_uses_reference_at_end_of_group(panning: Source, pan: Callable) -> None:
     exposure = merger().merge(panning, Group(FrameSpan(0, N), 0.0), pan(SPEED_PX), 1.0)
     # Later frames see further right, so that the left border of the first one is seen by it and few others.
     assert exposure.weight[20, 0] < N / 4
     assert exposure.weight[20, 40] == pytest.approx(N)
-
-
-@pytest.mark.parametrize(("scale", "shape"), [(0.5, (20, 24)), (2.0, (80, 96)), (0.3, (12, 14))])
-def test_photon_mle_scale_is_exposure_pixels_per_frame_pixel(
-    panning: Source, pan: Callable, scale: float, shape: tuple[int, int]
-) -> None:
-    exposure = merger().merge(panning, GROUP, pan(SPEED_PX), scale)
-    assert (exposure.flux.shape, exposure.scale) == (shape, scale)
-    assert exposure.flux.dtype == exposure.weight.dtype == np.float32
-    full = merger().merge(panning, GROUP, pan(SPEED_PX), 1.0)
-    means = [np.nanmean(exposure.response.mean_count(image.flux)) for image in (exposure, full)]
-    assert means[0] == pytest.approx(means[1], rel=0.03)
 
 
 def test_photon_mle_sums_chunks_within_tolerance(panning: Source, pan: Callable) -> None:

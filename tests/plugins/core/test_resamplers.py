@@ -1,4 +1,4 @@
-"""Checks that all resamplers share, and the groups of those other than midpoint."""
+"""Groups of the resamplers: those of midpoint are the measure of the others."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photonpano import FrameSpan, Group, InputError, StageContext, StreamInfo
-from photonpano_core.configs import MidpointConfig
 from photonpano_core.hooks import photonpano_resamplers
-from photonpano_core.midpoint import MidpointResampler
 
-NAMES = ("constant-groups", "sliding-window", "stratified")
+NAMES = ("midpoint", "constant-groups", "sliding-window", "stratified")
 CONTRIBUTIONS = {each.name: each for each in photonpano_resamplers()}
 
 
@@ -25,12 +23,16 @@ def groups(name: str, n_frames: int, level: int = 1, group_size: int = 100, seed
     return tuple(built.groups(n_frames, level))
 
 
+def midpoint(n_frames: int, level: int, group_size: int = 100, **config: bool) -> tuple[Group, ...]:
+    return groups("midpoint", n_frames, level, group_size, **config)
+
+
 def starts(found: tuple[Group, ...]) -> list[int]:
     return [group.span.start for group in found]
 
 
-def midpoint(n_frames: int, level: int, group_size: int = 100, **config: bool) -> tuple[Group, ...]:
-    return MidpointResampler(MidpointConfig(group_size=group_size, **config)).groups(n_frames, level)
+def spans(*starts: int, size: int = 100) -> list[FrameSpan]:
+    return [FrameSpan(start, start + size) for start in starts]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -49,7 +51,7 @@ TOO_SHORT = (
 )
 
 
-@pytest.mark.parametrize("name", ["midpoint", *NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_resamplers_refuse_capture_shorter_than_a_group(name: str) -> None:
     with pytest.raises(InputError) as caught:
         groups(name, 99)
@@ -57,6 +59,64 @@ def test_resamplers_refuse_capture_shorter_than_a_group(name: str) -> None:
     contribution = CONTRIBUTIONS[name]
     assert contribution.check(contribution.config(group_size=100), StreamInfo(99, 8, 8, None)) == [TOO_SHORT]
     assert contribution.check(contribution.config(group_size=100), StreamInfo(100, 8, 8, None)) == []
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "level", "found"),
+    [
+        (400, 1, spans(0, 100, 200, 300)),
+        (400, 2, [FrameSpan(0, 50), *spans(0, 50, 100, 150, 200, 250, 300), FrameSpan(350, 400)]),
+        (460, 1, spans(0, 120, 240, 360)),  # spare frames are left out between groups
+        (160, 1, spans(30)),
+        (160, 2, [FrameSpan(0, 50), *spans(30), FrameSpan(110, 160)]),
+    ],
+)
+def test_midpoint_adds_group_between_every_two_and_shorter_ones_at_ends(
+    n_frames: int, level: int, found: list[FrameSpan]
+) -> None:
+    assert midpoint(n_frames, level) == tuple(Group(span, (span.start + span.stop - 1) / 2) for span in found)
+
+
+def test_midpoint_end_groups_get_shorter_down_to_four_frames() -> None:
+    ends = midpoint(400, 3)
+    assert [group.span for group in ends[:2]] == [FrameSpan(0, 25), FrameSpan(0, 50)]
+    assert [group.span for group in ends[-2:]] == [FrameSpan(350, 400), FrameSpan(375, 400)]
+    assert min(len(group.span) for group in midpoint(400, 9)) == 6
+
+
+@pytest.mark.parametrize(("level", "count"), [(1, 10), (2, 19), (3, 37), (4, 73)])
+def test_midpoint_has_as_many_groups_as_the_paper(level: int, count: int) -> None:
+    ends = 2 * (level - 1)
+    assert len(midpoint(1000, level)) == count + ends
+    assert len(midpoint(1000, level, endpoints=False)) == count
+
+
+@given(group_size=st.integers(1, 300), more=st.integers(0, 1500), level=st.integers(1, 4))
+def test_midpoint_covers_any_capture_evenly(group_size: int, more: int, level: int) -> None:
+    n_frames = group_size + more
+    found = midpoint(n_frames, level, group_size)
+    assert all(min(4, group_size) <= len(group.span) <= group_size and group.span.stop <= n_frames for group in found)
+    assert all(group.reference == group.span.centre for group in found)
+    references = [group.reference for group in found]
+    assert all(earlier < later for earlier, later in pairwise(references))
+    if level > 1 and group_size >= 8:
+        assert (found[0].span.start, found[-1].span.stop) == (0, n_frames)
+    centred = midpoint(n_frames, level, group_size, endpoints=False)
+    assert all(len(group.span) == group_size for group in centred)
+    count = n_frames // group_size
+    distance = (n_frames - group_size) / max(1, (count - 1) * 2 ** (level - 1))
+    if distance >= 1:
+        assert len(centred) == (count - 1) * 2 ** (level - 1) + 1
+        assert all(abs(later.reference - earlier.reference - distance) <= 1 for earlier, later in pairwise(centred))
+    if count > 1:
+        assert (centred[0].span.start, centred[-1].span.stop) == (0, n_frames)
+
+
+@given(group_size=st.integers(1, 300), count=st.integers(1, 20), rest=st.integers(0, 299))
+def test_midpoint_level_1_has_as_many_disjoint_groups_as_fit(group_size: int, count: int, rest: int) -> None:
+    found = midpoint(group_size * count + rest % group_size, 1, group_size)
+    assert len(found) == count
+    assert all(earlier.span.stop <= later.span.start for earlier, later in pairwise(found))
 
 
 @pytest.mark.parametrize("level", [1, 2, 5])

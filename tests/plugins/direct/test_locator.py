@@ -14,7 +14,6 @@ from photonpano.geometry import (
     apply,
     corner_displacements,
     corners,
-    from_parameters,
     inverse,
     jacobian,
     rotation_matrices,
@@ -31,31 +30,10 @@ from photonpano_direct.small_matrices import rescaled
 SHAPE = (160, 240)
 STILL = np.eye(3)
 LOCATOR = DirectLocator(DirectConfig())
-ROTATED = from_parameters([np.cos(0.03) - 1, np.sin(0.03), -np.sin(0.03), np.cos(0.03) - 1, 6.0, -3.0, 0, 0])
-PROJECTIVE = from_parameters([0.01, 0.004, -0.006, 0.02, 9.0, 4.0, 2e-5, -3e-5])
 
 
 def register(moving: VirtualExposure, fixed: VirtualExposure, initial: np.ndarray | None = None) -> Located | NotLocated:
     return LOCATOR.register(LOCATOR.describe(moving), LOCATOR.describe(fixed), initial)
-
-
-@pytest.mark.parametrize(
-    ("true", "initial"),
-    [
-        (translation(0.3, -0.2), STILL),
-        (translation(20.25, 7.5), None),
-        (translation(-31.0, 0.0), None),
-        (ROTATED, None),
-        (PROJECTIVE, translation(8, 5)),
-    ],
-    ids=["sub-pixel", "shift", "backwards", "rotation", "projective"],
-)
-def test_direct_finds_known_motions_and_not_their_inverse(
-    seen_from: Callable, true: np.ndarray, initial: np.ndarray | None
-) -> None:
-    located = register(seen_from(true, seed=1), seen_from(STILL, seed=2), initial)
-    assert isinstance(located, Located), located
-    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.15
 
 
 def test_direct_forwards_inverts_direct_backwards(seen_from: Callable) -> None:
@@ -103,17 +81,6 @@ def test_direct_reaches_cramer_rao_bound_within_30_percent(seen_from: Callable, 
     assert np.sqrt(np.mean(errors)) < 1.3 * np.sqrt(np.mean(np.square(bounds)))
 
 
-def test_masked_half_does_not_bias_motion(seen_from: Callable) -> None:
-    true = translation(6.5, 1.5)
-    moving = seen_from(true, seed=1)
-    half = np.zeros(SHAPE, bool)
-    half[:, :150] = True
-    masked = replace(moving, flux=np.where(half, moving.flux, np.nan), weight=np.where(half, moving.weight, 0))
-    located = register(masked, seen_from(STILL, seed=2), STILL)
-    assert isinstance(located, Located), located
-    assert corner_displacements(located.homography, true, SHAPE).mean() < 0.3
-
-
 def test_masked_hot_pixels_are_interpolated(seen_from: Callable) -> None:
     """One pixel in 50, the same in both exposures, as on a sensor."""
     hot = np.random.default_rng(7).random(SHAPE) < 0.02
@@ -126,12 +93,6 @@ def test_masked_hot_pixels_are_interpolated(seen_from: Callable) -> None:
     assert isinstance(located, Located), located
     assert corner_displacements(located.homography, true, SHAPE).mean() < 0.15
     assert located.evidence["overlap"] > 0.8
-
-
-def test_pair_of_different_places_is_rejected_with_reason(seen_from: Callable) -> None:
-    failure = register(seen_from(translation(330, 200), seed=1), seen_from(STILL, seed=2), STILL)
-    assert isinstance(failure, NotLocated)
-    assert any(word in failure.reason for word in ("diverges", "similarity", "converged", "overlap"))
 
 
 def test_pair_without_overlap_is_rejected_with_reason(seen_from: Callable) -> None:

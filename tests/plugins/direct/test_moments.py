@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import apply
-from photonpano_direct.layers import Layer
-from photonpano_direct.moments import Buffers, derivative_moments, differentiate, residuals_and_moments
+from photonpano_direct.moments import Buffers, Layer, derivative_moments, differentiate, residuals_and_moments
 
 SHAPE = (31, 47)
 HOMOGRAPHY = np.array([[1.01, 0.02, 3.3], [-0.01, 0.99, -2.63], [1e-4, -2e-4, 1]])

@@ -16,7 +16,7 @@ import kornia
 import torch
 
 from photonpano_kornia.configs import KorniaLoftrConfig
-from photonpano_kornia.loftr import LoftrLocator
+from photonpano_kornia.matched import LoftrLocator
 from photonpano_kornia.weights import loftr_from
 
 SHAPE = (120, 176)

@@ -8,8 +8,8 @@ import pytest
 
 from photonpano import Located, NotLocated
 from photonpano.geometry import corner_displacements, translation
+from photonpano_opencv.brightness import EccLocator
 from photonpano_opencv.configs import OpencvEccConfig
-from photonpano_opencv.ecc import EccLocator
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

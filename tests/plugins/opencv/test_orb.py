@@ -8,8 +8,7 @@ import numpy as np
 from photonpano import Located
 from photonpano.geometry import corner_displacements, translation
 from photonpano_opencv.configs import OpencvOrbConfig
-from photonpano_opencv.keypoints import Keypoints
-from photonpano_opencv.orb import OrbLocator
+from photonpano_opencv.keypoints import Keypoints, OrbLocator
 
 SHAPE = (160, 240)
 
@@ -42,11 +41,3 @@ def test_information_accounts_for_common_rounding_of_keypoints(seen_from: Callab
     assert isinstance(motion, Located)
     assert 0.1 < corner_displacements(motion.homography, true, SHAPE).mean() < 0.6
     assert np.diag(np.linalg.inv(motion.information)[4:6, 4:6]).min() > 1 / 12
-
-
-def test_describe_keeps_at_most_max_keypoints(seen_from: Callable) -> None:
-    best = described(seen_from(np.eye(3)), max_keypoints=50)
-    assert 30 < len(best.points) <= 50
-    assert len(best.points) == len(best.sizes)
-    assert best.descriptors.shape == (len(best.points), 32)
-    assert best.shape == SHAPE

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from photonpano import Located, NotLocated
 from photonpano.geometry import apply, from_parameters, generators, jacobian, translation
 from photonpano.locating import View
+from photonpano_opencv.brightness import PhaseCorrelationLocator
 from photonpano_opencv.configs import PhaseCorrelationConfig
-from photonpano_opencv.phase import PhaseCorrelationLocator
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

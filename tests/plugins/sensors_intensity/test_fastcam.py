@@ -17,8 +17,8 @@ from photonpano_sensors.intensity.mraw import FastcamMrawSource
 
 REAL = Path(__file__).parents[2] / "data" / "photron"
 BEAM, CIH = (REAL / "beam.cihx").read_bytes(), (REAL / "sample_60k_16bit.cih").read_bytes()
+# What headers are damaged with, beside bytes by chance.
 PIECES = [b"-1", b"1e999", b"\xb2", b"<cih>", b"&x;", b" : "]
-"""What headers are damaged with, beside bytes by chance."""
 
 
 @pytest.mark.parametrize("name", ["beam", "ball_12bit"])

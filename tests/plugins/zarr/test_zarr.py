@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,6 @@ def opened(path: Path, **keys: Any) -> Any:
     return ZARR.build(ZarrConfig(path=path, **keys), SourceContext())
 
 
-def problem(path: Path, **keys: Any) -> str:
-    """Return what `check` says, which opening the array raises, too."""
-    (found,) = ZARR.check(ZarrConfig(path=path, **keys))
-    with pytest.raises(InputError) as caught:
-        opened(path, **keys)
-    assert str(caught.value) == found
-    return found.replace(str(path), path.name)
-
-
 @pytest.fixture
 def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Write an array in chunks of ten frames."""
@@ -45,12 +35,6 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         return path
 
     return written
-
-
-def changed(path: Path, **entries: Any) -> Path:
-    metadata = json.loads((path / "zarr.json").read_text())
-    (path / "zarr.json").write_text(json.dumps(metadata | entries))
-    return path
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -118,16 +102,6 @@ def test_keys_of_a_spec_override_the_attributes(written: Any) -> None:
         assert (source.info.width, source.info.frame_rate_hz) == (20, 5)
 
 
-def test_missing_or_short_chunk_is_named_before_the_run(written: Any) -> None:
-    path = written()
-    (path / "c.3.0.0").write_bytes(b"short")
-    assert problem(path) == "cube.zarr/c.3.0.0 has 5 bytes, and a chunk has 180; copy the array again"
-    (path / "c.3.0.0").unlink()
-    assert problem(path) == (
-        "cube.zarr is incomplete: there is no chunk c.3.0.0; copy it again, or write it with all chunks (write_empty_chunks)"
-    )
-
-
 def test_damaged_chunk_is_named_when_it_is_read(written: Any) -> None:
     path = written(compressed=True)
     chunk = path / "c.3.0.0"
@@ -140,50 +114,6 @@ def test_damaged_chunk_is_named_when_it_is_read(written: Any) -> None:
             InputError, match=r"c\.3\.0\.0 is damaged: it cannot be decompressed to a chunk of \(10, 6, 3\); copy it again"
         ):
             source.counts(FrameSpan(29, 31))
-
-
-def test_wrong_metadata_are_refused_with_the_way_out(written: Any, tmp_path: Path) -> None:
-    path = written()
-    whole = json.loads((path / "zarr.json").read_text())
-    layout = "a capture is uint8 (frames, height, bytes of a row), as from numpy.packbits(cube, axis=-1)"
-    assert problem(changed(path, data_type="float32")) == f"cube.zarr holds float32 values, not bytes of eight pixels; {layout}"
-    assert problem(changed(path, **whole | {"shape": [53, 18]})) == f"cube.zarr has the shape (53, 18); {layout}"
-    assert problem(changed(path, **whole | {"shape": [0, 6, 3]})) == "cube.zarr is empty: its shape is (0, 6, 3)"
-    assert problem(changed(path, **whole), width=30) == (
-        "cube.zarr has rows of 3 bytes, which hold a width of 17 to 24, not 30; correct the width"
-    )
-    own = {"photonpano": {"version": 1, "width": 30}}
-    assert problem(changed(path, **whole | {"attributes": own})).endswith("not 30; write the right width in the spec")
-    newer = {"photonpano": {"version": 2}}
-    assert problem(changed(path, **whole | {"attributes": newer})) == (
-        "cube.zarr was written by a newer photonpano, as version 2; update this one"
-    )
-    damaged = {"photonpano": {"version": 1, "width": "wide"}}
-    assert problem(changed(path, **whole | {"attributes": damaged})).startswith(
-        "cube.zarr/zarr.json is wrong at attributes.photonpano.width: "
-    )
-    shards = [{"name": "sharding_indexed", "configuration": {}}]
-    assert problem(changed(path, **whole | {"codecs": shards})) == (
-        "cube.zarr has chunks that are regular, with the codecs sharding_indexed; captures are read from regular chunks with "
-        "the codecs bytes, zstd, blosc, gzip, crc32c: write it again without others, such as shards"
-    )
-    grid = {"name": "regular", "configuration": {"chunk_shape": [0, 6, 3]}}
-    assert "is wrong at chunk_grid: expected three sizes" in problem(changed(path, **whole | {"chunk_grid": grid}))
-    (path / "zarr.json").write_text("{")
-    assert problem(path).startswith("cube.zarr/zarr.json is wrong at its JSON: Invalid JSON")
-    (path / "zarr.json").unlink()
-    assert problem(path) == "cube.zarr is no zarr array: there is no zarr.json in it; name the folder of an array"
-    (path / ".zarray").write_text("{}")
-    assert problem(path) == (
-        "cube.zarr is zarr version 2, and captures are version 3; convert it with: zarr migrate v3 cube.zarr"
-    )
-    assert problem(tmp_path / "none.zarr") == "there is no folder none.zarr; check the path"
-
-
-def test_group_is_refused_with_the_names_of_its_arrays(written: Any) -> None:
-    path = written()
-    (path.parent / "zarr.json").write_text(json.dumps({"zarr_format": 3, "node_type": "group"}))
-    assert problem(path.parent).endswith("is a zarr group, not an array; name the array in it: cube.zarr")
 
 
 @pytest.fixture

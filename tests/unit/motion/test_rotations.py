@@ -14,10 +14,8 @@ from photonpano.motion.rotations import RotationTrajectory, fit_rotations
 from photonpano.protocols import Interpolator
 from photonpano.values import FloatArray, NotLocated
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.geodesic import GeodesicInterpolator
-from photonpano_core.lie import LieInterpolator
-from photonpano_core.lucas_kanade import LucasKanadeInterpolator
-from photonpano_core.smoothing_spline import SmoothingSplineInterpolator
+from photonpano_core.interpolators.interpolating import GeodesicInterpolator, LieInterpolator, LucasKanadeInterpolator
+from photonpano_core.interpolators.smoothing_spline import SmoothingSplineInterpolator
 
 SHAPE = (254, 496)
 CAMERA = Camera.of(330.0, SHAPE)

@@ -1,0 +1,245 @@
+"""Guess the layout of an array of frames from samples: packed bits, bits or sums, the axis of the frames, the channel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.errors import InputError
+from photonpano.paths import Location, Url
+from photonpano.reading.files import OpenFiles, is_gzip, size_of
+from photonpano.reading.gzipped import local, unpacked_start
+from photonpano.reading.npy import NpyHeader
+from photonpano.reading.pixel_order import MIN_SCORE, other_order, score, units_of
+from photonpano.values import FrameSpan
+
+Capture = TypeVar("Capture")
+
+_VALUES = 3 * 1024**2  # values read, about
+_RUN = 128  # most frames of a run of consecutive frames
+_SHORTEST_RUN = 16  # frames of a run, even if only some of their columns can be read
+_MIN_BITS = 20  # fewest lit pixels by which an array of zeros and ones is recognised
+_MIN_SUMS = 200  # fewest nonzero pixels by which an array without values of 128 and more is recognised
+_BRIGHT = 0.9  # pixels above this quantile are left out: hot pixels must not outweigh the scene
+_COMPARED = 16  # frames whose bytes are compared as numbers
+# sum of the squares of the bits of each byte
+_WEIGHTS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 8) @ 4.0 ** np.arange(7, -1, -1)
+# Neighbouring numbers differ by less than their bits: 127 and 128 by 1. If a byte is eight pixels, the squared difference of
+# two is at least a third of the sum of the squares of their bits, even in a checkerboard.
+_CARRIES = 0.25
+_BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated with their neighbours
+_TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
+
+_MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
+_MIDDLE = 1  # the channel of three that is chosen
+
+
+class Content(NamedTuple):
+    """What the values of an array are.
+
+    Attributes:
+        holds: "bits" for a pixel to a value, of 0 and 1, or of 0 and 255; "sums" for counts.
+        lowest: the smallest value of the sample.
+        highest: the largest value of the sample.
+        n_values: values of the sample.
+    """
+
+    holds: Literal["bits", "sums"]
+    lowest: int
+    highest: int
+    n_values: int
+
+
+def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
+    """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
+
+    Args:
+        path: the file.
+        header: its header; the array has three dimensions or more, in C order.
+
+    Returns:
+        Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
+        list where the file is cut short, or the beginning of a .npy.gz file holds no whole frame.
+    """
+    n_frames, n_rows, n_columns, *_ = header.shape
+    values_of_frame = int(np.prod(header.shape[1:]))
+    if is_gzip(path):
+        start = unpacked_start(local(path), header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
+        whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
+        frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
+        return [frames.reshape(whole, *header.shape[1:])] if whole else []
+    if size_of(path) < header.file_bytes:
+        return []
+    columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))
+    spans = sampled_spans(n_frames, n_rows * columns)
+    if isinstance(path, Url):
+        files = OpenFiles()
+        samples = [np.empty((len(span), *header.shape[1:]), header.dtype) for span in spans]
+        for span, sample in zip(spans, samples, strict=True):
+            files.read(path, header.offset + span.start * sample[0].nbytes, sample.view(np.uint8))
+        return [sample[:, :, :columns] for sample in samples]
+    stored = np.memmap(path, header.dtype, "r", header.offset, header.shape)
+    return [np.array(stored[each.start : each.stop, :, :columns]) for each in spans]
+
+
+def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:
+    """Return spans of up to 128 frames, evenly spaced over a capture, that hold about 3 million values together."""
+    most = max(1, _VALUES // frame_values)
+    length = min(_RUN, n_frames, most)
+    n_spans = max(1, min(most // length, n_frames // length))
+    starts = np.linspace(0, n_frames - length, n_spans).astype(int).tolist()
+    return [FrameSpan(start, start + length) for start in starts]
+
+
+def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
+    """Return what the values of an array are if they are not bytes of eight pixels each.
+
+    Args:
+        samples: runs of consecutive frames, each (n, rows, columns), of integers or bool.
+
+    Returns:
+        None for packed pixels, and where too few pixels are lit.
+    """
+    lowest, highest = (int(edge) for edge in (min(each.min() for each in samples), max(each.max() for each in samples)))
+    n_values = sum(each.size for each in samples)
+    peak = np.max([each.max(axis=0) for each in samples], axis=0)
+    n_lit = int(np.count_nonzero(peak))
+    if samples[0].dtype != np.uint8:
+        return Content("bits" if (lowest, highest) in ((0, 1), (0, 0), (1, 1)) else "sums", lowest, highest, n_values)
+    if highest == 1:
+        return Content("bits", 0, 1, n_values) if n_lit >= _MIN_BITS else None
+    if highest == 255 and not any(((each + np.uint8(1)) > 1).any() for each in samples):
+        n_varied = int(np.count_nonzero((peak > 0) & (np.min([each.min(axis=0) for each in samples], axis=0) == 0)))
+        return Content("bits", 0, 255, n_values) if n_varied >= _MIN_BITS else None
+    if (highest < 128 and n_lit >= _MIN_SUMS) or (highest >= 128 and _are_numbers(samples, peak)):
+        return Content("sums", lowest, highest, n_values)
+    return None
+
+
+def _are_numbers(samples: Sequence[NDArray[np.uint8]], peak: NDArray[np.uint8]) -> bool:
+    """Return whether neighbouring bytes are alike as numbers, and not bit by bit."""
+    usual = peak <= np.quantile(peak, _BRIGHT)
+    pairs = usual[1:] & usual[:-1]
+    excess = np.zeros(pairs.shape)
+    frames = [frame for run in samples for frame in run]
+    for frame in frames[:: -(-len(frames) // _COMPARED)]:
+        difference = np.diff(frame.astype(np.int16), axis=0)
+        flipped = _WEIGHTS[frame[1:] ^ frame[:-1]]
+        excess += _CARRIES * flipped - difference.astype(np.float64) ** 2
+    return score(units_of((excess * pairs)[None])[0]) > MIN_SCORE
+
+
+def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int]) -> bool:
+    """Return whether the last axis of an array is that of the frames, and the first two are those of the image.
+
+    Eight frames later a pixel is more like itself than the pixel eight rows or columns further, unless the image moves by more
+    than a pixel a frame. So the axis along which blocks of values correlate most is that of the frames, if it is the longest.
+
+    Args:
+        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, columns), a pixel to a value.
+        shape: that of the array.
+    """
+    return _last_is_longest(*shape) and _last_is_alike(samples, (_BLOCK, _BLOCK, _BLOCK))
+
+
+def packed_frames_are_last(
+    samples: Sequence[NDArray[np.uint8]], shape: Sequence[int], a_byte_holds: Literal["pixels", "frames"]
+) -> bool:
+    """Return whether the last axis of an array of bytes is that of the frames: see `frames_are_last`.
+
+    Args:
+        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, bytes of a row).
+        shape: that of the array.
+        a_byte_holds: whether a byte would hold eight pixels of a frame, or a pixel of eight frames.
+    """
+    first, second, last = shape
+    if a_byte_holds == "frames":
+        return _last_is_longest(first, second, 8 * last) and _last_is_alike(_lit(samples), (_BLOCK, _BLOCK, 1))
+    if not _last_is_longest(first, 8 * second, last):
+        return False
+    if _last_is_alike(_lit(samples), (_BLOCK, 1, _BLOCK)):
+        return True
+    # The frames may move too fast for that. Then the second axis, where bytes are packed, is still an axis of the image.
+    other = other_order(samples)
+    return other is not None and other.order.packed_along == "height"
+
+
+def _lit(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    return [np.bitwise_count(each) for each in samples]
+
+
+def _last_is_longest(first: int, second: int, last: int) -> bool:
+    return last > _TIMES_LONGER * max(first, second)
+
+
+def _last_is_alike(samples: Sequence[NDArray[Any]], block: tuple[int, int, int]) -> bool:
+    """Return whether neighbouring blocks of values correlate most along the last axis."""
+    first, second, last = np.sum([_moments(_blocks(each, block)) for each in samples], axis=0)
+    correlations = [_correlation(moments) for moments in (first, second, last)]
+    if not all(correlations):
+        return False
+    lead = correlations[2] - max(correlations[:2])
+    return lead > _MIN_LEAD * math.sqrt(2 / float(last[0]))
+
+
+def _blocks(frames: NDArray[Any], block: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Return the means of blocks of values: (n, rows, columns) becomes smaller by the sides of a block."""
+    shape = [length // side for length, side in zip(frames.shape, block, strict=True)]
+    cut = frames[tuple(slice(n * side) for n, side in zip(shape, block, strict=True))]
+    in_blocks = cut.reshape(shape[0], block[0], shape[1], block[1], shape[2], block[2])
+    return np.asarray(in_blocks.mean(axis=(1, 3, 5)))
+
+
+def _moments(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (3, 6) sums over neighbours along the first, second and last axis: 1, x, y, x^2, y^2, x y."""
+    rows = []
+    for axis in range(3):
+        along = np.moveaxis(blocks, axis, 0)
+        x, y = along[:-1], along[1:]
+        rows.append([x.size, *(each.sum() for each in (x, y, x * x, y * y, x * y))])
+    return np.array(rows, np.float64)
+
+
+def _correlation(moments: NDArray[np.float64]) -> float:
+    """Return the correlation of neighbours; 0 if there are none, or no scatter."""
+    if not moments[0]:
+        return 0.0
+    x, y, xx, yy, xy = moments[1:] / moments[0]
+    scatter = float(np.sqrt(max(0.0, (xx - x * x) * (yy - y * y))))
+    return float(xy - x * y) / scatter if scatter > 0 else 0.0
+
+
+class Channel(NamedTuple):
+    """The channel that a recognised capture is read with.
+
+    Attributes:
+        keys: the key `channel` of the source, if the capture has channels.
+        clause: follows the reason why the capture was recognised.
+    """
+
+    keys: dict[str, int]
+    clause: str
+
+
+def with_channel(read: Callable[[int | None], Capture]) -> tuple[Capture, Channel] | None:
+    """Read a capture without channels, or the middle one of three.
+
+    Args:
+        read: reads the capture with a `channel`, and raises an `InputError` if the capture does not have it.
+
+    Returns:
+        What `read` returned, and the channel; None if it raised for both.
+    """
+    for channel in (None, _MIDDLE):
+        try:
+            found = read(channel)
+        except InputError:
+            continue
+        if channel is None:
+            return found, Channel({}, "")
+        return found, Channel({"channel": channel}, ", of whose channels the middle one is used")
+    return None

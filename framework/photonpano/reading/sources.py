@@ -1,0 +1,196 @@
+"""Base classes of sources: of binary frames in packed bytes, whose order is a `FrameLayout`, and of single frames."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.photometry import BinaryResponse, BitOrder, packed_counts, reversed_bits
+from photonpano.protocols import Closing as Closing
+from photonpano.reading.files import OpenFiles
+from photonpano.values import Counts, Frames, FrameSpan, StreamInfo
+
+Pixels = TypeVar("Pixels", bound=np.generic)
+
+
+class Arrangement(Protocol):
+    """Moves blocks of stored images to their places in the image."""
+
+    def __call__(self, images: NDArray[Pixels], /) -> NDArray[Pixels]:
+        """Return (..., height, columns) of (..., rows, columns), where a column is a pixel or a byte of eight pixels.
+
+        The pixels of a byte stay together. The argument must not be changed.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLayout:
+    """The order of the pixels of a binary frame in its bytes.
+
+    Pixels are reordered once in a sum of frames, and not in each frame.
+
+    Attributes:
+        frame_shape: (height, width) of the image.
+        stored_shape: the shape of the bytes of a frame: its packed rows, unless there is a `to_rows`.
+        bit_order: "big" if the first pixel is the highest bit of a byte, "little" if it is the lowest.
+        arranged: turns stored images into images; None if their rows are those of the image.
+        to_rows: turns (n, *stored_shape) into (n, rows, bytes of a row), packed along the width; None if frames are stored so.
+    """
+
+    frame_shape: tuple[int, int]
+    stored_shape: tuple[int, ...]
+    bit_order: BitOrder = "big"
+    arranged: Arrangement | None = None
+    to_rows: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of a frame in the file."""
+        return math.prod(self.stored_shape)
+
+    def rows(self, stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the packed rows (n, rows, bytes of a row) of stored frames (n, *stored_shape)."""
+        return stored if self.to_rows is None else self.to_rows(stored)
+
+    def add_counts(self, rows: NDArray[np.uint8], sums: Counts | None) -> Counts:
+        """Add packed rows to their sums, which `image` turns into sums of the image."""
+        return packed_counts(rows, 8 * rows.shape[-1], sums, self.bit_order)
+
+    def unpacked(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Unpack packed rows to frames (n, H, W)."""
+        return self.image(np.unpackbits(rows, axis=-1, bitorder=self.bit_order))
+
+    def packed(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return frames packed as by numpy, (n, H, ceil(W / 8)), which may share memory with `rows`."""
+        packed = rows if self.bit_order == "big" else reversed_bits(rows)
+        if self.arranged is not None:
+            packed = self.arranged(packed)
+        if beyond := -self.frame_shape[1] % 8:
+            packed = packed.copy()
+            packed[..., -1] &= 0xFF << beyond & 0xFF
+        return packed
+
+    def image(self, pixels: NDArray[Pixels]) -> NDArray[Pixels]:
+        """Return (..., H, W) of pixels (..., rows, 8 times the bytes of a row)."""
+        arranged = pixels if self.arranged is None else self.arranged(pixels)
+        return np.ascontiguousarray(arranged[..., : self.frame_shape[1]])
+
+
+class BinarySource(Closing, ABC):
+    """Binary frames, eight pixels to a byte: a `photonpano.PackedSource`. A subclass reads the bytes.
+
+    Attributes:
+        info: frames, size, rate.
+        response: that of binary frames.
+        valid: (H, W) mask, True everywhere: files do not mark bad pixels.
+        layout: order of the pixels of a frame in its bytes.
+        files: reads pieces of files.
+    """
+
+    def __init__(self, n_frames: int, layout: FrameLayout, frame_rate_hz: float | None = None) -> None:
+        self.info = StreamInfo(n_frames, *layout.frame_shape, frame_rate_hz)
+        self.response = BinaryResponse()
+        self.valid = np.ones(layout.frame_shape, np.bool_)
+        self.valid.flags.writeable = False
+        self.layout = layout
+        self.files = OpenFiles()
+
+    @abstractmethod
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span, a few at a time.
+
+        Returns:
+            The place of these frames in the span, and their packed rows, (n, rows, bytes of a row), which the next step may
+            overwrite.
+
+        Raises:
+            InputError: the frames cannot be read.
+        """
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        sums = None
+        for _, rows in self.pieces(span):
+            sums = self.layout.add_counts(rows, sums)
+        assert sums is not None, "a span is never empty"
+        return self.layout.image(sums)
+
+    def frames(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span: (n, H, W) of zeros and ones."""
+        self.info.require(span)
+        frames = np.empty((len(span), *self.info.frame_shape), np.uint8)
+        for place, rows in self.pieces(span):
+            frames[place] = self.layout.unpacked(rows)
+        return frames
+
+    def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
+        """Return the frames of a span, eight pixels to a byte: see `photonpano.PackedSource`."""
+        self.info.require(span)
+        frames = np.empty((len(span), self.info.height, -(-self.info.width // 8)), np.uint8)
+        for place, rows in self.pieces(span):
+            frames[place] = self.layout.packed(rows)
+        return frames
+
+    def close(self) -> None:
+        """Close the files."""
+        self.files.close()
+
+
+class BlockSource(Closing, ABC):
+    """Sums and spans of frames of values. A subclass yields frames, and has what is missing for a `photonpano.Source`.
+
+    Attributes:
+        info: frames, size, rate; the subclass sets it.
+    """
+
+    info: StreamInfo
+
+    @abstractmethod
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield some frames of a span at a time, (n, H, W), whose values fit into the bits of `info`, and their place in it.
+
+        Raises:
+            InputError: the frames cannot be read.
+        """
+
+    def counts(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        counts = np.zeros(self.info.frame_shape, np.uint32)
+        for _, values in self.blocks(span):
+            counts += values.sum(axis=0, dtype=np.uint32)
+        return counts
+
+    def frames(self, span: FrameSpan) -> Frames:
+        """Return the frames of a span: (n, H, W) uint8, or uint16 of more than eight bits."""
+        self.info.require(span)
+        shape = len(span), *self.info.frame_shape
+        frames: Frames = np.empty(shape, np.uint8) if self.info.bit_depth <= 8 else np.empty(shape, np.uint16)
+        for place, values in self.blocks(span):
+            frames[place] = values
+        return frames
+
+
+class SingleFrameSource(BlockSource):
+    """Frames that are made or read one by one. A subclass gives a frame."""
+
+    @abstractmethod
+    def frame(self, index: int) -> NDArray[np.bool_] | Frames:
+        """Return a frame of the capture, (H, W), whose values fit into the bits of `info`.
+
+        Raises:
+            InputError: the frame cannot be read.
+        """
+
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the frames of a span one by one."""
+        for place, index in enumerate(range(span.start, span.stop)):
+            yield slice(place, place + 1), self.frame(index)[None]

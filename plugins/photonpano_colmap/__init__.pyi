@@ -1,0 +1,3 @@
+from .averages import AveragesEstimator as AveragesEstimator
+from .stratified import StratifiedEstimator as StratifiedEstimator
+from .two_view import TwoViewLocator as TwoViewLocator

@@ -1,0 +1,93 @@
+"""Exporters: OpenEXR, with flux, weight, standard deviation and saturated pixels as channels of 32 bits, and Radiance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from photonpano import FinishedPanorama
+    from photonpano_core.configs import ExrConfig
+
+_BLOCK_ROWS = 256
+_COMPRESSIONS = {"none": "NO_COMPRESSION", "zip": "ZIP_COMPRESSION", "zips": "ZIPS_COMPRESSION"}
+
+
+class ExrExporter:
+    """Writes channels `Y`, or `R`, `G` and `B`, with the flux, and layers `weight`, `std` and `saturated`.
+
+    Unseen pixels are 0, and transparent: `A` is 1 where a pixel was seen, so that viewers need not know NaN.
+    """
+
+    def __init__(self, config: ExrConfig) -> None:
+        import OpenEXR
+
+        self._library = OpenEXR
+        self._compression = getattr(OpenEXR, _COMPRESSIONS[config.compression])
+
+    def export(self, panorama: FinishedPanorama, path: Path) -> None:
+        """Write the file: see `Exporter`. The channels are held in memory."""
+        names = list("RGB") if panorama.in_colour else ["Y"]
+        layers = {name: np.zeros((len(names), *panorama.shape), np.float32) for name in ("flux", "weight", "std", "saturated")}
+        seen = np.zeros(panorama.shape, np.float32)
+        for start in range(0, panorama.shape[0], _BLOCK_ROWS):
+            stop = min(start + _BLOCK_ROWS, panorama.shape[0])
+            rows = panorama.rows(start, stop)
+            for name, layer in layers.items():
+                image = np.nan_to_num(getattr(rows, name).astype(np.float32))
+                layer[:, start:stop] = image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
+            known = np.isfinite(rows.flux)
+            seen[start:stop] = known if known.ndim == 2 else known.all(axis=-1)
+        channels: dict[str, NDArray[np.float32]] = {"A": seen}
+        for layer_name, layer in layers.items():
+            for name, image in zip(names, layer, strict=True):
+                channels[_channel(layer_name, name)] = image
+        header = {
+            "compression": self._compression,
+            "type": self._library.scanlineimage,
+            "comments": "flux in photons per pixel per frame; weight in frames; std: standard deviation of the flux",
+        }
+        with self._library.File(header, channels) as file:
+            file.write(str(path))
+
+
+def _channel(layer: str, name: str) -> str:
+    """Return the name of a channel: `Y` is the flux of a grey panorama, `std` its standard deviation, `std.R` that of red."""
+    if layer == "flux":
+        return name
+    return layer if name == "Y" else f"{layer}.{name}"
+
+
+class RadianceExporter:
+    """Writes flux as .hdr, with an error of 0.4 % of the brightest colour of a pixel at most; unseen pixels are black."""
+
+    def export(self, panorama: FinishedPanorama, path: Path) -> None:
+        """Write the file: see `Exporter`."""
+        height, width = panorama.shape
+        with path.open("wb") as file:
+            file.write(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode())
+            for start in range(0, height, _BLOCK_ROWS):
+                file.write(encoded(panorama.rows(start, min(start + _BLOCK_ROWS, height)).flux).tobytes())
+
+
+def encoded(flux: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return red, green, blue and exponent of each pixel (Ward 1991): (h, w, 4).
+
+    Args:
+        flux: (h, w), or (h, w, 3) of red, green and blue; negative and unknown flux becomes 0.
+    """
+    colours = np.maximum(np.nan_to_num(flux), 0)
+    colours = np.repeat(colours[..., None], 3, axis=-1) if colours.ndim == 2 else colours
+    brightest = colours.max(axis=-1)
+    # Rounding must not lift a mantissa to 256.
+    mantissa, exponent = np.frexp(brightest)
+    exponent = np.where(mantissa > 255.5 / 256, exponent + 1, exponent)
+    pixels = np.zeros((*brightest.shape, 4), np.uint8)
+    lit = (brightest > 0) & (exponent > -128)
+    pixels[lit, :3] = np.rint(np.ldexp(colours[lit], (8 - exponent[lit])[:, None])).astype(np.uint8)
+    pixels[lit, 3] = np.clip(exponent[lit] + 128, 1, 255)
+    return pixels

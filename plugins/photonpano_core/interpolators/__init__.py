@@ -1,0 +1,1 @@
+"""Interpolators, and the trajectories that they fit."""

@@ -1,0 +1,1 @@
+"""Refiners: a trajectory made finer after the loop."""

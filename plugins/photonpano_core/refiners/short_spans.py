@@ -1,0 +1,149 @@
+"""Refine the motion by the shifts of short spans of frames, where they exceed photon noise: tremor inside a group."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
+from photonpano.filtering import SIGNIFICANT, SLOW, SYSTEMATIC_PX, WINDOW, Filtered, exceeding_noise
+from photonpano.geometry import BLOCK_FRAMES, apply, corners, inverse, normalised, step_motions
+from photonpano_core.configs import ShortSpansConfig
+from photonpano_core.refiners.uneven_noise import separated
+
+_FEWEST_SPANS = 16  # fewest spans that have a spectrum
+# The light goes out, as between two flickers, if 5 % of the steps have 10 times the usual variance.
+_DARK, _DARK_SHARE = 10.0, 0.05
+_SMOOTH_SPANS = 16.0  # standard deviation of the Gaussian that smooths a trajectory, in spans
+_NAMED_LINES = 3  # most frequencies named in a summary
+_NAMED_SHARE = 0.003  # a frequency is named if its peak has at least this fraction of the power
+
+
+class ShortSpansRefiner:
+    """Corrects shift, roll and zoom of the frames by a Wiener filter of the steps of short spans.
+
+    The spectrum of the steps is estimated in windows that overlap by half. The noise of the steps is known from the photons,
+    so the spectrum of the motion is what exceeds it. Each frequency of each window is multiplied by signal / (signal + noise)
+    if it is significant, by 0 if not (Wiener 1949).
+    """
+
+    def __init__(self, config: ShortSpansConfig, frame_shape: tuple[int, int], frame_rate_hz: float | None) -> None:
+        """Take the (height, width) of a frame, and the frames per second, None if unknown."""
+        self._config = config
+        self._shape = frame_shape
+        self._rate = frame_rate_hz
+        self._radius_px = float(np.linalg.norm(corners(frame_shape)[0] - corners(frame_shape).mean(axis=0)))
+
+    def refine(
+        self, source: Source, trajectory: Trajectory, std_px: FloatArray, residuals: SpanResiduals, view: PanoramaView
+    ) -> Refined | None:
+        """Correct the motion: see `Refiner`."""
+        del source, view
+        if len(residuals.spans) < _FEWEST_SPANS:
+            return None
+        to_px = np.array([1, 1, self._radius_px, self._radius_px])
+        variances = _variances(residuals.information) * to_px**2
+        steps = residuals.steps * to_px
+        instants = np.array([span.centre for span in residuals.spans])
+        if _goes_dark(variances):
+            wiggles = _wiggles(trajectory, instants, self._shape) * to_px
+            modes = [_through_the_dark(*columns) for columns in zip(steps.T, wiggles.T, variances.T, strict=True)]
+        else:
+            modes = [exceeding_noise(*columns) for columns in zip(steps.T, variances.T, strict=True)]
+        shift_px = float(np.sqrt(sum(np.mean(mode.signal**2) for mode in modes)))
+        if shift_px < self._config.smallest_px:
+            return None
+        corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1) / to_px)
+        shifts = np.stack([mode.signal for mode in modes[:2]], axis=1)
+        noise = np.interp(np.arange(len(std_px)), instants, np.sqrt(sum(mode.std**2 for mode in modes)))
+        return Refined(
+            self._corrected(trajectory, len(std_px), corrections, instants),
+            np.hypot(std_px, noise),
+            f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(shifts, instants)}",
+        )
+
+    def _corrected(self, trajectory: Trajectory, n_frames: int, corrections: CubicSpline, instants: FloatArray) -> FloatArray:
+        """Return the homographies of all frames, moved by a spline of (shift x, shift y, roll, zoom), (T, 3, 3).
+
+        Frames before the first instant, and after the last one, are moved as at these.
+        """
+        refined, from_reference = np.empty((n_frames, 3, 3)), np.empty(n_frames)
+        for start in range(0, n_frames, BLOCK_FRAMES):
+            frames = np.arange(start, min(start + BLOCK_FRAMES, n_frames))
+            motions = trajectory.at(frames)
+            from_reference[frames] = np.abs(motions - np.eye(3)).max(axis=(1, 2))
+            refined[frames] = motions @ step_motions(corrections(np.clip(frames, instants[0], instants[-1])), self._shape)
+        to_reference = inverse(refined[from_reference.argmin()])
+        for start in range(0, n_frames, BLOCK_FRAMES):
+            block = slice(start, start + BLOCK_FRAMES)
+            refined[block] = normalised(to_reference @ refined[block])
+        return refined
+
+    def _frequencies(self, shifts: FloatArray, instants: FloatArray) -> str:
+        """Return the strongest frequencies of (S, 2) shifts, as the end of a sentence."""
+        spectrum = np.fft.rfft(shifts * np.hanning(len(shifts))[:, None], axis=0)
+        power = (np.abs(spectrum) ** 2).sum(axis=1)
+        found: list[int] = []
+        total = power.sum()
+        while len(found) < _NAMED_LINES and power.max() > _NAMED_SHARE * total:
+            peak = int(power.argmax())
+            found.append(peak)
+            power[max(0, int(peak * 0.8) - 2) : int(peak * 1.25) + 3] = 0
+        cycles = np.array(sorted(peak for peak in found if peak > 1)) / (len(shifts) * float(np.median(np.diff(instants))))
+        if not len(cycles):
+            return ""
+        if self._rate is None:
+            return f", mostly with periods of {' and '.join(f'{1 / each:.0f}' for each in cycles)} frames"
+        return f", mostly at {' and '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
+
+
+def _variances(information: FloatArray) -> FloatArray:
+    """Return the variances of (S, 4) steps; infinite where the photons do not determine one."""
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 0))
+    known = scale > 0
+    unit = information / np.where(known, scale, 1)[:, :, None] / np.where(known, scale, 1)[:, None, :]
+    inverted = np.linalg.pinv(unit, hermitian=True)
+    variances = np.diagonal(inverted, axis1=1, axis2=2) / np.where(known, scale, 1) ** 2
+    return np.where(known & (variances > 0), variances, np.inf)
+
+
+def _goes_dark(variances: FloatArray) -> bool:
+    """Return whether many steps are far less certain than the others, as between two flickers: variances are (S, 4)."""
+    noise = variances[:, 0]
+    return bool(np.mean(noise > _DARK * np.median(noise)) > _DARK_SHARE)
+
+
+def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:
+    """Filter one mode where the light goes out.
+
+    What the motion does in the dark follows from what it does before and after, and not from the steps, which vanish there once
+    the trajectory is right: so the wiggles of the trajectory are part of what is filtered.
+
+    Args:
+        steps: (S,) in px.
+        wiggles: (S,) what the trajectory does faster than a smooth one.
+        variances: (S,) of the photon noise of the steps.
+    """
+    size = min(WINDOW, len(steps))
+    noise = variances + SYSTEMATIC_PX**2
+    found = separated(wiggles + steps, noise, size, SIGNIFICANT, SLOW)
+    return Filtered(found.signal - wiggles, found.std)
+
+
+def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return by which steps a trajectory differs from a smooth one: (S, 4), shift in px, roll in radians, and zoom."""
+    homographies = trajectory.at(instants)
+    middle = corners(frame_shape).mean(axis=0)
+    points = apply(homographies, middle + np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0]]))
+    place, along = points[:, 0], points[:, 2] - points[:, 1]
+    angle, size = np.unwrap(np.arctan2(along[:, 1], along[:, 0])), np.hypot(*along.T)
+    parameters = np.column_stack([place, angle, np.log(size)])
+    # Beyond its ends, the trajectory goes on as a mirror image through them.
+    beyond = min(int(4 * _SMOOTH_SPANS), len(instants) - 1)
+    longer = np.pad(parameters, ((beyond, beyond), (0, 0)), mode="reflect", reflect_type="odd")
+    wiggles = parameters - gaussian_filter1d(longer, _SMOOTH_SPANS, axis=0, mode="nearest")[beyond : beyond + len(instants)]
+    cosine, sine = np.cos(angle) / size, np.sin(angle) / size
+    x, y = wiggles[:, 0].copy(), wiggles[:, 1].copy()
+    wiggles[:, 0], wiggles[:, 1] = cosine * x + sine * y, cosine * y - sine * x
+    return wiggles

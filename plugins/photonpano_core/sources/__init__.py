@@ -1,0 +1,1 @@
+"""Sources of frames in .npy files, and in files without any description."""

@@ -1,0 +1,1 @@
+from .locator import DirectLocator as DirectLocator
