@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from photonpano.registry.kinds import KINDS
+from photonpano.contributions import KINDS
 from photonpano.registry.schema_text import (
     alternatives,
     bounds_words,

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 import pluggy
 
 from photonpano import hookspecs
-from photonpano.contributions import API_VERSION, Contribution
+from photonpano.contributions import API_VERSION, KINDS, Contribution, Kind
 from photonpano.errors import PluginError, described
 from photonpano.hookspecs import observation
 from photonpano.interrupts import is_interrupt
-from photonpano.registry.kinds import KINDS, Kind
 from photonpano.text import listed
 
 if TYPE_CHECKING:
