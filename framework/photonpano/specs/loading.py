@@ -45,7 +45,16 @@ def load_spec(
     """
     path, catalog = Path(path), discover() if catalog is None else catalog
     try:
-        return _load(read_spec(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog, arriving)
+        return parse_spec(
+            read_spec(path),
+            directory=path.parent,
+            name=path.stem,
+            overrides=overrides,
+            output=output,
+            catalog=catalog,
+            file=path,
+            arriving=arriving,
+        )
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
             raise
@@ -81,8 +90,19 @@ def parse_spec(
     Raises:
         SpecError: the spec is wrong; carries all problems.
     """
+    problems: list[Problem] = []
+    place = Place(file=file)
+    root = read_yaml(spec, place, problems) if isinstance(spec, str) else from_python(spec, place, problems)
+    if root.data is None:
+        raise SpecError(problems or [root.place.problem("the spec is empty; it needs at least `version` and `source`")])
+    own = _capture(root)
+    for override in overrides:
+        root = _overridden(root, override, problems)
+    other = _capture(root)
+    named = name if other in (own, None) or refusal(Path(str(other))) else f"{name}-{other}"
+    root = _with_output(root, None if output is None else Path(output).absolute(), Path("runs", named))
     catalog = discover() if catalog is None else catalog
-    return _load(spec, Place(file=file), Path(directory).absolute(), name, overrides, output, catalog, arriving)
+    return resolve(Spec(root, catalog, Path(directory).absolute(), arriving, problems))
 
 
 def capture_plan(
@@ -123,46 +143,21 @@ def read_spec(path: Path) -> str:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_LENGTH + 1)
+        if len(data) <= MAX_LENGTH:
+            return data.decode("utf-8-sig")
+        problem = Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)  # a capture that is given by mistake is
     except FileNotFoundError:
         problem = Problem("", "there is no such file", path)
     except IsADirectoryError:
         problem = Problem("", "this is a folder, expected a spec in YAML", path)
     except OSError as error:
         problem = Problem("", f"cannot be read: {error.strerror}", path)
-    else:
-        if len(data) > MAX_LENGTH:  # a capture that is given by mistake is
-            raise SpecError([Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)])
-        try:
-            return data.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            start = data.rfind(b"\n", 0, error.start) + 1
-            line = data.count(b"\n", 0, error.start) + 1
-            message = f"not UTF-8 text, got the byte {data[error.start]:#04x}; save the file as UTF-8"
-            problem = Problem("", message, path, line, error.start - start + 1)
+    except UnicodeDecodeError as error:
+        start = data.rfind(b"\n", 0, error.start) + 1
+        line = data.count(b"\n", 0, error.start) + 1
+        message = f"not UTF-8 text, got the byte {data[error.start]:#04x}; save the file as UTF-8"
+        problem = Problem("", message, path, line, error.start - start + 1)
     raise SpecError([problem])
-
-
-def _load(
-    spec: Mapping[str, Any] | str,
-    place: Place,
-    directory: Path,
-    name: str,
-    overrides: Sequence[str],
-    output: str | Path | None,
-    catalog: Catalog,
-    arriving: bool,
-) -> Plan:
-    problems: list[Problem] = []
-    root = read_yaml(spec, place, problems) if isinstance(spec, str) else from_python(spec, place, problems)
-    if root.data is None:
-        raise SpecError(problems or [root.place.problem("the spec is empty; it needs at least `version` and `source`")])
-    own = _capture(root)
-    for override in overrides:
-        root = _overridden(root, override, problems)
-    other = _capture(root)
-    named = name if other in (own, None) or refusal(Path(str(other))) else f"{name}-{other}"
-    root = _with_output(root, None if output is None else Path(output).absolute(), Path("runs", named))
-    return resolve(Spec(root, catalog, directory, arriving, problems))
 
 
 def _capture(root: Written) -> str | None:

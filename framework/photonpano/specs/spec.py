@@ -88,8 +88,9 @@ class Spec:
         """Yield the sections where a key may stand, for the components that the spec chooses."""
         for kind in KINDS.values():
             section = self.root.at(*kind.section.split("."))
-            for item in [section] if section.data is None else section.items():
-                name = item.data if isinstance(item.data, str) else item.at("use").data or kind.default
+            is_list = kind.several and section.data is not None
+            for item in section.items() if is_list else [section]:
+                name = item.spelled_out().at("use").data or (None if is_list else kind.default)
                 if key in self.catalog.keys_of(kind.name, name):
                     yield f"{item.place.where}.with"
         yield from (name for name, model in SETTINGS.items() if key in model.model_fields)

@@ -169,9 +169,13 @@ def _from_python(data: object, place: Place, problems: list[Problem]) -> Written
         case list() | tuple():
             return Written([_from_python(item, _inside(place, index), problems) for index, item in enumerate(data)], place)
         case Mapping():
-            problems += [place.problem(f"a key is text, got {key!r}") for key in data if not isinstance(key, str)]
-            own = {key: item for key, item in data.items() if isinstance(key, str)}
-            return Written({key: _from_python(item, _inside(place, key), problems) for key, item in own.items()}, place)
+            content = {}
+            for key, item in data.items():
+                if isinstance(key, str):
+                    content[key] = _from_python(item, _inside(place, key), problems)
+                else:
+                    problems.append(place.problem(f"a key is text, got {key!r}"))
+            return Written(content, place)
         case _:
             message = f"expected plain data (text, numbers, lists, mappings), got a {type(data).__name__}"
     problems.append(place.problem(message))

@@ -63,7 +63,7 @@ def test_auto_resolved_document_records_no_decision_again(folder, catalog):
 def test_written_keys_override_recognised_keys(folder, catalog):
     plan = parsed(folder, catalog.including(HALVES), path="recording", rows=16)
     assert plan.source.config.model_dump(exclude={"frames"}) == {"path": folder / "recording", "order": "right", "rows": 16}
-    assert set(plan.places) >= {"source.with.path", "source.with.order", "source.with.rows"}
+    assert all(plan.place(f"source.with.{key}").is_written for key in ("path", "order", "rows"))
 
 
 def fussy(name, *suffixes):
