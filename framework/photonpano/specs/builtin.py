@@ -198,7 +198,7 @@ def first_with_fallbacks(section: Written, spec: Spec) -> Written | None:
     if section.at("fallback").data:
         spec.wrong_key(section.at("fallback"), "a chain cannot have a fallback; add the locator to its backends")
     validate(ChainConfig, keys, spec)
-    backends: list[Written] | None = keys.at("backends").data
+    backends: Any = keys.at("backends").data
     if backends is None:
         backends = [Written(name, use.place) for name in ChainConfig.model_fields["backends"].default]
     if not isinstance(backends, list) or not backends or not all(isinstance(item.data, str | dict) for item in backends):

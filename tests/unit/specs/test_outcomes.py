@@ -11,7 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
+from ruamel.yaml import YAML, YAMLError
 
 from photonpano import (
     Config,
@@ -25,7 +27,7 @@ from photonpano import (
 )
 from photonpano.registry import Catalog
 from photonpano.registry.description import flow
-from photonpano.specs import Plan, check_stream, parse_spec
+from photonpano.specs import Plan, check_stream, json_schema, parse_spec
 
 CASES = Path(__file__).with_name("outcomes.txt")
 SHORT = StreamInfo(n_frames=100, height=8, width=16, frame_rate_hz=None)
@@ -90,21 +92,32 @@ def leaves(data: Any, where: str = "") -> Iterator[tuple[str, str]]:
         yield from leaves(value, f"{where}.{key}" if where else str(key))
 
 
-def outcome(written: list[str], catalog: Catalog) -> list[str]:
+def outcome(written: list[str], catalog: Catalog, validator: jsonschema.Draft202012Validator) -> list[str]:
+    """Return the lines of an outcome; an editor marks a spec, unless a line says so, exactly if it has problems."""
     overrides = [line.removeprefix("--set ") for line in written if line.startswith("--set ")]
     sections = "".join(f"{line}\n" for line in written if not line.startswith("--"))
     text = MINIMAL + ("" if "source:" in sections else SOURCE) + sections
     try:
-        plan = parse_spec(text, overrides=overrides, output="/out", catalog=catalog)
+        plan = parse_spec(text, overrides=overrides, directory="/out", catalog=catalog)
     except SpecError as error:
-        return str(error).splitlines()
+        overlooked = not overrides and is_valid(text, validator)
+        return str(error).splitlines() + ["editors see nothing wrong"] * overlooked
+    refused = ["editors refuse it"] * (not overrides and not is_valid(text, validator))
     require_same_again(plan, catalog)
     if "--stream" in written:
         return [str(each) for each in check_stream(plan, SHORT)] or ["it suits"]
-    defaults = dict(leaves(parse_spec(MINIMAL + SOURCE, output="/out", catalog=catalog).document))
+    defaults = dict(leaves(parse_spec(MINIMAL + SOURCE, directory="/out", catalog=catalog).document))
     found = dict(leaves(plan.document))
     changed = [f"{path}: {value}{place(plan, path)}" for path, value in found.items() if defaults.get(path) != value]
-    return changed + [f"{path}: not there" for path in defaults if path not in found] or ["the defaults"]
+    changed += [f"{path}: not there" for path in defaults if path not in found]
+    return (changed or ["the defaults"]) + refused
+
+
+def is_valid(text: str, validator: jsonschema.Draft202012Validator) -> bool:
+    try:
+        return validator.is_valid(YAML(typ="safe", pure=True).load(text))
+    except (YAMLError, TypeError, ValueError):
+        return False
 
 
 def place(plan: Plan, path: str) -> str:
@@ -116,31 +129,33 @@ def require_same_again(plan: Plan, catalog: Catalog) -> None:
     """A document is a spec, and resolves to itself."""
     again = parse_spec(json.loads(json.dumps(plan.document)), catalog=catalog)
     assert again.document == plan.document
-    assert (again.levels, again.refine, again.renderer, again.formats) == (
-        plan.levels,
-        plan.refine,
-        plan.renderer,
-        plan.formats,
-    )
-    jsonschema.validate(plan.document, json_schema(catalog))
+    assert (again.levels, again.refine) == (plan.levels, plan.refine)
+    assert (again.renderer, again.formats) == (plan.renderer, plan.formats)
+
+
+def told(catalog: Catalog) -> dict[str, list[str]]:
+    """Return the outcome of each case."""
+    more = with_more(catalog)
+    validator = jsonschema.Draft202012Validator(json_schema(more))
+    return {
+        title: [line.replace(__name__, "HERE") for line in outcome(written, more, validator)]
+        for title, (written, _) in cases().items()
+    }
 
 
 @pytest.fixture(scope="module")
-def more(catalog: Catalog) -> Catalog:
-    return with_more(catalog)
+def all_told(catalog: Catalog) -> dict[str, list[str]]:
+    return told(catalog)
 
 
 @pytest.mark.parametrize("title", cases())
-def test_spec_has_the_outcome(title: str, more: Catalog) -> None:
-    written, told = cases()[title]
-    assert [line.replace(__name__, "HERE") for line in outcome(written, more)] == told
+def test_spec_has_the_outcome(title: str, all_told: dict[str, list[str]]) -> None:
+    assert all_told[title] == cases()[title][1]
 
 
 if __name__ == "__main__":
     from conftest import toys
 
-    blocks = [
-        "\n".join([title, *written, *(f"-> {line}".replace(__name__, "HERE") for line in outcome(written, with_more(toys())))])
-        for title, (written, _) in cases().items()
-    ]
+    outcomes = told(toys())
+    blocks = ["\n".join([title, *cases()[title][0], *(f"-> {line}" for line in outcomes[title])]) for title in outcomes]
     CASES.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
