@@ -203,7 +203,8 @@ def first_with_fallbacks(section: Written, spec: Spec) -> Written | None:
         backends = [Written(name, use.place) for name in ChainConfig.model_fields["backends"].default]
     if not isinstance(backends, list) or not backends or not all(isinstance(item.data, str | dict) for item in backends):
         return None
-    first, *others = [each.spelled_out() for each in backends[:_MOST_BACKENDS]]
+    items: list[Written] = [each.spelled_out() for each in backends[:_MOST_BACKENDS]]
+    first, *others = items
     if "fallback" in first.data:
         message = "a locator of a chain cannot have a fallback; list all of them, in the order in which they are tried"
         spec.wrong_key(first.at("fallback"), message)

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"
 MAX_LISTED = 16  # components in a list, such as fallbacks
-CHOICE = ("use", "with")
-"""The keys that choose a component."""
+CHOICE = ("use", "with")  # the keys that choose a component
 _AGAIN = "would lose the same pairs again"
 
 

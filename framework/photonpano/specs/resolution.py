@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from photonpano.errors import Problem
     from photonpano.specs.spec import Spec
 
+# The keys of the framework's own sections that choose components.
 NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}
-"""The keys of the framework's own sections that choose components."""
 
 
 def resolve(spec: Spec) -> Plan:

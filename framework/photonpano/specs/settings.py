@@ -179,10 +179,10 @@ class RunSettings(Config):
 VERSION = 1
 LEVELS = 3
 MAX_LEVELS = 8
+# Instead of a number of levels: as many as the motion needs to converge, `MAX_LEVELS` at most.
 UNTIL_CONVERGED = "until-converged"
-"""Instead of a number of levels: as many as the motion needs to converge, `MAX_LEVELS` at most."""
+# The sections that choose the components of a level, in the order of the loop.
 STAGES = tuple(kind.section for kind in KINDS.values() if kind.of_level)
-"""The sections that choose the components of a level, in the order of the loop."""
 SETTINGS: dict[str, type[BaseModel]] = {
     "motion": MotionSettings,
     "camera": CameraSettings,
@@ -193,7 +193,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "run": RunSettings,
 }
 """The framework's own sections."""
+# All sections of a spec, in the order in which they are written.
 SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", "pose", *SETTINGS)
-"""All sections of a spec, in the order in which they are written."""
+# The sections that do not apply with `pose`.
 PANORAMA_ONLY = (*STAGES, "refine", "levels", "motion", "light", "graph", "render")
-"""The sections that do not apply with `pose`."""
