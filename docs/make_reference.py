@@ -36,7 +36,7 @@ COMPUTED = {"directory": "`runs/` and the name of the spec"}
 
 def main() -> None:
     """Write every page of the reference that is out of date."""
-    for page in sorted(REFERENCE.glob("*.md")):
+    for page in sorted(REFERENCE.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
         if (fresh := updated(text)) != text:
             page.write_text(fresh, encoding="utf-8")
@@ -86,7 +86,7 @@ def config_table(config: type[BaseModel]) -> str:
 def components() -> str:
     """Return a table of the components of this distribution."""
     rows = [
-        [f"`{KINDS[entry.kind].section}`", f"[`{entry.name}`](#{entry.name})", entry.contribution.summary]
+        [f"`{KINDS[entry.kind].section}`", f"[`{entry.name}`](spec/{entry.kind}s.md#{entry.name})", entry.contribution.summary]
         for entry in discover().rows
         if entry.origin.plugin == "photonpano"
     ]
@@ -97,7 +97,7 @@ def corrections() -> str:
     """Return a table of all corrections."""
     rows = []
     for name, model in CORRECTIONS.items():
-        shown = f"[`{name}`](#{name})" if model.model_fields else f"`{name}`"
+        shown = f"[`{name}`](spec/corrections.md#{name})" if model.model_fields else f"`{name}`"
         rows.append([shown, first_sentence(model)])
     return table(["Correction", "What it does"], rows)
 

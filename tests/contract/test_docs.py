@@ -323,14 +323,19 @@ def make_reference() -> Any:
     return module
 
 
-@pytest.mark.parametrize("page", sorted(REFERENCE.glob("*.md")), ids=ident)
+@pytest.mark.parametrize("page", sorted(REFERENCE.rglob("*.md")), ids=ident)
 def test_generated_tables_are_up_to_date(page, make_reference):
     text = page.read_text(encoding="utf-8")
     assert make_reference.updated(text) == text, "run: python docs/make_reference.py"
 
 
+def spec_reference() -> str:
+    pages = (REFERENCE / "spec.md", *(REFERENCE / "spec").glob("*.md"))
+    return "".join(page.read_text(encoding="utf-8") for page in pages)
+
+
 def test_spec_reference_has_table_for_every_component():
-    page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
+    page = spec_reference()
     wanted = [f"settings {name}" for name in ("levels", "graph", "render", "output", "run")]
     own = [entry for entry in discover().rows if entry.origin.plugin == "photonpano"]
     wanted += [f"{entry.kind} {entry.name}" for entry in own if entry.contribution.config.model_fields]
@@ -339,7 +344,7 @@ def test_spec_reference_has_table_for_every_component():
 
 
 def test_spec_reference_has_table_for_every_correction():
-    page = (REFERENCE / "spec.md").read_text(encoding="utf-8")
+    page = spec_reference()
     wanted = ["corrections", *(f"correction {name}" for name, model in CORRECTIONS.items() if model.model_fields)]
     assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
 

@@ -156,7 +156,7 @@ class _Writer:
 
     def _origin(self, path: str) -> str:
         """Return "default" or "--set" for a value that does not stand in the file."""
-        place = self._plan.places.get(path)
-        if place is not None and place.override is not None:
+        place = self._plan.place(path)
+        if place.is_written and place.override is not None:
             return "--set"
-        return "default" if place is None or place.line is None else ""
+        return "default" if not place.is_written or place.line is None else ""

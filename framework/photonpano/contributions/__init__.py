@@ -2,6 +2,7 @@
 
 from photonpano.contributions.configs import Config, SpecLocation, SpecPath
 from photonpano.contributions.contexts import ExecutorContext, SourceContext, StageContext
+from photonpano.contributions.kinds import KINDS, PROJECT, Kind, hookimpl, hookspec
 from photonpano.contributions.records import (
     API_VERSION,
     Contribution,
@@ -25,12 +26,15 @@ from photonpano.contributions.records import (
 
 __all__ = [
     "API_VERSION",
+    "KINDS",
+    "PROJECT",
     "Config",
     "Contribution",
     "ExecutorContext",
     "ExecutorContribution",
     "ExporterContribution",
     "InterpolatorContribution",
+    "Kind",
     "LocatorContribution",
     "MergerContribution",
     "PartOfCapture",
@@ -47,5 +51,7 @@ __all__ = [
     "StageContext",
     "StageContribution",
     "WriteFrames",
+    "hookimpl",
+    "hookspec",
     "install_command",
 ]

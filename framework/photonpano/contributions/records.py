@@ -18,6 +18,7 @@ from pydantic import (
 
 from photonpano.contributions.configs import Config
 from photonpano.contributions.contexts import ExecutorContext, SourceContext, StageContext
+from photonpano.contributions.kinds import KINDS, Kind
 from photonpano.execution import Executor
 from photonpano.protocols import (
     Arrived,
@@ -93,6 +94,12 @@ class Contribution:
     requires: tuple[Requirement, ...] = ()
     api_version: int = API_VERSION
 
+    def __init_subclass__(cls, kind: str = "", **row: Any) -> None:
+        super().__init_subclass__()
+        if kind:
+            cls.kind = kind
+            KINDS[kind] = Kind(kind, contribution=cls, **row)
+
     def __post_init__(self) -> None:
         if not _KEBAB.fullmatch(self.name):
             raise ValueError(f"the name of a contribution is kebab-case, such as 'my-{self.kind}'; got {self.name!r}")
@@ -157,7 +164,7 @@ class WriteFrames(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SourceContribution(Contribution):
+class SourceContribution(Contribution, kind="source", section="source"):
     """Offers a source.
 
     The config gets one more key, `frames`: see `PartOfCapture`. The framework reads that part of what `build` returns.
@@ -176,7 +183,6 @@ class SourceContribution(Contribution):
             there yet is no error, one that will never be a capture is an `InputError`.
     """
 
-    kind: ClassVar[str] = "source"
     build: Callable[[Any, SourceContext], Source]
     check: Callable[[Any], Sequence[str]] = no_problems
     recognise: Callable[[Any], Recognised | None] = _not_ours
@@ -207,15 +213,14 @@ class StageContribution(Contribution):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResamplerContribution(StageContribution):
+class ResamplerContribution(StageContribution, kind="resampler", section="resample", default="midpoint", of_level=True):
     """Offers a resampler."""
 
-    kind: ClassVar[str] = "resampler"
     build: Callable[[Any, StageContext], Resampler]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergerContribution(StageContribution):
+class MergerContribution(StageContribution, kind="merger", section="merge", default="photon-mle", of_level=True):
     """Offers a merger.
 
     Attributes:
@@ -223,37 +228,42 @@ class MergerContribution(StageContribution):
             a vignette that it finds.
     """
 
-    kind: ClassVar[str] = "merger"
     build: Callable[[Any, StageContext], Merger]
     accepts_corrected_sums: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocatorContribution(StageContribution):
+class LocatorContribution(StageContribution, kind="locator", section="locate", default="direct", of_level=True):
     """Offers a locator."""
 
-    kind: ClassVar[str] = "locator"
     build: Callable[[Any, StageContext], Locator]
 
 
 @dataclass(frozen=True, kw_only=True)
-class InterpolatorContribution(StageContribution):
+class InterpolatorContribution(
+    StageContribution, kind="interpolator", section="interpolate", default="smoothing-spline", of_level=True
+):
     """Offers an interpolator."""
 
-    kind: ClassVar[str] = "interpolator"
     build: Callable[[Any, StageContext], Interpolator]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinerContribution(StageContribution):
+class RefinerContribution(
+    StageContribution,
+    kind="refiner",
+    section="refine",
+    default="short-spans",
+    several=True,
+    meaning="the refiners that correct the motion after the last level, in order: one or a list, each a name or {use, with}",
+):
     """Offers a refiner."""
 
-    kind: ClassVar[str] = "refiner"
     build: Callable[[Any, StageContext], Refiner]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RendererContribution(StageContribution):
+class RendererContribution(StageContribution, kind="renderer", section="render", default="merge"):
     """Offers a renderer.
 
     Attributes:
@@ -265,7 +275,6 @@ class RendererContribution(StageContribution):
             `photonpano.merging.accumulate` does. If not, a run that needs it is refused.
     """
 
-    kind: ClassVar[str] = "renderer"
     build: Callable[[Any, StageContext], Renderer]
     bytes_per_pixel: int = 40
     divides_by_light: bool = False
@@ -278,14 +287,19 @@ class RendererContribution(StageContribution):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExporterContribution(StageContribution):
+class ExporterContribution(
+    StageContribution,
+    kind="exporter",
+    section="output.formats",
+    several=True,
+    meaning="further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}",
+):
     """Offers an exporter.
 
     Attributes:
         suffix: the ending of its file, in small letters, such as ".exr": the run folder gets `panorama.exr`.
     """
 
-    kind: ClassVar[str] = "exporter"
     build: Callable[[Any, StageContext], Exporter]
     suffix: str
 
@@ -298,16 +312,25 @@ class ExporterContribution(StageContribution):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseEstimatorContribution(StageContribution):
+class PoseEstimatorContribution(
+    StageContribution,
+    kind="pose-estimator",
+    section="pose",
+    meaning="instead of a panorama, the pose of each frame of a camera that travels through a scene: a name, or {use, with}. "
+    "The sections of the panorama do not apply then. Experimental",
+):
     """Offers a pose estimator. Experimental: the record may change with any version."""
 
-    kind: ClassVar[str] = "pose-estimator"
     build: Callable[[Any, StageContext], PoseEstimator]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExecutorContribution(Contribution):
+class ExecutorContribution(
+    Contribution,
+    kind="executor",
+    section="run.executor",
+    meaning="what works on the tasks of the run: a name, or {use, with}; by default threads of this process",
+):
     """Offers an executor. Experimental: the record may change with any version."""
 
-    kind: ClassVar[str] = "executor"
     build: Callable[[Any, ExecutorContext], Executor]

@@ -9,13 +9,13 @@ The hook module imports no heavy library; the component does so when it is built
 distribution, and `docs/tutorial/first-plugin.md` writes it step by step.
 """
 
+from photonpano.contributions import PROJECT, hookimpl, hookspec
 from photonpano.hookspecs.levels import (
     photonpano_interpolators,
     photonpano_locators,
     photonpano_mergers,
     photonpano_resamplers,
 )
-from photonpano.hookspecs.markers import PROJECT, hookimpl, hookspec
 from photonpano.hookspecs.observation import photonpano_run_finished, photonpano_run_started, photonpano_stage_finished
 from photonpano.hookspecs.runs import (
     photonpano_executors,

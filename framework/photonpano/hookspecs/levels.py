@@ -9,8 +9,8 @@ from photonpano.contributions import (
     LocatorContribution,
     MergerContribution,
     ResamplerContribution,
+    hookspec,
 )
-from photonpano.hookspecs.markers import hookspec
 
 
 @hookspec

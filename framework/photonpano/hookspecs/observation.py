@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from photonpano.hookspecs.markers import hookspec
+from photonpano.contributions import hookspec
 
 
 @hookspec

@@ -11,8 +11,8 @@ from photonpano.contributions import (
     RefinerContribution,
     RendererContribution,
     SourceContribution,
+    hookspec,
 )
-from photonpano.hookspecs.markers import hookspec
 
 
 @hookspec

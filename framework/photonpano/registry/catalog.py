@@ -6,13 +6,14 @@ import importlib.util
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from photonpano.contributions import Contribution, install_command
+from photonpano.contributions import KINDS, Contribution, install_command
 from photonpano.errors import PluginError
-from photonpano.registry.kinds import KINDS
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of, require_same_contract
 from photonpano.text import listed, suggestion
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import pluggy
 
     from photonpano.contributions import Requirement
@@ -152,6 +153,10 @@ class Catalog:
     def entries(self, kind: str, name: object) -> list[Entry]:
         """Return the components of a name: one, none, or several if several plugins offer it."""
         return [entry for entry in self.rows if (entry.kind, entry.name) == (kind, name)]
+
+    def keys_of(self, kind: str, name: object) -> Iterable[str]:
+        """Return the keys of the component with this name; none if there is no such component."""
+        return next((each.contribution.config.model_fields for each in self.entries(kind, name)), ())
 
     def find(self, kind: str, name: str) -> Entry:
         """Look a component up, whether or not its libraries are installed: see `Entry.unavailable`.

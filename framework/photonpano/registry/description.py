@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from photonpano.registry.kinds import KINDS
+from photonpano.contributions import KINDS
 from photonpano.registry.schema_text import (
     alternatives,
     bounds_words,
@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 
 _PLAIN_TEXT = re.compile(r"[A-Za-z/][\w./-]*")
 _NOT_PLAIN = {"true", "false", "null", "yes", "no", "on", "off", "y", "n"}
-_COMPUTED = "computed"
-"""Stands for a default that only the config itself can compute."""
-_MAX_DEPTH = 4
-"""The depth down to which the mappings of a config, which may contain itself, are described."""
+_COMPUTED = "computed"  # stands for a default that only the config itself can compute
+_MAX_DEPTH = 4  # the depth down to which the mappings of a config, which may contain itself, are described
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,7 @@ from photonpano.text import listed, suggestion
 
 logger = logging.getLogger(__name__)
 
-DISABLE = "PHOTONPANO_DISABLE_PLUGINS"
-"""An environment variable: names of distributions or entry points, separated by commas."""
+DISABLE = "PHOTONPANO_DISABLE_PLUGINS"  # an environment variable: names of distributions or entry points, separated by commas
 
 
 def discover() -> Catalog:

@@ -8,23 +8,21 @@ from typing import TYPE_CHECKING, Any
 import pluggy
 
 from photonpano import hookspecs
-from photonpano.contributions import API_VERSION, Contribution
+from photonpano.contributions import API_VERSION, KINDS, Contribution, Kind
 from photonpano.errors import PluginError, described
 from photonpano.hookspecs import observation
 from photonpano.interrupts import is_interrupt
-from photonpano.registry.kinds import KINDS, Kind
 from photonpano.text import listed
 
 if TYPE_CHECKING:
     from photonpano.contributions import Contribution
 
 PREFIX = f"{hookspecs.PROJECT}_"
+# The hooks that offer nothing: a run calls them, so that a plugin can watch it.
 OBSERVATION_HOOKS = tuple(name for name in vars(observation) if name.startswith(PREFIX))
-"""The hooks that offer nothing: a run calls them, so that a plugin can watch it."""
+# All hooks: those that offer components, in the order in which a run needs these, and those that watch.
 HOOKS = (*(kind.hook for kind in KINDS.values()), *OBSERVATION_HOOKS)
-"""All hooks: those that offer components, in the order in which a run needs these, and those that watch."""
-MAX_OFFERED = 1000
-"""Most components that a hook may offer."""
+MAX_OFFERED = 1000  # most components that a hook may offer
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:

@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
     from pydantic_core import core_schema
 
-Schema: TypeAlias = "Mapping[str, Any]"
-"""A JSON Schema, or a part of one."""
+Schema: TypeAlias = "Mapping[str, Any]"  # A JSON Schema, or a part of one
 
-_DEPTH = 4
-"""The depth below which a schema, which may contain itself, is not put into words."""
+_DEPTH = 4  # the depth below which a schema, which may contain itself, is not put into words
+# What a value may be, apart from one of several words.
 _NOUNS = ("integer", "number", "mapping", "path", "size", "list", "value", "text")
-"""What a value may be, apart from one of several words."""
 
 
 class TolerantJsonSchema(GenerateJsonSchema):

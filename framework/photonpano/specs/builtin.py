@@ -17,11 +17,11 @@ from photonpano.hookspecs import hookimpl
 from photonpano.interrupts import is_interrupt
 from photonpano.paths import Location, Url
 from photonpano.reading import objections, require_there
-from photonpano.specs.aliases import LocatorAlias, SourceAlias
 from photonpano.specs.checks import complaints
+from photonpano.specs.components import LocatorAlias, SourceAlias
 from photonpano.specs.plan import Choice
 from photonpano.specs.validation import validate
-from photonpano.specs.written import WrittenSpec, from_python
+from photonpano.specs.written import Written, from_python
 from photonpano.text import listed
 from photonpano.values import Decision
 
@@ -29,16 +29,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from photonpano.registry import Catalog, Entry
+    from photonpano.specs.spec import Spec
 
 logger = logging.getLogger(__name__)
 
-_SHOWN = 3
-"""The largest number of names of a folder in a message."""
-_SEARCHED = 1000
-"""The largest number of files of a folder whose endings are compared with those of sources."""
-
-_MOST_BACKENDS = 16
-"""The largest number of locators of a chain."""
+_SHOWN = 3  # names of a folder in a message
+_SEARCHED = 1000  # files of a folder whose endings are compared with those of sources
+_MOST_BACKENDS = 16  # locators of a chain
 
 
 class AutoConfig(Config):
@@ -82,20 +79,18 @@ def photonpano_locators() -> Iterator[LocatorAlias]:
     )
 
 
-def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) -> dict[str, Any] | None:
+def recognised_source(section: Written, spec: Spec) -> Written | None:
     """Rewrite a section that uses `auto` into one that uses the source that recognises the capture.
 
     The keys that the source recognised are laid under those that are written beside the path.
     """
-    written, keys = section.get("with"), f"{where}.with"
-    own = {key: written[key] for key in AutoConfig.model_fields if key in written} if isinstance(written, dict) else written
-    config = validate(AutoConfig, own, keys, spec)
+    keys = section.at("with")
+    config = validate(AutoConfig, keys.only(AutoConfig.model_fields), spec)
     if config is None:
         return None
-    assert isinstance(written, dict)
-    path = config.path
+    path, written = config.path, keys.at("path")
     if unreadable := objections(require_there, path):
-        spec.wrong(f"{keys}.path", unreadable[0])
+        spec.wrong(written, unreadable[0])
         return None
     recognised, failures = ask_sources(spec.catalog, path)
     if len(recognised) != 1:
@@ -104,25 +99,23 @@ def recognised_source(section: dict[str, Any], where: str, spec: WrittenSpec) ->
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
             # The path is named once; each line begins with its last part.
-            near = list(_near_misses(spec, written, path))
+            near = list(_near_misses(spec, keys, path))
             lines = [f"{name}: {line.replace(str(path), path.name or str(path), 1)}" for name, line in near]
             lines = [*(lines or _known_endings(spec.catalog)), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
             if isinstance(path, Url) and len({line for _, line in near}) == 1:  # such as that there is nothing
                 message = near[0][1]
-        spec.wrong(f"{keys}.path", message)
+        spec.wrong(written, message)
         return None
     for failure in failures:
         logger.warning(failure)
     ((entry, answer),) = recognised
-    found = from_python(answer.keys, spec.place(f"{keys}.path"))
-    spec.problems += found.problems
-    here = {f"{keys}.{key}": replace(spec.place(f"{keys}.path"), where=f"{keys}.{key}") for key in found.data}
-    spec.places = here | spec.places
+    found = from_python(answer.keys, replace(written.place, where=keys.place.where), spec.problems)
     spec.remark = f" ({path.name} was recognised as {entry.name}: {answer.because})"
-    spec.decisions.append(Decision(where, entry.name, f"{path.name} was recognised: {answer.because}"))
-    others = {key: value for key, value in written.items() if key not in AutoConfig.model_fields}
-    return section | {"use": entry.name, "with": found.data | others}
+    reason = f"{path.name} was recognised: {answer.because}"
+    spec.decisions.append(Decision(section.place.where, entry.name, reason))
+    together = Written(found.data | keys.without(*AutoConfig.model_fields).data, keys.place)
+    return section.having({"use": Written(entry.name, section.at("use").place), "with": together})
 
 
 def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Recognised]], list[str]]:
@@ -151,7 +144,7 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
     return recognised, failures
 
 
-def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Location) -> Iterator[tuple[str, str]]:
+def _near_misses(spec: Spec, keys: Written, path: Location) -> Iterator[tuple[str, str]]:
     """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept.
 
     Returns:
@@ -168,7 +161,7 @@ def _near_misses(spec: WrittenSpec, written: dict[str, Any], path: Location) -> 
         if isinstance(path, Url) and not contribution.recognises_urls:
             continue
         try:
-            config = validate(contribution.config, written, "", replace(spec, problems=[]))
+            config = validate(contribution.config, keys, replace(spec, problems=[]))
         except BaseException as error:  # what is wrong with the config is reported once the source is named
             if is_interrupt(error):
                 raise
@@ -199,28 +192,20 @@ def _contents(path: Location) -> str:
     return f"a folder of {listed(names)}" if names else "an empty folder"
 
 
-def first_with_fallbacks(section: dict[str, Any], where: str, spec: WrittenSpec) -> dict[str, Any] | None:
+def first_with_fallbacks(section: Written, spec: Spec) -> Written | None:
     """Rewrite a section that uses `chain-of-backends` into one that uses the first, and has the others as its fallbacks."""
-    keys = section.get("with")
-    if section.get("fallback"):
-        spec.wrong_key(f"{where}.fallback", "a chain cannot have a fallback; add the locator to its backends")
-    validate(ChainConfig, keys, f"{where}.with", spec)
-    backends = keys.get("backends") if isinstance(keys, dict) else None
-    items = f"{where}.with.backends"
+    keys, use = section.at("with"), section.at("use")
+    if section.at("fallback").data:
+        spec.wrong_key(section.at("fallback"), "a chain cannot have a fallback; add the locator to its backends")
+    validate(ChainConfig, keys, spec)
+    backends: Any = keys.at("backends").data
     if backends is None:
-        backends = list(ChainConfig.model_fields["backends"].default)
-        spec.places |= {f"{items}.{index}": spec.place(f"{where}.use") for index in range(len(backends))}
-    if not isinstance(backends, list) or not backends or not all(isinstance(item, str | dict) for item in backends):
+        backends = [Written(name, use.place) for name in ChainConfig.model_fields["backends"].default]
+    if not isinstance(backends, list) or not backends or not all(isinstance(item.data, str | dict) for item in backends):
         return None
-    backends = backends[:_MOST_BACKENDS]
-    first, *others = backends
-    chosen = {"use": first} if isinstance(first, str) else {"use": None} | first
-    if "fallback" in chosen:
+    items: list[Written] = [each.spelled_out() for each in backends[:_MOST_BACKENDS]]
+    first, *others = items
+    if "fallback" in first.data:
         message = "a locator of a chain cannot have a fallback; list all of them, in the order in which they are tried"
-        spec.wrong_key(f"{items}.0.fallback", message)
-    moved = {f"{where}.use": spec.place(f"{items}.0")} if isinstance(first, str) else {}
-    moved |= spec.places_under(f"{items}.0", where)
-    for index in range(len(others)):
-        moved |= spec.places_under(f"{items}.{index + 1}", f"{where}.fallback.{index}")
-    spec.replace_places(where, moved)
-    return chosen | {"fallback": others}
+        spec.wrong_key(first.at("fallback"), message)
+    return first.having({"fallback": Written(others, first.place)})

@@ -1,23 +1,26 @@
-"""Run the checks of components: of a source before it is opened, of the stages once the capture is known."""
+"""Check what single sections cannot: settings against each other, and components against the capture."""
 
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from photonpano.contributions import MergerContribution
+from photonpano.corrections import FlatField
 from photonpano.errors import described
 from photonpano.interrupts import is_interrupt
-from photonpano.registry.kinds import KINDS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from photonpano.corrections import Correction
     from photonpano.errors import Problem
-    from photonpano.specs.plan import Choice, Plan
+    from photonpano.specs.plan import Choice, LevelPlan, Plan
+    from photonpano.specs.settings import CameraSettings, MotionSettings
+    from photonpano.specs.spec import Spec
     from photonpano.values import StreamInfo
 
-STAGES = tuple(KINDS[name].section for name in ("resampler", "merger", "locator", "interpolator"))
-"""The sections of a spec that choose the components of a level, in the order of the loop."""
-MAX_COMPLAINTS = 100
-"""Most problems of one component that are reported."""
+MAX_COMPLAINTS = 100  # of one component that are reported
 
 
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
@@ -28,18 +31,14 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
     Returns:
         The problems, each at its place in the spec; empty if there are none.
     """
-    choices: dict[str, Choice] = {} if plan.pose is None else {"pose": plan.pose}
-    for index, level in enumerate(plan.levels):
-        choices |= {f"levels.{index}.{stage}": getattr(level, stage) for stage in STAGES}
-        choices |= {f"levels.{index}.locate.fallback.{rank}": choice for rank, choice in enumerate(level.fallbacks)}
-    choices |= {f"refine.{index}": choice for index, choice in enumerate(plan.refine)}
-    choices["render"] = plan.renderer
-    choices |= {f"output.formats.{index}": choice for index, choice in enumerate(plan.formats)}
-    sentences: dict[tuple[str, str], str] = {}
-    for where, choice in choices.items():
+    choices = [] if plan.pose is None else [plan.pose]
+    for level in plan.levels:
+        choices += [level.resample, level.merge, level.locate, level.interpolate, *level.fallbacks]
+    found: dict[tuple[str, str], Problem] = {}
+    for choice in (*choices, *plan.refine, plan.renderer, *plan.formats):
         for sentence in complaints(choice, info):
-            sentences.setdefault((choice.contribution.name, sentence), where)
-    problems = [plan.place(where).problem(sentence) for (_, sentence), where in sentences.items()]
+            found.setdefault((choice.contribution.name, sentence), choice.place.problem(sentence))
+    problems = list(found.values())
     reference = plan.render.reference
     if isinstance(reference, int) and reference >= info.n_frames:
         message = f"expected a frame of the capture, 0 to {info.n_frames - 1}, got {reference}"
@@ -56,3 +55,69 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
         if is_interrupt(error):
             raise
         return (f"the check of the {choice.label} raised {described(error)}",)
+
+
+def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
+    """Check the framework's own sections against each other.
+
+    Args:
+        found: the settings of each section; None where they have problems.
+        posed: whether the run finds poses instead of a panorama.
+        spec: problems are added here.
+    """
+    motion, camera, output, render = (found[name] for name in ("motion", "camera", "output", "render"))
+    if motion is not None and camera is not None:
+        _check_camera(motion, camera, posed, spec)
+    if output is not None and output.exposures and not posed:
+        message = "true needs a section `pose`: a panorama has no exposures with poses; remove it"
+        spec.wrong(spec.root.at("output", "exposures"), message)
+    if output is not None and output.keep is not None and posed:
+        message = "exposures are those of the levels of a panorama; remove it, or write exposures: true"
+        spec.wrong(spec.root.at("output", "keep"), message)
+    is_planar = motion is None or render is None or motion.model != "homography" or render.projection in ("auto", "planar")
+    if not is_planar:
+        message = f"a {render.projection} panorama needs motion.model: rotation or auto; one of homographies is planar"
+        spec.wrong(spec.root.at("render", "projection"), message)
+
+
+def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, spec: Spec) -> None:
+    """Refuse what homographies and pose estimators cannot find of the camera, and a start that only homographies have."""
+    if motion.model != "homography":
+        if motion.start != "none":
+            message = f"{motion.start} is the start of motion.model: homography, not of {motion.model}"
+            spec.wrong(spec.root.at("motion", "start"), message)
+        return
+    unfindable = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
+    without_focal = "distortion is in units of the focal length: give camera.focal_px"
+    if posed:
+        unfindable = "find does not apply with `pose`: calibrate the lens, or measure it in a run with motion.model: rotation"
+    else:
+        without_focal += ", or take motion.model: rotation"
+    distortion, written = camera.distortion.model_dump(), spec.root.at("camera", "distortion")
+    for key, number in distortion.items():
+        if number == "find":
+            spec.wrong(written.at(key), unfindable)
+    if camera.focal_px == "find" and any(number != 0 and not (posed and number == "find") for number in distortion.values()):
+        spec.wrong_key(written, without_focal)
+
+
+def check_flat_field(corrections: Iterable[Correction], levels: Iterable[LevelPlan], posed: bool, spec: Spec) -> None:
+    """Refuse a flat field where nothing can be divided by it.
+
+    Args:
+        corrections: of the spec.
+        levels: all levels.
+        posed: whether the run finds poses.
+        spec: problems are added here.
+    """
+    index = next((place for place, each in enumerate(corrections) if isinstance(each, FlatField)), None)
+    if index is None:
+        return
+    mergers = [level.merge.contribution for level in levels]
+    refusing = [each.name for each in mergers if isinstance(each, MergerContribution) and not each.accepts_corrected_sums]
+    written = spec.root.at("corrections", index)
+    if posed:
+        spec.wrong(written, "flat-field does not apply with `pose`: it is measured along a panorama; remove it")
+    elif refusing:
+        message = f"flat-field divides sums of frames, and {refusing[0]!r} merges single frames; choose another merger"
+        spec.wrong(written, message)

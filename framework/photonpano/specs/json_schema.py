@@ -7,41 +7,35 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pydantic.json_schema import models_json_schema
 
+from photonpano.contributions import KINDS
 from photonpano.corrections import CORRECTIONS
-from photonpano.registry.kinds import KINDS
 from photonpano.registry.schema_text import TolerantJsonSchema
-from photonpano.specs.aliases import LocatorAlias
-from photonpano.specs.checks import STAGES
-from photonpano.specs.components import DEFAULT_FALLBACK, DEFAULT_REFINER, DEFAULTS
+from photonpano.specs.components import DEFAULT_FALLBACK, LocatorAlias
 from photonpano.specs.corrections import AUTO
-from photonpano.specs.pose import PANORAMA_ONLY
-from photonpano.specs.resolution import LEVELS, MAX_LEVELS, SETTINGS, UNTIL_CONVERGED, VERSION
-from photonpano.specs.settings import LevelSettings, LightSettings, OutputSettings, RenderSettings, RunSettings
+from photonpano.specs.settings import (
+    LEVELS,
+    MAX_LEVELS,
+    PANORAMA_ONLY,
+    SETTINGS,
+    UNTIL_CONVERGED,
+    VERSION,
+    LevelSettings,
+    LightSettings,
+    OutputSettings,
+    RenderSettings,
+    RunSettings,
+)
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from photonpano.registry import Catalog, Entry, Kind
+    from photonpano.contributions import Kind
+    from photonpano.registry import Catalog, Entry
 
 Schema: TypeAlias = dict[str, Any]
-MODES = ["auto", "steady", "changing"]
-"""Words that may stand for the section `light`."""
-SECTION = ["object", "null"]
-"""A section may be left empty."""
+MODES = ["auto", "steady", "changing"]  # words that may stand for the section `light`
+SECTION = ["object", "null"]  # a section may be left empty
 FALLBACK = "the locators to which a lost pair is offered, in order: one or a list, each a name or {use, with}"
-"""The description of the fallback of a locator."""
-REFINE = "the refiners that correct the motion after the last level, in order: one or a list, each a name or {use, with}"
-"""The description of the refiners, but for the default."""
-
-POSE = (
-    "instead of a panorama, the pose of each frame of a camera that travels through a scene: a name, or {use, with}. The "
-    "sections of the panorama do not apply then. Experimental"
-)
-"""The description of the pose estimator."""
-EXECUTOR = "what works on the tasks of the run: a name, or {use, with}; by default threads of this process"
-"""The description of the executor."""
-FORMATS = "further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}"
-"""The description of the formats."""
 
 
 def json_schema(catalog: Catalog) -> Schema:
@@ -55,31 +49,26 @@ def json_schema(catalog: Catalog) -> Schema:
     models += CORRECTIONS.values()
     schemas, definitions = _schemas(models)
     definitions[OutputSettings.__name__].pop("required")  # the run folder has a default that depends on the spec's name
-    level = definitions[LevelSettings.__name__]
     sections, overrides = {}, {}
     for kind in KINDS.values():
         own = [entry for entry in entries if entry.kind == kind.name]
-        sections[kind.section] = _component(kind, own, schemas, DEFAULTS.get(kind.section))
-        overrides[kind.section] = _component(kind, own, schemas, None)
+        sections[kind.section] = (
+            _component(kind, own, schemas, kind.default) if not kind.meaning else _items(kind, own, schemas)
+        )
+        if kind.of_level:
+            overrides[kind.section] = _component(kind, own, schemas, None)
     one = _item(KINDS["locator"], entries, schemas)
     definitions["fallback"] = _one_or_list(one)
-    refiners = _one_or_list(_item(KINDS["refiner"], entries, schemas))
-    sections["refine"] = {"description": f"{REFINE}; by default {DEFAULT_REFINER}"} | refiners
-    sections["pose"] = {"description": POSE} | _item(KINDS["pose-estimator"], entries, schemas)
     for entry in entries:
         if isinstance(entry.contribution, LocatorAlias):
             definitions[_definition(schemas[entry.contribution.config])]["properties"]["backends"]["items"] = one
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
         section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
-    level["properties"] |= {name: schema for name, schema in overrides.items() if name in STAGES}
+    definitions[LevelSettings.__name__]["properties"] |= overrides
     sections["source"]["required"] = ["use"]
-    formats = _one_or_list(_item(KINDS["exporter"], entries, schemas))
-    del sections[KINDS["exporter"].section]
-    executor = {"description": EXECUTOR} | _item(KINDS["executor"], entries, schemas)
-    del sections[KINDS["executor"].section]
-    definitions[RunSettings.__name__]["properties"]["executor"] = executor
-    definitions[OutputSettings.__name__]["properties"]["formats"] = {"description": FORMATS} | formats
+    definitions[RunSettings.__name__]["properties"]["executor"] = sections.pop("run.executor")
+    definitions[OutputSettings.__name__]["properties"]["formats"] = sections.pop("output.formats")
     rendering = _rendering(sections.pop("render"), definitions[_definition(schemas[RenderSettings])])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -163,6 +152,13 @@ def _item(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schem
 def _one_or_list(item: Schema) -> Schema:
     """Return the schema of a list of components, for which one alone may stand."""
     return {"anyOf": [*item["anyOf"], {"type": "array", "items": item}, {"type": "null"}]}
+
+
+def _items(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema]) -> Schema:
+    """Return the schema of a section in which components stand by name, or as mappings."""
+    item = _item(kind, entries, schemas)
+    meaning = f"{kind.meaning}; by default {kind.default}" if kind.default else kind.meaning
+    return {"description": meaning} | (_one_or_list(item) if kind.several else item)
 
 
 def _corrections(schemas: dict[type[BaseModel], Schema]) -> Schema:

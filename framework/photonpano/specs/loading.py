@@ -11,7 +11,8 @@ from photonpano.paths import Location, location, refusal
 from photonpano.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
 from photonpano.specs.resolution import resolve
-from photonpano.specs.written import Place, WrittenSpec, from_python, given, joined
+from photonpano.specs.spec import Spec
+from photonpano.specs.written import Place, Written, from_python, given, joined
 from photonpano.specs.yaml_reader import MAX_LENGTH, read_yaml
 
 if TYPE_CHECKING:
@@ -44,7 +45,16 @@ def load_spec(
     """
     path, catalog = Path(path), discover() if catalog is None else catalog
     try:
-        return _load(read_spec(path), Place(file=path), path.parent.absolute(), path.stem, overrides, output, catalog, arriving)
+        return parse_spec(
+            read_spec(path),
+            directory=path.parent,
+            name=path.stem,
+            overrides=overrides,
+            output=output,
+            catalog=catalog,
+            file=path,
+            arriving=arriving,
+        )
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
             raise
@@ -80,8 +90,19 @@ def parse_spec(
     Raises:
         SpecError: the spec is wrong; carries all problems.
     """
+    problems: list[Problem] = []
+    place = Place(file=file)
+    root = read_yaml(spec, place, problems) if isinstance(spec, str) else from_python(spec, place, problems)
+    if root.data is None:
+        raise SpecError(problems or [root.place.problem("the spec is empty; it needs at least `version` and `source`")])
+    own = _capture(root)
+    for override in overrides:
+        root = _overridden(root, override, problems)
+    other = _capture(root)
+    named = name if other in (own, None) or refusal(Path(str(other))) else f"{name}-{other}"
+    root = _with_output(root, None if output is None else Path(output).absolute(), Path("runs", named))
     catalog = discover() if catalog is None else catalog
-    return _load(spec, Place(file=file), Path(directory).absolute(), name, overrides, output, catalog, arriving)
+    return resolve(Spec(root, catalog, Path(directory).absolute(), arriving, problems))
 
 
 def capture_plan(
@@ -122,110 +143,84 @@ def read_spec(path: Path) -> str:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_LENGTH + 1)
+        if len(data) <= MAX_LENGTH:
+            return data.decode("utf-8-sig")
+        problem = Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)  # a capture that is given by mistake is
     except FileNotFoundError:
         problem = Problem("", "there is no such file", path)
     except IsADirectoryError:
         problem = Problem("", "this is a folder, expected a spec in YAML", path)
     except OSError as error:
         problem = Problem("", f"cannot be read: {error.strerror}", path)
-    else:
-        if len(data) > MAX_LENGTH:  # a capture that is given by mistake is
-            raise SpecError([Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)])
-        try:
-            return data.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            start = data.rfind(b"\n", 0, error.start) + 1
-            line = data.count(b"\n", 0, error.start) + 1
-            message = f"not UTF-8 text, got the byte {data[error.start]:#04x}; save the file as UTF-8"
-            problem = Problem("", message, path, line, error.start - start + 1)
+    except UnicodeDecodeError as error:
+        start = data.rfind(b"\n", 0, error.start) + 1
+        line = data.count(b"\n", 0, error.start) + 1
+        message = f"not UTF-8 text, got the byte {data[error.start]:#04x}; save the file as UTF-8"
+        problem = Problem("", message, path, line, error.start - start + 1)
     raise SpecError([problem])
 
 
-def _load(
-    spec: Mapping[str, Any] | str,
-    place: Place,
-    directory: Path,
-    name: str,
-    overrides: Sequence[str],
-    output: str | Path | None,
-    catalog: Catalog,
-    arriving: bool,
-) -> Plan:
-    written = read_yaml(spec, place) if isinstance(spec, str) else from_python(spec, place)
-    if written.data is None:
-        empty = written.place("").problem("the spec is empty; it needs at least `version` and `source`")
-        raise SpecError(written.problems or [empty])
-    own = _capture(written)
-    for override in overrides:
-        _apply_override(written, override)
-    other = _capture(written)
-    named = name if other in (own, None) or refusal(Path(str(other))) else f"{name}-{other}"
-    _set_output(written, None if output is None else Path(output).absolute(), Path("runs", named))
-    written.directory, written.catalog, written.arriving = directory, catalog, arriving
-    return resolve(written)
-
-
-def _capture(spec: WrittenSpec) -> str | None:
+def _capture(root: Written) -> str | None:
     """Return the names of the capture and its folder, such as `night-cube` for `captures/night/cube.npy`; None without one."""
-    node = spec.data
-    for key in ("source", "with", "path"):
-        node = node.get(key) if isinstance(node, dict) else None
-    if not isinstance(node, str):
+    written = root.at("source", "with", "path").data
+    if not isinstance(written, str):
         return None
-    path = Path(str(location(node)))  # without the secrets of a URL
-    return (
-        "-".join(part for part in (*path.parts[:-1][-1:], path.name.split(".")[0]) if part not in ("", "/", ".", "..")) or None
-    )
+    path = Path(str(location(written)))  # without the secrets of a URL
+    parts = (*path.parts[:-1][-1:], path.name.split(".")[0])
+    return "-".join(part for part in parts if part not in ("", "/", ".", "..")) or None
 
 
-def _apply_override(spec: WrittenSpec, text: str) -> None:
-    """Set one value of a spec; mappings on the way to it are made where they are missing.
+def _overridden(root: Written, text: str, problems: list[Problem]) -> Written:
+    """Return a spec with one value changed; mappings on the way to it are made where they are missing.
 
     Args:
-        spec: the spec, which is changed.
+        root: the spec.
         text: such as `run.seed=1` or `levels.0.scale=0.5`: keys and list indices (from 0), then a value in YAML.
+        problems: what is wrong with the override is added here, and the spec stays as it is.
     """
     path, sign, yaml = text.partition("=")
     keys = path.strip().split(".")
     if not sign or not all(keys):
-        spec.problems.append(Place(override=text).problem("expected KEY=VALUE, such as run.seed=1"))
-        return
-    place = Place(path.strip(), override=text)
-    value = read_yaml(yaml, place)
-    spec.problems += value.problems
-    if not value.problems:
-        _set(spec, spec.data, "", keys, value, place)
+        problems.append(Place(override=text).problem("expected KEY=VALUE, such as run.seed=1"))
+        return root
+    n_problems = len(problems)
+    value = read_yaml(yaml, Place(path.strip(), override=text), problems)
+    if len(problems) > n_problems:
+        return root
+    try:
+        return _changed(root, keys, value)
+    except LookupError as error:
+        problems.append(value.place.problem(str(error.args[0])))
+        return root
 
 
-def _set(spec: WrittenSpec, node: Any, where: str, keys: list[str], value: WrittenSpec, place: Place) -> None:
-    """Set a value in a mapping or list of a spec."""
-    key: str | int
+def _changed(node: Written, keys: list[str], value: Written) -> Written:
+    """Return a value of a spec with one of the values in it replaced.
+
+    Raises:
+        LookupError: there is no such place; carries a message.
+    """
+    if not keys:
+        return value
     key, *rest = keys
-    if isinstance(node, list) and key.isdecimal() and int(key) < len(node):
-        key = int(key)
-    elif not isinstance(node, dict):
-        spec.problems.append(place.problem(f"{where or 'the spec'} is {given(node)}, which has no {key!r}"))
-        return
-    path = joined(where, key)
-    if not rest:
-        node[key] = value.data
-        spec.replace_places(path, value.places)
-        return
-    if isinstance(node, dict) and key not in node:
-        spec.places[path] = Place(path, override=place.override)
-        node[key] = {}
-    if node[key] is None:
-        node[key] = {}
-    _set(spec, node[key], path, rest, value, place)
+    place = Place(joined(node.place.where, key), override=value.place.override)
+    if isinstance(node.data, list) and key.isdecimal() and int(key) < len(node.data):
+        items = list(node.data)
+        items[int(key)] = _changed(items[int(key)], rest, value)
+        return Written(items, node.place)
+    if node.data is None:
+        return Written({key: _changed(Written(None, place), rest, value)}, node.place)
+    if not isinstance(node.data, dict):
+        raise LookupError(f"{node.place.where or 'the spec'} is {given(node.data)}, which has no {key!r}")
+    return node.having({key: _changed(node.data.get(key, Written(None, place)), rest, value)})
 
 
-def _set_output(spec: WrittenSpec, chosen: Path | None, default: Path) -> None:
-    """Set the run folder: the chosen one, or the default where the spec names none."""
-    if not isinstance(spec.data, dict):
-        return
-    if spec.data.get("output") is None:
-        spec.data["output"] = {}
-    section = spec.data["output"]
-    if isinstance(section, dict) and (chosen is not None or "directory" not in section):
-        section["directory"] = str(chosen or default)
-        spec.replace_places("output.directory", {"output.directory": Place("output.directory", spec.place("").file)})
+def _with_output(root: Written, chosen: Path | None, default: Path) -> Written:
+    """Return a spec with a run folder: the chosen one, or the default where the spec names none."""
+    section = root.at("output")
+    if not isinstance(root.data, dict) or not isinstance(section.data, dict | None):
+        return root
+    if chosen is None and "directory" in (section.data or {}):
+        return root
+    directory = Written(str(chosen or default), Place("output.directory", root.place.file))
+    return root.having({"output": section.having({"directory": directory})})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from photonpano.specs.written import place_of
+from photonpano.specs.written import Place, Written
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         RenderSettings,
         RunSettings,
     )
-    from photonpano.specs.written import Place
     from photonpano.values import Decision
 
 
@@ -35,11 +34,13 @@ class Choice:
         contribution: what the plugin offers under that name.
         config: an instance of `contribution.config`.
         origin: the plugin.
+        place: where the spec chooses it.
     """
 
     contribution: Contribution
     config: Config
     origin: Origin
+    place: Place = field(default=Place(), compare=False)
 
     @property
     def label(self) -> str:
@@ -82,7 +83,7 @@ class Plan:
         output: the run folder.
         run: seed, threads, memory.
         document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
-        places: the place of each value that was written, by its path in `document`, for later messages: see `place`.
+        written: the values of `document` with their places, as far as they were written: see `place`.
         file: the spec file, None for a spec that was built in Python.
         observers: the plugins that watch the run.
         decisions: choices that the spec leaves open and that reading it made: the source that recognises the capture.
@@ -107,7 +108,7 @@ class Plan:
     output: OutputSettings
     run: RunSettings
     document: Mapping[str, Any]
-    places: Mapping[str, Place] = field(default_factory=dict)
+    written: Written = field(default=Written({}), repr=False)
     file: Path | None = None
     observers: tuple[Observer, ...] = ()
     decisions: tuple[Decision, ...] = ()
@@ -116,4 +117,4 @@ class Plan:
 
     def place(self, where: str) -> Place:
         """Return where a value was written, by its path in `document`; for a default, where it would stand."""
-        return place_of(self.places, where)
+        return self.written.at(*where.split(".")).place

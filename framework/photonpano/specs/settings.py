@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import ByteSize, Field, field_validator
+from pydantic import BaseModel, ByteSize, Field, field_validator
 
-from photonpano.contributions import Config, SpecPath
+from photonpano.contributions import KINDS, Config, SpecPath
 
 _Factor = Annotated[float, Field(gt=0, le=1000)]
 Extent = Literal["panorama", "reference"] | tuple[int, int, int, int]
@@ -174,3 +174,26 @@ class RunSettings(Config):
         description="memory for rendering the panorama; a larger panorama is rendered in parts, and one of more than "
         "16 times this size is an error",
     )
+
+
+VERSION = 1
+LEVELS = 3
+MAX_LEVELS = 8
+# Instead of a number of levels: as many as the motion needs to converge, `MAX_LEVELS` at most.
+UNTIL_CONVERGED = "until-converged"
+# The sections that choose the components of a level, in the order of the loop.
+STAGES = tuple(kind.section for kind in KINDS.values() if kind.of_level)
+SETTINGS: dict[str, type[BaseModel]] = {
+    "motion": MotionSettings,
+    "camera": CameraSettings,
+    "light": LightSettings,
+    "graph": GraphSettings,
+    "render": RenderSettings,
+    "output": OutputSettings,
+    "run": RunSettings,
+}
+"""The framework's own sections."""
+# All sections of a spec, in the order in which they are written.
+SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", "pose", *SETTINGS)
+# The sections that do not apply with `pose`.
+PANORAMA_ONLY = (*STAGES, "refine", "levels", "motion", "light", "graph", "render")

@@ -1,27 +1,20 @@
-"""A spec as it was written: plain data, and a table of the place of each value."""
+"""Values of a spec, each with the place where it was written."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.errors import Problem
 from photonpano.paths import Url
-from photonpano.registry.catalog import Catalog
-from photonpano.text import listed, suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from photonpano.values import Decision
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a value of a spec was written.
+    """Where a value of a spec was written, or would be.
 
     Attributes:
         where: path inside the spec, such as `levels.0.scale`; empty for the whole.
@@ -30,6 +23,8 @@ class Place:
         column: column of the key in the line, from 1; None if unknown.
         override: the override that set the value, such as `run.seed=1`; None if it stands in the spec itself.
         start: line and column of the value, if it has a key.
+        is_written: whether a value stands here; if not, line and column are those of the mapping or list where it would stand.
+        is_readable: whether what stands here, or around it, could be read; if not, that is the only problem with it.
     """
 
     where: str = ""
@@ -38,107 +33,86 @@ class Place:
     column: int | None = None
     override: str | None = None
     start: tuple[int, int] | None = None
+    is_written: bool = True
+    is_readable: bool = True
 
     def problem(self, message: str) -> Problem:
         """Return a problem with the key, or with the value that has none."""
         return Problem(self.where, message, self.file, self.line, self.column, self.override)
 
+    def below(self, key: str | int) -> Place:
+        """Return the place of a key or an item that is not written."""
+        return replace(self, where=joined(self.where, key), start=None, is_written=False)
 
-@dataclass
-class WrittenSpec:
-    """A spec while it is resolved.
 
-    Attributes:
-        data: plain data: text, numbers, lists, mappings.
-        places: the place of each value, by its path. A value that moves while the spec is resolved, such as a locator of a
-            chain that becomes a fallback, has an entry for its new path with the place where it was written.
-        problems: what is wrong, so far.
-        unreadable: the paths of values that could not be read; no further problem with them is reported.
-        sections_of: the sections in which a key may stand, such as `resample.with` for `group_size`; "" for a section itself.
-        remark: added to the message of every problem.
-        arriving: whether the capture is still being written, so that its files are not checked.
-        directory: what relative paths count from.
-        catalog: what can be chosen.
-        decisions: choices that the spec leaves open and that reading it made.
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A value of a spec: text, a number, true, false, nothing, a list of such values, or a mapping.
+
+    It keeps its place wherever it is used: a locator of a chain that becomes a fallback is reported as part of the chain.
     """
 
     data: Any
-    places: dict[str, Place]
-    problems: list[Problem] = field(default_factory=list)
-    directory: Path = Path()
-    catalog: Catalog = field(default_factory=Catalog)
-    unreadable: set[str] = field(default_factory=set)
-    decisions: list[Decision] = field(default_factory=list)
-    sections_of: dict[str, list[str]] = field(default_factory=dict)
-    remark: str = ""
-    arriving: bool = False
+    place: Place = Place()
 
-    def place(self, where: str) -> Place:
-        """Return the place of a value; if it was not written, that of the mapping or list where it would stand."""
-        return place_of(self.places, where)
+    def at(self, *keys: str | int) -> Written:
+        """Return a value in this one, by keys and indices; nothing, with the place where it would stand, if there is none."""
+        found = self
+        for key in keys:
+            match found.data:
+                case dict() if key in found.data:
+                    found = found.data[key]
+                case list() if str(key).isdecimal() and int(key) < len(found.data):
+                    found = found.data[int(key)]
+                case _:
+                    found = Written(None, found.place.below(key))
+        return found
 
-    def wrong(self, where: str, message: str) -> None:
-        """Report a problem with a value."""
-        place = self.place(where)
-        line, column = place.start or (place.line, place.column)
-        self.problems.append(replace(place, line=line, column=column).problem(message + self.remark))
+    def only(self, keys: Iterable[str]) -> Written:
+        """Return a mapping without any other keys; anything else stays as it is."""
+        if not isinstance(self.data, dict):
+            return self
+        return Written({key: self.data[key] for key in self.data if key in keys}, self.place)
 
-    def wrong_key(self, where: str, message: str) -> None:
-        """Report a problem with a key: one that is unknown, or missing."""
-        self.problems.append(self.place(where).problem(message + self.remark))
+    def without(self, *keys: str) -> Written:
+        """Return a mapping without some keys; anything else stays as it is."""
+        return self.only(self.data.keys() - {*keys}) if isinstance(self.data, dict) else self
 
-    def places_under(self, source: str, target: str) -> dict[str, Place]:
-        """Return the places of a value and all values in it, by the paths that they have once the value has moved."""
-        inside = {path: place for path, place in self.places.items() if f"{path}.".startswith(f"{source}.")}
-        return {target + path.removeprefix(source): place for path, place in inside.items()}
+    def having(self, values: Mapping[str, Written]) -> Written:
+        """Return a mapping with some values added or replaced; nothing counts as an empty mapping."""
+        return Written({**(self.data or {}), **values}, self.place)
 
-    def replace_places(self, where: str, places: Mapping[str, Place]) -> None:
-        """Forget the places of a value and all values in it, and enter others."""
-        for path in [path for path in self.places if path == where or path.startswith(f"{where}.")]:
-            del self.places[path]
-        self.places.update(places)
+    def laid_over(self, base: Written) -> Written:
+        """Return these keys of a mapping with those of another that they leave out; if nothing is written, the other."""
+        if isinstance(self.data, dict) and isinstance(base.data, dict):
+            return Written(base.data | self.data, self.place)
+        return base if self.data is None else self
 
-    def mapping(self, data: Any, where: str, example: str = "") -> dict[str, Any] | None:
-        """Return a section, where nothing counts as an empty mapping; anything but a mapping is a problem, and None."""
-        if data is None:
-            return {}
-        if isinstance(data, dict):
-            return data
-        self.wrong(where, f"expected a mapping{example}, got {given(data)}")
-        return None
+    def items(self) -> list[Written]:
+        """Return the values of a list; anything else is a list of one, and nothing an empty one."""
+        if isinstance(self.data, list):
+            return self.data
+        return [] if self.data is None else [self]
 
-    def check_keys(self, section: Mapping[str, Any], where: str, known: Iterable[str], below: Iterable[str] = ()) -> None:
-        """Report unknown keys.
+    def spelled_out(self, key: str = "use") -> Written:
+        """Return the mapping for which a word stands: of one key, such as the name of a component; else the value itself."""
+        return Written({key: self}, self.place) if isinstance(self.data, str) else self
 
-        Args:
-            section: a mapping.
-            where: its path.
-            known: the keys that it may have.
-            below: the keys that the mapping under its `with` may have.
-        """
-        for key in section:
-            if key not in known:
-                message = "unknown key; it belongs under `with`" if key in below else self.unknown_key(key, where, known)
-                self.wrong_key(joined(where, key), message)
+    def plain(self) -> Any:
+        """Return the value as plain data, without places."""
+        match self.data:
+            case dict():
+                return {key: item.plain() for key, item in self.data.items()}
+            case list():
+                return [item.plain() for item in self.data]
+        return self.data
 
-    def unknown_key(self, key: str, where: str, known: Iterable[str]) -> str:
-        """Return the message for an unknown key: where it belongs, else the nearest of the keys that are known."""
-        _, *inside_level = where.split(".", 2) if where.startswith("levels.") else ("", "", where)
-        sections = [f"`{section}`" for section in self.sections_of.get(key, ()) if section != inside_level[-1]]
-        if "" in self.sections_of.get(key, ()):
-            return f"unknown key; `{key}` is a section of its own, not part of another"
-        if sections:
-            return f"unknown key; it belongs under {listed(sections, 'or')}"
-        return f"unknown key; {suggestion(key, known) or 'no keys are allowed here'}"
-
-
-def place_of(places: Mapping[str, Place], where: str) -> Place:
-    """Return the place of a value; if it was not written, that of the mapping or list where it would stand."""
-    if where in places or not where:
-        return places.get(where, Place())
-    parent, _, key = where.rpartition(".")
-    above = place_of(places, parent)
-    return replace(above, where=joined(above.where, key), start=None)
+    def all(self) -> Iterator[Written]:
+        """Yield this value and all values in it."""
+        yield self
+        inside = self.data.values() if isinstance(self.data, dict) else self.data if isinstance(self.data, list) else ()
+        for item in inside:
+            yield from item.all()
 
 
 def joined(where: str, key: str | int) -> str:
@@ -163,42 +137,50 @@ def given(data: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def from_python(data: object, place: Place) -> WrittenSpec:
-    """Read a spec from Python data; anything but plain data becomes a problem and None."""
-    spec = WrittenSpec(None, {"": place})
+def from_python(data: object, place: Place, problems: list[Problem]) -> Written:
+    """Read plain Python data; anything else is a problem, and nothing in its place.
+
+    Args:
+        data: the data.
+        place: its place; what is inside has the same line.
+        problems: problems are added here.
+    """
     try:
-        spec.data = _plain(data, "", spec)
+        return _from_python(data, place, problems)
     except RecursionError:
-        spec.problems.append(place.problem("not a spec: nested too deeply"))
-    return spec
+        problems.append(place.problem("not a spec: nested too deeply"))
+        return Written(None, place)
 
 
-def _plain(data: object, where: str, spec: WrittenSpec) -> Any:
+def _from_python(data: object, place: Place, problems: list[Problem]) -> Written:
     match data:
         case str() if any("\ud800" <= each <= "\udfff" for each in data):
-            spec.wrong(where, f"{data!a} is no text of UTF-8, which results cannot record; if it names a file, rename it")
-            spec.unreadable.add(where)
-            return None
+            message = f"{data!a} is no text of UTF-8, which results cannot record; if it names a file, rename it"
         case None | bool() | str():
-            return data
+            return Written(data, place)
         case Integral():
-            return int(data)
+            return Written(int(data), place)
         case Real():
-            return float(data)
+            return Written(float(data), place)
         case Path():
-            return _plain(str(data), where, spec)
+            return _from_python(str(data), place, problems)
         case Url():
-            return _plain(data.address, where, spec)
+            return Written(data.address, place)
         case list() | tuple():
-            return [_plain(item, joined(where, index), spec) for index, item in enumerate(data)]
+            return Written([_from_python(item, _inside(place, index), problems) for index, item in enumerate(data)], place)
         case Mapping():
             content = {}
             for key, item in data.items():
                 if isinstance(key, str):
-                    content[key] = _plain(item, joined(where, key), spec)
+                    content[key] = _from_python(item, _inside(place, key), problems)
                 else:
-                    spec.wrong(where, f"a key is text, got {key!r}")
-            return content
-    spec.wrong(where, f"expected plain data (text, numbers, lists, mappings), got a {type(data).__name__}")
-    spec.unreadable.add(where)
-    return None
+                    problems.append(place.problem(f"a key is text, got {key!r}"))
+            return Written(content, place)
+        case _:
+            message = f"expected plain data (text, numbers, lists, mappings), got a {type(data).__name__}"
+    problems.append(place.problem(message))
+    return Written(None, replace(place, is_readable=False))
+
+
+def _inside(place: Place, key: str | int) -> Place:
+    return replace(place, where=joined(place.where, key))

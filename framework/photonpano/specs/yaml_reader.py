@@ -1,4 +1,4 @@
-"""Read YAML into plain data with a table of places. Nothing is constructed from tags, so nothing in a file is executed."""
+"""Read YAML into values with their places. Nothing is constructed from tags, so nothing in a file is executed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.reader import ReaderError
 
-from photonpano.specs.written import Place, WrittenSpec, given, joined
+from photonpano.specs.written import Place, Written, given, joined
 
 if TYPE_CHECKING:
     from ruamel.yaml.error import StringMark
@@ -22,12 +22,9 @@ if TYPE_CHECKING:
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
-MAX_LENGTH = 2**18
-"""The largest number of characters of a spec, or bytes of its file: a text of a megabyte takes 4 s to read."""
-MAX_VALUES = 5000
-"""The largest number of values in a spec; aliases of aliases multiply."""
-MAX_DEPTH = 100
-"""How deeply values may be nested in a spec."""
+MAX_LENGTH = 2**18  # characters of a spec, or bytes of its file: a text of a megabyte takes 4 s to read
+MAX_VALUES = 5000  # of a spec; aliases of aliases multiply
+MAX_DEPTH = 100  # of values in values
 
 
 class _TooLongError(Exception):
@@ -35,7 +32,7 @@ class _TooLongError(Exception):
 
 
 class _Composer(Composer):
-    """Stops at files that are no specs, which take a minute otherwise: a megabyte holds 500,000 values."""
+    """Stop early in files that are no specs: a megabyte may hold 500,000 values, which take a minute."""
 
     n_values = 0
     depth = 0
@@ -52,28 +49,28 @@ class _Composer(Composer):
         return node
 
 
-def read_yaml(text: str, place: Place) -> WrittenSpec:
+def read_yaml(text: str, place: Place, problems: list[Problem]) -> Written:
     """Read one YAML 1.2 document; aliases and merge keys are followed.
 
     Args:
         text: the document.
         place: where the document stands; lines and columns are filled in unless it is an override.
+        problems: what cannot be read is added here.
 
     Returns:
-        The document, with problems if something cannot be read; its data is None if the text is not YAML or holds no document.
+        The document, which is nothing if the text is not YAML or holds no document.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.Composer = _Composer
     yaml.composer.warn_double_anchors = False
-    reader = _Reader(place)
-    problems = reader.spec.problems
+    reader = _Reader(place, problems)
     if len(text) > MAX_LENGTH:
         problems.append(place.problem(f"not a spec: longer than {MAX_LENGTH} characters"))
-        return reader.spec
+        return Written(None, place)
     try:
         node = yaml.compose(text)
         if node is not None:
-            reader.spec.data = reader.value(node, place.where)
+            return reader.value(node, reader.place(node, place.where))
     except MarkedYAMLError as error:
         problems.append(_syntax_problem(error, reader))
     except ReaderError as error:
@@ -87,7 +84,7 @@ def read_yaml(text: str, place: Place) -> WrittenSpec:
         problems.append(place.problem(f"not a spec: with its aliases expanded it has more than {MAX_VALUES} values"))
     except RecursionError:
         problems.append(place.problem("not a spec: nested too deeply"))
-    return reader.spec
+    return Written(None, place)
 
 
 def _syntax_problem(error: MarkedYAMLError, reader: _Reader) -> Problem:
@@ -98,126 +95,134 @@ def _syntax_problem(error: MarkedYAMLError, reader: _Reader) -> Problem:
         message = f"not valid YAML: {context} {error.problem}"
     elif error.context_mark and not reader.root.override:
         message += f" ({context} that starts in line {error.context_mark.line + 1})"
-    return (reader.place(error.problem_mark, reader.root.where) if error.problem_mark else reader.root).problem(message)
+    place = reader.marked(error.problem_mark, reader.root.where) if error.problem_mark else reader.root
+    return place.problem(message)
 
 
 class _Reader:
-    """Reads the nodes of one document."""
+    """Reads the nodes of one document; what cannot be read becomes a problem, and nothing in its place."""
 
-    def __init__(self, root: Place) -> None:
+    def __init__(self, root: Place, problems: list[Problem]) -> None:
         self.root = root
-        self.spec = WrittenSpec(None, {root.where: root})
+        self.problems = problems
         self.count = 0
         self.open: set[int] = set()
 
-    def place(self, mark: StringMark, where: str) -> Place:
+    def marked(self, mark: StringMark, where: str) -> Place:
         """Return the place of a mark; an override has no lines."""
         if self.root.override is not None:
             return replace(self.root, where=where)
         return replace(self.root, where=where, line=mark.line + 1, column=mark.column + 1)
 
-    def value(self, node: Node, where: str, key: Place | None = None) -> Any:
-        """Read a node; what cannot be read becomes a problem and None."""
+    def place(self, node: Node, where: str) -> Place:
+        """Return the place where a node begins."""
+        return self.marked(node.start_mark, where)
+
+    def value(self, node: Node, place: Place) -> Written:
+        """Read a node.
+
+        Args:
+            node: the node.
+            place: that of its key, or where it begins if it has none.
+        """
         self.count += 1
         if self.count > MAX_VALUES:
             raise _TooLongError
-        place = self.place(node.start_mark, where)
-        if key is not None and node.tag == f"{TAG}null" and node.value == "":
-            self.spec.places[where] = key  # nothing was written, so there is no place but the key's
-            return None
-        start = (place.line, place.column) if place.line and place.column else None
-        self.spec.places[where] = place if key is None else replace(key, start=start)
         if isinstance(node, ScalarNode):
-            return self.scalar(node, where)
-        if not self.is_known(node, where, "map", "seq"):
-            return None
+            return self.scalar(node, place)
+        if not self.is_known(node, "map", "seq"):
+            return self.unreadable(place, _tag_message(node))
         if id(node) in self.open:
-            self.unreadable(where, "an alias inside the value that it repeats")
-            return None
+            return self.unreadable(place, "an alias inside the value that it repeats")
         self.open.add(id(node))
         try:
             if isinstance(node, MappingNode):
-                return self.mapping(node, where)
-            return [self.value(item, joined(where, index)) for index, item in enumerate(node.value)]
+                return self.mapping(node, place)
+            items = enumerate(node.value)
+            return Written([self.value(item, self.place(item, joined(place.where, index))) for index, item in items], place)
         finally:
             self.open.discard(id(node))
 
-    def mapping(self, node: MappingNode, where: str) -> dict[str, Any]:
+    def mapping(self, node: MappingNode, place: Place) -> Written:
         """Read a mapping; the first of duplicate keys stays, and the mapping's own keys win over those that are merged in."""
-        merged: dict[str, Any] = {}
-        for key_node, item in node.value:
-            if key_node.tag == f"{TAG}merge":
-                merged = self.merged(item, where) | merged
-        content: dict[str, Any] = {}
+        where = place.where
+        content: dict[str, Written] = {}
+        merged = Written({}, place)
         for key_node, item in node.value:
             key = key_node.value
             if key_node.tag == f"{TAG}merge":
-                continue
-            if key_node.tag != f"{TAG}str":
+                for source in self.merged(item, where):
+                    is_readable = merged.place.is_readable and source.place.is_readable
+                    merged = Written(merged.laid_over(source).data, replace(place, is_readable=is_readable))
+            elif key_node.tag != f"{TAG}str":
                 got = (f"{key}; quote it" if key else "nothing") if isinstance(key, str) else "a list or a mapping"
                 self.report(key_node, where, f"a key is text, got {got}")
             elif key in content:
-                first = self.spec.places[joined(where, key)].line
-                self.report(
-                    key_node, joined(where, key), f"the key is given twice, first{f' in line {first}' if first else ''}"
-                )
+                line = content[key].place.line
+                first = f" in line {line}" if line else ""
+                self.report(key_node, joined(where, key), f"the key is given twice, first{first}")
             else:
-                path = joined(where, key)
-                if path in self.spec.places:  # that of a value which was merged in
-                    self.spec.replace_places(path, {})
-                content[key] = self.value(item, path, self.place(key_node.start_mark, path))
-        return merged | content
+                content[key] = self.keyed(key_node, item, joined(where, key))
+        return merged.having(content)
 
-    def merged(self, node: Node, where: str) -> dict[str, Any]:
+    def keyed(self, key: Node, node: Node, where: str) -> Written:
+        """Read the value of a key, whose place is that of the key; without a value, it has no other."""
+        place, value = self.place(key, where), self.place(node, where)
+        is_empty = node.tag == f"{TAG}null" and node.value == ""
+        start = (value.line, value.column) if value.line and value.column and not is_empty else None
+        return self.value(node, replace(place, start=start))
+
+    def merged(self, node: Node, where: str) -> list[Written]:
         """Read what stands under a merge key: a mapping, or a list of mappings of which the first wins."""
-        content: dict[str, Any] = {}
-        place = self.spec.places[where]
-        for source in reversed([node] if isinstance(node, MappingNode) else node.value):
-            if not isinstance(source, MappingNode):
-                self.report(node, where, "<< merges mappings, expected a mapping or a list of mappings")
-                return {}
-            content |= self.value(source, where) or {}
-        self.spec.places[where] = place
-        return content
+        sources = [node] if isinstance(node, MappingNode) else node.value
+        if all(isinstance(source, MappingNode) for source in sources):
+            return [self.value(source, self.place(source, where)) for source in sources]
+        self.report(node, where, "<< merges mappings, expected a mapping or a list of mappings")
+        return []
 
     def report(self, node: Node, where: str, message: str) -> None:
-        """Report a problem at a node."""
-        self.spec.problems.append(self.place(node.start_mark, where).problem(message))
+        """Report a problem where a node begins."""
+        self.problems.append(self.place(node, where).problem(message))
 
-    def unreadable(self, where: str, message: str) -> None:
-        """Report a value that cannot be read, and return None in its place."""
-        self.spec.wrong(where, message)
-        self.spec.unreadable.add(where)
+    def unreadable(self, place: Place, message: str) -> Written:
+        """Report a value that cannot be read, at its beginning."""
+        line, column = place.start or (place.line, place.column)
+        self.problems.append(replace(place, line=line, column=column).problem(message))
+        return Written(None, replace(place, is_readable=False))
 
-    def is_known(self, node: Node, where: str, *names: str) -> bool:
-        """Return whether the tag of a node is one of these; any other is a problem."""
-        if node.tag in {f"{TAG}{name}" for name in names}:
-            return True
-        self.unreadable(where, f"tags such as {str(node.tag).replace(TAG, '!!')} are not allowed")
-        return False
+    def is_known(self, node: Node, *names: str) -> bool:
+        """Return whether the tag of a node is one of these."""
+        return node.tag in {f"{TAG}{name}" for name in names}
 
-    def scalar(self, node: ScalarNode, where: str) -> str | int | float | bool | None:
+    def scalar(self, node: ScalarNode, place: Place) -> Written:
         """Read a scalar; dates are text."""
-        if not self.is_known(node, where, "null", "bool", "int", "float", "str", "timestamp", "value"):
-            return None
+        if not self.is_known(node, "null", "bool", "int", "float", "str", "timestamp", "value"):
+            return self.unreadable(place, _tag_message(node))
         text = str(node.value)
         tag = str(node.tag).removeprefix(TAG)
         try:
-            match tag:
-                case "null":
-                    return None
-                case "bool":
-                    return text.lower() in ("true", "yes", "on")
-                case "int":
-                    digits = text.replace("_", "")
-                    return int(digits, 0 if digits.lstrip("+-")[:2] in ("0x", "0o", "0b") else 10)
-                case "float" if WHOLE.fullmatch(text) and abs(float(text)) < 2**53:
-                    return int(float(text))  # 1e3 frames are as good as 1000
-                case "float":
-                    return float(text.replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
-            text.encode()  # refuses half of a surrogate pair, which JSON and file systems cannot hold
+            return Written(_parsed(text, tag), place)
         except ValueError:
             expected = {"int": "an integer", "float": "a number"}.get(tag, "text")
-            self.unreadable(where, f"expected {expected}, got {given(text)}")
+            return self.unreadable(place, f"expected {expected}, got {given(text)}")
+
+
+def _tag_message(node: Node) -> str:
+    return f"tags such as {str(node.tag).replace(TAG, '!!')} are not allowed"
+
+
+def _parsed(text: str, tag: str) -> str | int | float | bool | None:
+    match tag:
+        case "null":
             return None
-        return text
+        case "bool":
+            return text.lower() in ("true", "yes", "on")
+        case "int":
+            digits = text.replace("_", "")
+            return int(digits, 0 if digits.lstrip("+-")[:2] in ("0x", "0o", "0b") else 10)
+        case "float" if WHOLE.fullmatch(text) and abs(float(text)) < 2**53:
+            return int(float(text))  # 1e3 frames are as good as 1000
+        case "float":
+            return float(text.replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
+    text.encode()  # refuses half of a surrogate pair, which JSON and file systems cannot hold
+    return text

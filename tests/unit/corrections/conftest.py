@@ -11,6 +11,7 @@ from photonpano import FrameSpan
 from photonpano.corrections import Correction
 from photonpano.photometry import packed_counts
 from photonpano.specs.corrections import resolved_corrections
+from photonpano.specs.spec import Spec
 from photonpano.specs.written import Place, from_python
 from photonpano.testing import MemorySource
 
@@ -35,9 +36,8 @@ def corrections(tmp_path: Path) -> Callable[..., tuple[Correction, ...]]:
     """Make corrections of what a spec would say: `corrections("rot90", {"crop": {"rows": [2, None]}})`."""
 
     def corrections(*written: Any) -> tuple[Correction, ...]:
-        spec = from_python({"corrections": list(written)}, Place())
-        spec.directory = tmp_path
-        found = resolved_corrections(spec.data["corrections"], spec)
+        spec = Spec(from_python(list(written), Place("corrections"), []), directory=tmp_path)
+        found = resolved_corrections(spec.root, spec)
         assert spec.problems == []
         return found
 

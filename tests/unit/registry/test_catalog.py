@@ -90,21 +90,26 @@ def test_unknown_name_suggests_nearest_names(kind, name, expected, catalog):
     assert message(catalog, kind, name) == expected
 
 
-def test_unknown_name_of_a_catalog_with_broken_plugins():
-    broken = (
-        BrokenPlugin(Origin("a", "1", "a = a.hooks"), "ImportError: x"),
-        BrokenPlugin(Origin("b", "2", "b = b.hooks"), "ValueError: y"),
-    )
-    assert message(Catalog(broken=broken), "source", "cube") == (
-        "there is no source 'cube'. Broken plugins may have offered it: "
-        "a 1 (a = a.hooks): ImportError: x and b 2 (b = b.hooks): ValueError: y"
-    )
+A, B = Origin("a", "1", "a = a.hooks"), Origin("b", "2", "b = b.hooks")
 
 
-def test_unknown_name_of_a_catalog_with_disabled_plugins():
-    disabled = (DisabledPlugin(Origin("a", "1", "a = a.hooks"), "X=a"),)
-    assert message(Catalog(disabled=disabled), "source", "cube") == (
-        "there is no source 'cube'. Disabled plugins may have offered it: a 1 (a = a.hooks), by X=a"
+@pytest.mark.parametrize(
+    ("catalog", "expected"),
+    [
+        (
+            Catalog(broken=(BrokenPlugin(A, "ImportError: x"), BrokenPlugin(B, "ValueError: y"))),
+            "Broken plugins may have offered it: a 1 (a = a.hooks): ImportError: x and b 2 (b = b.hooks): ValueError: y",
+        ),
+        (
+            Catalog(disabled=(DisabledPlugin(A, "X=a"),)),
+            "Disabled plugins may have offered it: a 1 (a = a.hooks), by X=a",
+        ),
+    ],
+)
+def test_unknown_name_mentions_plugins_that_offer_nothing(catalog, expected):
+    assert message(catalog, "source", "cube") == f"there is no source 'cube'. {expected}"
+    assert message(catalog.including(locator("cubes")), "locator", "cub") == (
+        f"there is no locator 'cub'; did you mean 'cubes'? {expected}"
     )
 
 

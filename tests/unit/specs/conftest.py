@@ -5,20 +5,8 @@ from typing import Literal
 import pytest
 from pydantic import Field, model_validator
 
-from photonpano import (
-    Config,
-    InterpolatorContribution,
-    LocatorContribution,
-    MergerContribution,
-    Recognised,
-    RefinerContribution,
-    RendererContribution,
-    Requirement,
-    ResamplerContribution,
-    SourceContribution,
-    SpecPath,
-)
-from photonpano.registry import Catalog, Origin
+from photonpano import Config, Recognised, Requirement, SpecPath
+from photonpano.registry import KINDS, Catalog, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.plugins import contributions_of
 from photonpano.specs import builtin
@@ -112,6 +100,10 @@ def unbuilt(config, context):
     raise AssertionError("nothing is built while a spec is read")
 
 
+def toy(kind, name, config=Plain, **more):
+    return KINDS[kind].contribution(name=name, summary="Toy", config=config, build=unbuilt, **more)
+
+
 def missing_file(config):
     return [] if config.path.exists() else [f"there is no file {config.path.name}"]
 
@@ -136,34 +128,30 @@ def too_few_frames(config, info):
 
 CONTRIBUTIONS = [
     *contributions_of(builtin),
-    SourceContribution(
-        name="packed-npy", summary="Toy", config=PackedNpyConfig, build=unbuilt, check=missing_file, recognise=npy
-    ),
-    SourceContribution(name="simulator", summary="Toy", config=SimulatorConfig, build=unbuilt),
-    ResamplerContribution(name="midpoint", summary="Toy", config=MidpointConfig, build=unbuilt, check=too_few_frames),
-    MergerContribution(name="photon-mle", summary="Toy", config=PhotonMleConfig, build=unbuilt),
-    LocatorContribution(name="opencv-sift", summary="Toy", config=SiftConfig, build=unbuilt),
-    LocatorContribution(name="direct", summary="Toy", config=DirectConfig, build=unbuilt),
-    LocatorContribution(
-        name="kornia-loftr",
-        summary="Toy",
-        config=LoftrConfig,
-        build=unbuilt,
-        requires=(Requirement("no_such_library", "photonpano[kornia]"),),
-    ),
-    LocatorContribution(name="moody", summary="Toy", config=MoodyConfig, build=unbuilt),
-    InterpolatorContribution(name="smoothing-spline", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
-    InterpolatorContribution(name="lucas-kanade", summary="Toy", config=LucasKanadeConfig, build=unbuilt),
-    RefinerContribution(name="short-spans", summary="Toy", config=SpansConfig, build=unbuilt, check=too_few_spans),
-    RefinerContribution(name="drift", summary="Toy", config=DriftConfig, build=unbuilt),
-    RendererContribution(name="merge", summary="Toy", config=Plain, build=unbuilt),
-    RendererContribution(name="sharp", summary="Toy", config=SharpConfig, build=unbuilt, check=too_small),
+    toy("source", "packed-npy", PackedNpyConfig, check=missing_file, recognise=npy),
+    toy("source", "simulator", SimulatorConfig),
+    toy("resampler", "midpoint", MidpointConfig, check=too_few_frames),
+    toy("merger", "photon-mle", PhotonMleConfig),
+    toy("locator", "opencv-sift", SiftConfig),
+    toy("locator", "direct", DirectConfig),
+    toy("locator", "kornia-loftr", LoftrConfig, requires=(Requirement("no_such_library", "photonpano[kornia]"),)),
+    toy("locator", "moody", MoodyConfig),
+    toy("interpolator", "smoothing-spline", LucasKanadeConfig),
+    toy("interpolator", "lucas-kanade", LucasKanadeConfig),
+    toy("refiner", "short-spans", SpansConfig, check=too_few_spans),
+    toy("refiner", "drift", DriftConfig),
+    toy("renderer", "merge"),
+    toy("renderer", "sharp", SharpConfig, check=too_small),
 ]
-TWICE = LocatorContribution(name="twice", summary="Toy", config=DirectConfig, build=unbuilt)
+
+
+def toys():
+    rows = [make_entry(each, Origin("photonpano", "0.1.0", "toys = toys.hooks")) for each in CONTRIBUTIONS]
+    twice = toy("locator", "twice", DirectConfig)
+    rows += [make_entry(twice, Origin(plugin, "2.0", f"{plugin} = {plugin}.hooks")) for plugin in ("alpha", "beta")]
+    return Catalog(tuple(rows))
 
 
 @pytest.fixture(scope="session")
 def catalog() -> Catalog:
-    rows = [make_entry(each, Origin("photonpano", "0.1.0", "toys = toys.hooks")) for each in CONTRIBUTIONS]
-    rows += [make_entry(TWICE, Origin(plugin, "2.0", f"{plugin} = {plugin}.hooks")) for plugin in ("alpha", "beta")]
-    return Catalog(tuple(rows))
+    return toys()

@@ -22,9 +22,11 @@ def halves(path):
     return Recognised({"path": path, "order": "right", "rows": 8}, "left.bin lies in it")
 
 
-HALVES = SourceContribution(
-    name="halves", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=halves, check=lambda _: ()
-)
+def toy(name, recognise=lambda _: None, **more):
+    return SourceContribution(name=name, summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=recognise, **more)
+
+
+HALVES = toy("halves", halves)
 
 
 @pytest.fixture
@@ -63,19 +65,12 @@ def test_auto_resolved_document_records_no_decision_again(folder, catalog):
 def test_written_keys_override_recognised_keys(folder, catalog):
     plan = parsed(folder, catalog.including(HALVES), path="recording", rows=16)
     assert plan.source.config.model_dump(exclude={"frames"}) == {"path": folder / "recording", "order": "right", "rows": 16}
-    assert set(plan.places) >= {"source.with.path", "source.with.order", "source.with.rows"}
+    assert all(plan.place(f"source.with.{key}").is_written for key in ("path", "order", "rows"))
 
 
 def fussy(name, *suffixes):
     """Offer a source that recognises nothing and has a problem with every path."""
-    return SourceContribution(
-        name=name,
-        summary="Toy",
-        config=HalvesConfig,
-        build=lambda *_: None,
-        check=lambda config: [f"{config.path} is not mine"],
-        suffixes=suffixes,
-    )
+    return toy(name, check=lambda config: [f"{config.path} is not mine"], suffixes=suffixes)
 
 
 FUSSY = [fussy("any"), fussy("bins", ".bin"), fussy("dats", ".dat", ".data")]
@@ -114,10 +109,7 @@ def test_unrecognised_folder_is_described_by_its_files(folder, catalog, names, l
 
 
 def test_path_recognised_by_several_sources_is_an_error(folder, catalog):
-    def greedy(path):
-        return Recognised({"path": path}, "it is there")
-
-    also = SourceContribution(name="greedy", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=greedy)
+    also = toy("greedy", lambda path: Recognised({"path": path}, "it is there"))
     said = message_of(folder, catalog.including(also), "source: {use: auto, with: {path: cube.npy}}")
     assert said == (
         "scan.yaml:2:34: source.with.path: cube.npy is recognised by greedy (it is there) and packed-npy "
@@ -129,7 +121,7 @@ def test_recognise_that_raises_is_logged_and_other_sources_are_tried(folder, cat
     def raises(path):
         raise LookupError("not today")
 
-    sulky = SourceContribution(name="sulky", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=raises)
+    sulky = toy("sulky", raises)
     with caplog.at_level(logging.WARNING):
         assert parsed(folder, catalog.including(sulky), path="cube.npy").source.contribution.name == "packed-npy"
     complaint = f"recognise of the source 'sulky' of {__name__} unreleased raised LookupError: not today"
@@ -146,8 +138,7 @@ def test_recognise_that_raises_is_logged_and_other_sources_are_tried(folder, cat
     ],
 )
 def test_recognise_that_returns_wrong_type_is_named(folder, catalog, answer, broken):
-    odd = SourceContribution(name="odd", summary="Toy", config=HalvesConfig, build=lambda *_: None, recognise=lambda _: answer)
-    said = message_of(folder, catalog.including(odd), "source: {use: auto, with: {path: cube.dat}}")
+    said = message_of(folder, catalog.including(toy("odd", lambda _: answer)), "source: {use: auto, with: {path: cube.dat}}")
     complaint = f"recognise of the source 'odd' of {__name__} unreleased returned {broken}"
     assert said.splitlines()[1:] == [f"  {complaint}"]
 
@@ -180,14 +171,8 @@ def test_auto_with_wrong_path_is_an_error_at_its_place(folder, catalog, text, sa
 
 
 def test_recognised_source_without_its_library_names_the_extra(folder, catalog):
-    needy = SourceContribution(
-        name="needy",
-        summary="Toy",
-        config=HalvesConfig,
-        build=lambda *_: None,
-        recognise=lambda path: Recognised({"path": path}, "it is heavy"),
-        requires=(Requirement("no_such_library", "photonpano[heavy]"),),
-    )
+    missing = (Requirement("no_such_library", "photonpano[heavy]"),)
+    needy = toy("needy", lambda path: Recognised({"path": path}, "it is heavy"), requires=missing)
     said = message_of(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
     assert said == (
         "scan.yaml:2:15: source.use: the source 'needy' needs no_such_library, which is not installed: pip install "

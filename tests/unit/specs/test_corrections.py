@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from photonpano import SpecError
-from photonpano.corrections import CORRECTIONS
-from photonpano.corrections.geometry import Crop
 from photonpano.registry import Catalog
 from photonpano.specs import load_spec, parse_spec
 
@@ -43,15 +41,6 @@ def test_missing_correction_file_is_an_error_at_its_place(catalog: Catalog, tmp_
         f"{path}:4:18: corrections.0.mask.file: there is no file {tmp_path / 'bad.npy'}; check the path\n"
         f"{path}:6:13: corrections.1.dark-counts.dark: there is no file {tmp_path / 'dark.npz'}; check the path"
     )
-
-
-def test_override_changes_correction_settings(catalog: Catalog) -> None:
-    written = spec("rot90", {"crop": {"rows": [0, 4]}})
-    changed = parse_spec(written, overrides=["corrections.1.crop.rows=[2, null]"], catalog=catalog)
-    assert changed.corrections == (CORRECTIONS["rot90"](), Crop(rows=(2, None)))
-    replaced = parse_spec(written, overrides=["corrections=[rot90]"], catalog=catalog)
-    assert replaced.corrections == (CORRECTIONS["rot90"](),)
-    assert replaced.document["corrections"] == ["rot90"]
 
 
 @pytest.mark.parametrize(("written", "still"), [({}, True), ({"corrections": "auto"}, True), ({"corrections": []}, False)])

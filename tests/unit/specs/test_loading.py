@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonpano import SpecError
+from photonpano import Config, ExporterContribution, PluginError, SpecError
 from photonpano.registry import Catalog
 from photonpano.registry.description import snippet
-from photonpano.specs import load_spec, parse_spec
+from photonpano.specs import builtin, load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
 
@@ -23,121 +23,66 @@ def messages(spec, **settings):
 
 def test_minimal_spec_is_complete(catalog):
     plan = parse_spec(MINIMAL, catalog=catalog)
-    assert len(plan.levels) == 3
-    level = plan.levels[0]
-    names = [choice.contribution.name for choice in (level.resample, level.merge, level.locate, level.interpolate)]
+    first, second, third = plan.levels
+    names = [choice.contribution.name for choice in (first.resample, first.merge, first.locate, first.interpolate)]
     assert names == ["midpoint", "photon-mle", "direct", "smoothing-spline"]
-    assert [choice.contribution.name for choice in level.fallbacks] == ["opencv-sift"]
+    assert [choice.contribution.name for choice in first.fallbacks] == ["opencv-sift"]
+    assert [choice.contribution.name for choice in (*plan.refine, plan.renderer, *plan.formats)] == ["short-spans", "merge"]
     assert (plan.source.origin.plugin, plan.source.origin.version) == ("photonpano", "0.1.0")
+    assert first.locate is second.locate is third.locate
     assert {level.scale for level in plan.levels} == {"auto"}
-
-
-def test_levels_without_overrides_share_their_choices(catalog):
-    plan = parse_spec(MINIMAL | {"levels": [{"scale": 0.5}, {}]}, catalog=catalog)
-    assert [level.scale for level in plan.levels] == [0.5, "auto"]
-    assert plan.levels[0].locate is plan.levels[1].locate
-
-
-def test_until_converged_is_eight_equal_levels(catalog):
-    plan = parse_spec(MINIMAL | {"levels": "until-converged"}, catalog=catalog)
-    assert plan.until_converged
-    assert plan.levels == (plan.levels[0],) * 8
-    assert plan.document["levels"] == "until-converged"
+    assert list(plan.document)[:8] == [
+        *("version", "source", "corrections", "resample", "merge", "locate", "interpolate", "refine")
+    ]
+    converged = parse_spec(MINIMAL | {"levels": "until-converged"}, catalog=catalog)
+    assert (converged.until_converged, converged.levels) == (True, (converged.levels[0],) * 8)
     assert not parse_spec(MINIMAL | {"levels": 8}, catalog=catalog).until_converged
 
 
-def test_level_replaces_a_stage_with_use_and_updates_it_without(catalog):
-    levels = [{"locate": {"use": "direct"}}, {"locate": {"with": {"ratio": 0.6}}}, {}, {"locate": None}]
-    spec = MINIMAL | {"locate": {"use": "opencv-sift", "with": {"max_keypoints": 99}}, "levels": levels}
-    replaced, updated, base, empty = (level.locate for level in parse_spec(spec, catalog=catalog).levels)
-    assert replaced.contribution.name == "direct"
-    assert (updated.config.ratio, updated.config.max_keypoints) == (0.6, 99)
-    assert (base.config.ratio, base.config.max_keypoints) == (0.8, 99)
-    assert empty == base
-
-
-def tried_by(level):
-    return [(each.contribution.name, each.config.model_dump(exclude_unset=True)) for each in (level.locate, *level.fallbacks)]
-
-
 @pytest.mark.parametrize(
-    ("section", "tried"),
+    ("gone", "sections", "problem"),
     [
-        (None, ["direct", "opencv-sift"]),
-        ({"with": {"max_steps": 5}}, ["direct", "opencv-sift"]),
-        ({"fallback": None}, ["direct", "opencv-sift"]),
-        ({"fallback": []}, ["direct"]),
-        ({"fallback": {"use": "direct", "with": {"max_steps": 5}}}, ["direct", "direct"]),
-        ({"use": "direct"}, ["direct"]),
-        ({"use": "opencv-sift"}, ["opencv-sift"]),
-        ({"use": "opencv-sift", "fallback": "direct"}, ["opencv-sift", "direct"]),
+        ("opencv-sift", {}, None),
+        ("opencv-sift", {"locate": {"use": "chain-of-backends"}}, "locate.use: there is no locator 'opencv-sift'; known: "),
+        ("short-spans", {}, None),
+        ("short-spans", {"refine": "short-spans"}, "refine: there is no refiner 'short-spans'; known: drift"),
     ],
 )
-def test_only_the_default_locator_has_a_default_fallback(section, tried, catalog):
-    plan = parse_spec(MINIMAL | {"locate": section}, catalog=catalog)
-    assert [[name for name, _ in tried_by(level)] for level in plan.levels] == [tried] * 3
-    assert [each["use"] for each in plan.document["locate"]["fallback"]] == tried[1:]
+def test_default_that_is_not_installed_is_left_out_unless_it_is_named(gone, sections, problem, catalog):
+    without = Catalog(tuple(entry for entry in catalog.rows if entry.name != gone))
+    if problem is None:
+        plan = parse_spec(MINIMAL | sections, catalog=without)
+        assert (plan.levels[0].fallbacks, plan.refine).count(()) == 1
+    else:
+        (message,) = messages(MINIMAL | sections, catalog=without)
+        assert message.startswith(problem)
 
 
-def test_level_that_overrides_keys_keeps_the_default_fallback_and_one_that_names_a_locator_has_none(catalog):
-    levels = [{"locate": {"with": {"max_steps": 5}}}, {"locate": {"use": "direct"}}, {"locate": {"fallback": []}}]
-    plan = parse_spec(MINIMAL | {"levels": levels}, catalog=catalog)
-    short = ("direct", {"max_steps": 5})
-    assert [tried_by(level) for level in plan.levels] == [[short, ("opencv-sift", {})], [("direct", {})], [("direct", {})]]
-
-
-def test_default_fallback_is_left_out_where_it_is_not_installed_and_an_error_where_it_is_ambiguous(catalog):
-    without = Catalog(tuple(entry for entry in catalog.rows if entry.name != "opencv-sift"))
-    assert parse_spec(MINIMAL, catalog=without).levels[0].fallbacks == ()
+def test_default_fallback_of_two_plugins_is_an_error_unless_fallbacks_are_named(catalog):
     twice = Catalog((*catalog.rows, catalog.find("locator", "opencv-sift")))
     (message,) = messages(MINIMAL | {"levels": [{"locate": {"with": {"max_steps": 5}}}]}, catalog=twice)
-    assert message.startswith("locate.fallback.0.use: the locator 'opencv-sift' is offered by ")
+    assert message.startswith("locate.fallback.0: the locator 'opencv-sift' is offered by ")
     parse_spec(MINIMAL | {"locate": {"fallback": []}}, catalog=twice)
 
 
-def test_level_keeps_the_fallbacks_until_it_names_a_locator_or_fallbacks_of_its_own(catalog):
-    steps = {"max_steps": 5}
-    overrides = {
-        "nothing": {},
-        "null": {"fallback": None},
-        "keys": {"with": {"ratio": 0.6}},
-        "locator": {"use": "direct"},
-        "fallback": {"fallback": {"use": "direct", "with": steps}},
-        "both": {"use": "direct", "fallback": ["opencv-sift", {"use": "direct", "with": steps}]},
-        "none": {"fallback": []},
-    }
-    levels = [{"locate": override} for override in overrides.values()]
-    plan = parse_spec(MINIMAL | {"locate": {"use": "opencv-sift", "fallback": "direct"}, "levels": levels}, catalog=catalog)
-    tried = {name: tried_by(level) for name, level in zip(overrides, plan.levels, strict=True)}
-    sift, direct, short = ("opencv-sift", {}), ("direct", {}), ("direct", steps)
-    assert tried == {
-        "nothing": [sift, direct],
-        "null": [sift, direct],
-        "keys": [("opencv-sift", {"ratio": 0.6}), direct],
-        "locator": [direct],
-        "fallback": [sift, short],
-        "both": [direct, sift, short],
-        "none": [sift],
-    }
-    assert "locate" not in plan.document["levels"][0]
-    assert plan.document["levels"][3]["locate"]["fallback"] == []
+def test_building_an_alias_is_an_error():
+    for alias in (*builtin.photonpano_sources(), *builtin.photonpano_locators()):
+        with pytest.raises(PluginError, match=r"^this name stands for other components, "):
+            alias.build(None, None)
 
 
 @pytest.mark.parametrize(
-    ("written", "chosen"),
+    ("suffix", "message"),
     [
-        (None, ["short-spans"]),
-        ([], []),
-        ("drift", ["drift"]),
-        ({"use": "drift"}, ["drift"]),
-        (["drift", {"use": "short-spans"}, "drift"], ["drift", "short-spans", "drift"]),
+        ("exr", "toy: suffix is a dot and small letters or digits, such as .exr, got 'exr'"),
+        (".E/r", "toy: suffix is a dot and small letters or digits, such as .exr, got '.E/r'"),
+        (".tiff", "toy: every run writes panorama.tiff itself; choose another suffix"),
     ],
 )
-def test_refiners_are_a_list_in_order_and_short_spans_by_default(written, chosen, catalog):
-    plan = parse_spec(MINIMAL | {"refine": written}, catalog=catalog)
-    assert [choice.contribution.name for choice in plan.refine] == chosen
-    assert [each["use"] for each in plan.document["refine"]] == chosen
-    assert list(plan.document)[6:9] == ["interpolate", "refine", "levels"]
+def test_exporter_refuses_suffix_that_is_no_file_of_its_own(suffix, message):
+    with pytest.raises(ValueError, match="toy") as caught:
+        ExporterContribution(name="toy", summary="Toy", config=Config, suffix=suffix, build=lambda *_: None)
+    assert str(caught.value) == message
 
 
 def test_snippet_of_a_refiner_is_a_section_of_a_spec(catalog):
@@ -145,35 +90,6 @@ def test_snippet_of_a_refiner_is_a_section_of_a_spec(catalog):
     assert snippet(drift) == "refine:\n  use: drift\n  with:\n    knots: 4  # of the spline\n"
     plan = parse_spec(f"version: 1\nsource: {{use: simulator}}\n{snippet(drift)}", catalog=catalog)
     assert [choice.contribution for choice in plan.refine] == [drift]
-
-
-def test_default_refiner_is_left_out_where_it_is_not_installed(catalog):
-    without = Catalog(tuple(entry for entry in catalog.rows if entry.name != "short-spans"))
-    assert parse_spec(MINIMAL, catalog=without).refine == ()
-    (message,) = messages(MINIMAL | {"refine": "short-spans"}, catalog=without)
-    assert message == "refine.0.use: there is no refiner 'short-spans'; known: drift"
-
-
-def test_places_of_refiners_are_found_by_their_paths_in_the_document(catalog):
-    spec = "version: 1\nsource: {use: simulator}\nrefine: {use: drift, with: {knots: 5}}"
-    places = parse_spec(spec, catalog=catalog).places
-    assert (places["refine.0.use"].column, places["refine.0.with.knots"].column) == (10, 29)
-    places = parse_spec(spec.replace("{use: drift, with: {knots: 5}}", "[drift, short-spans]"), catalog=catalog).places
-    assert (places["refine.0.use"].column, places["refine.1.use"].column) == (10, 17)
-
-
-def test_places_of_fallbacks_are_found_by_their_paths_in_the_document(catalog):
-    """Where a fallback is one name or one mapping, the document has a list of mappings."""
-    spec = (
-        "version: 1\nsource: {use: simulator}\n"
-        "locate: {fallback: opencv-sift}\nlevels: [{locate: {fallback: {use: opencv-sift}}}]"
-    )
-    places = parse_spec(spec, catalog=catalog).places
-    found = {path: (places[path].where, places[path].column) for path in places if path.endswith(".0.use")}
-    assert found == {
-        "locate.fallback.0.use": ("locate.fallback", 10),
-        "levels.0.locate.fallback.0.use": ("levels.0.locate.fallback.use", 31),
-    }
 
 
 def test_paths_count_from_the_folder_of_the_spec(catalog, tmp_path, monkeypatch):

@@ -13,9 +13,14 @@ from photonpano.specs.yaml_reader import read_yaml
 
 
 def read(text):
-    spec = read_yaml(text, Place())
-    assert spec.problems == []
-    return spec
+    problems = []
+    value = read_yaml(text, Place(), problems)
+    assert problems == []
+    return value
+
+
+def places(text):
+    return {value.place.where: value.place for value in read(text).all()}
 
 
 @pytest.mark.parametrize(
@@ -53,22 +58,19 @@ def read(text):
         ("a: &x {p: 1, q: 2}\nb: {<<: *x, q: 3}", {"a": {"p": 1, "q": 2}, "b": {"p": 1, "q": 3}}),
         ("{<<: [{a: 1}, {a: 2, b: 3}], c: 4}", {"a": 1, "b": 3, "c": 4}),
         ("&x 1", 1),
+        ("123456789012345678901234567890", 123456789012345678901234567890),
         ("{a: &x 1, b: &x 2, c: *x}", {"a": 1, "b": 2, "c": 2}),
     ],
 )
 def test_yaml_scalar_gives_value(text, value):
-    plain = read(text).data
+    plain = read(text).plain()
     assert plain == value
     assert type(plain) is type(value)
 
 
-def test_whole_numbers_beyond_a_float_keep_their_size():
-    assert read("123456789012345678901234567890").data == 123456789012345678901234567890
-
-
 def test_places_of_values_and_keys():
-    places = read("a: 1\nb:\n  - x: {y: 2}\n  -\nc:\n").places
-    assert {where: (place.line, place.column, place.start) for where, place in places.items()} == {
+    found = places("a: 1\nb:\n  - x: {y: 2}\n  -\nc:\n")
+    assert {where: (place.line, place.column, place.start) for where, place in found.items()} == {
         "": (1, 1, None),
         "a": (1, 1, (1, 4)),
         "b": (2, 1, (3, 3)),
@@ -81,8 +83,8 @@ def test_places_of_values_and_keys():
 
 
 def test_merged_keys_have_places_where_they_are_written():
-    places = read("a: &x {p: {r: 1}, q: {r: 2}}\nb: {<<: *x, q: {s: 3}}").places
-    assert {where: place.line for where, place in places.items() if where.startswith("b.")} == {
+    found = places("a: &x {p: {r: 1}, q: {r: 2}}\nb: {<<: *x, q: {s: 3}}")
+    assert {where: place.line for where, place in found.items() if where.startswith("b.")} == {
         "b.p": 1,
         "b.p.r": 1,
         "b.q": 2,
@@ -102,14 +104,14 @@ documents = st.recursive(
 @given(documents)
 def test_yaml_reader_reads_json(document):
     """JSON is YAML, up to whole floats such as 1e16, which are read as integers."""
-    assert read(json.dumps(document, ensure_ascii=False)).data == document
+    assert read(json.dumps(document, ensure_ascii=False)).plain() == document
 
 
 @settings(deadline=None)  # the machine may be busy
 @given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))
 def test_any_text_gives_value_or_problem(text):
-    spec = read_yaml(text, Place())
-    if spec.data is None and not spec.problems:
+    problems = []
+    if read_yaml(text, Place(), problems).data is None and not problems:
         assert YAML(typ="safe", pure=True).load(text) is None
-    for problem in spec.problems:
+    for problem in problems:
         assert problem.line is None or problem.line <= text.count("\n") + 2

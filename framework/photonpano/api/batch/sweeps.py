@@ -97,11 +97,12 @@ def read_changes(
             what = "the captures of a batch" if key == CAPTURE_KEY else "the folder of a batch"
             problems.append(place.problem(f"{what} are given beside the spec" if key == CAPTURE_KEY else f"{what} is --output"))
             continue
-        read = read_yaml(f"[{yaml}]" if is_sweep else yaml, place)
-        if is_sweep and read.problems:
-            problems += read.problems
-        elif is_sweep or (isinstance(read.data, list) and read.data and not takes_list(key, text)):
-            values = read.data[0] if is_sweep and len(read.data) == 1 and isinstance(read.data[0], list) else read.data
+        unread: list[Problem] = []
+        read = read_yaml(f"[{yaml}]" if is_sweep else yaml, place, unread).plain()
+        if is_sweep and unread:
+            problems += unread
+        elif is_sweep or (isinstance(read, list) and read and not takes_list(key, text)):
+            values = read[0] if is_sweep and len(read) == 1 and isinstance(read[0], list) else read
             unique = list({json.dumps(value): value for value in values}.values())
             if key in found:
                 problems.append(place.problem("is swept twice; give all of its values at once"))
