@@ -10,8 +10,9 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.contracts.rules import BrokenContract, shown
 from photonpano.errors import PluginError
-from photonpano.motion.attribution import BrokenContract, attributing, shown
+from photonpano.motion.attribution import attributing
 from photonpano.protocols import Source
 from photonpano.source_wrapper import (
     ArrayT,

@@ -12,6 +12,8 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from photonpano.captures.part import part_of
+from photonpano.contracts.loop import require_groups
+from photonpano.contracts.rules import shown
 from photonpano.contributions import (
     ExecutorContext,
     ExporterContribution,
@@ -25,8 +27,7 @@ from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
 from photonpano.motion.attributed_source import attributed
-from photonpano.motion.attribution import attributing, shown
-from photonpano.motion.checks import require_groups
+from photonpano.motion.attribution import attributing
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.motion.recorder import Recorder
 from photonpano.protocols import ColouredSource, PoseEstimator, Resampler, Source, light_of

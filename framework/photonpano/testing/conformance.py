@@ -16,9 +16,9 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from photonpano.contracts.rules import BrokenContract
 from photonpano.contributions import Contribution, install_command
 from photonpano.errors import PluginError
-from photonpano.motion.attribution import BrokenContract
 from photonpano.registry import KINDS
 from photonpano.registry.plugins import contributions_of
 

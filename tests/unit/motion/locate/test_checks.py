@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
+from photonpano.contracts.information import why_undetermined
+from photonpano.contracts.loop import KNOTS, knot_errors, require_valid
+from photonpano.contracts.rules import BrokenContract
 from photonpano.geometry import jacobian, rescaled, translation
-from photonpano.motion.attribution import BrokenContract
-from photonpano.motion.checks import require_knots_kept, require_valid, why_undetermined
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -159,11 +160,11 @@ def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make
     )
 
 
-KNOTS = np.array([translation(5.0 * index, 0) for index in range(9)])
+PLACES = np.array([translation(5.0 * index, 0) for index in range(9)])
 
 
 def knots_kept(trajectory: Trajectory, std_px: float = 0.05) -> None:
-    require_knots_kept(trajectory, np.arange(0, 90, 10.0), KNOTS, np.full(9, std_px), (40, 60))
+    KNOTS.require(knot_errors(trajectory, np.arange(0, 90, 10.0), PLACES, np.full(9, std_px), (40, 60)))
 
 
 def test_trajectory_may_smooth_its_knots_and_miss_outliers(known_motion: type) -> None:
