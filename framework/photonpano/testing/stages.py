@@ -74,7 +74,8 @@ class AnswerConformance(StageConformance):
     def test_answers_keep_the_contract(self, rule: Rule) -> None:
         """See `photonpano.contracts`: a run refuses what breaks most of these rules, and converts or ignores the rest."""
         for complaint, broken in self._complaints():
-            assert broken is not rule, complaint
+            kept = broken is not rule
+            assert kept, complaint
 
     def _complaints(self) -> list[tuple[str, Rule]]:
         """Return what is wrong with each answer that breaks a rule; the component is called once for all rules."""

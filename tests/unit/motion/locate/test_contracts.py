@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,41 +15,10 @@ from photonpano.geometry import jacobian, rescaled, translation
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-BROKEN = [
-    (None, "expected Located or NotLocated, got NoneType"),
-    (np.eye(3), "expected Located or NotLocated, got ndarray"),
-    (
-        Located(np.full((3, 3), np.nan)),
-        "a homography is a finite (3, 3) matrix with h33 = 1, got [[nan, nan, nan], [nan, nan, nan], [nan, nan, nan]]; "
-        "a failure is NotLocated",
-    ),
-    (
-        Located(np.eye(2)),
-        "a homography is a finite (3, 3) matrix with h33 = 1, got [[1.0, 0.0], [0.0, 1.0]]; a failure is NotLocated",
-    ),
-    (
-        Located(np.diag([1.0, 1.0, 0.0])),
-        "a homography is a finite (3, 3) matrix with h33 = 1, got [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]; "
-        "a failure is NotLocated",
-    ),
-    *(
-        (
-            Located(np.eye(3), information),
-            "information is an inverse covariance: an (8, 8) matrix, finite and positive definite; None if there is none",
-        )
-        for information in (np.eye(9), -np.eye(8), np.zeros((8, 8)), np.full((8, 8), np.nan))
-    ),
-    (Located(translation(3, 1), evidence={"inliers": "many"}), "evidence consists of numbers, got inliers = 'many'"),
-    (NotLocated("lost", {"matches": [3, 4]}), "evidence consists of numbers, got matches = [3, 4]"),
-]
-
-
-@pytest.mark.parametrize(("answer", "problem"), BROKEN)
-def test_invalid_motion_is_refused_with_the_name_of_the_locator(
-    run: Callable, make_level: Callable, pan: Callable, answer: Any, problem: str
-) -> None:
+def test_invalid_motion_is_refused_with_the_name_of_the_locator(run: Callable, make_level: Callable, pan: Callable) -> None:
     with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.3), lambda *_: answer))
+        run(make_level(pan(0.3), lambda *_: None))
+    problem = "expected Located or NotLocated, got NoneType"
     assert str(caught.value) == f"locator 'toy' of toys 1.0 broke its contract at level 1: {problem}"
 
 
