@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeAlias
@@ -60,7 +61,7 @@ class AnswerConformance(StageConformance):
         """Parametrise the check of the contract with its rules."""
         if "rule" in metafunc.fixturenames:
             rules = self.rules()
-            metafunc.parametrize("rule", rules, ids=[sentence.replace("{}", "_") for sentence, _ in rules])
+            metafunc.parametrize("rule", rules, ids=[re.sub("{.*?}", "_", sentence) for sentence, _ in rules])
 
     @classmethod
     def rules(cls) -> list[Rule]:

@@ -32,7 +32,7 @@ from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion, MemorySource, Scene, pose_estimators
 from photonpano.testing.captures import recorded
 
-from .strange import FRAMES, KINDS, ORIGIN, SHAPE, Keys, Outcome
+from .strange import FRAMES, KINDS, ORIGIN, SHAPE, Keys, Outcome, without_config
 
 
 def cases(check: Callable, kit: Any) -> Iterator[dict[str, Any]]:
@@ -65,7 +65,7 @@ def failure(tmp_path: Path) -> Callable[..., str | None]:
     """
 
     def failure(kit: type, check: str, build: Any, record: dict[str, Any] | None = None, **attributes: Any) -> str | None:
-        fields = {"name": "toy", "summary": "A toy", "config": Keys, "build": lambda _, context: build(context)}
+        fields = {"name": "toy", "summary": "A toy", "config": Keys, "build": without_config(build)}
         contribution = OF_CATALOG[kit.kind].contribution(**fields | (record or {}))
         subject = type("TestToy", (kit,), {"contribution": contribution, **attributes})()
         if hasattr(subject, "prepare"):
