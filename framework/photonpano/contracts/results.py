@@ -178,13 +178,6 @@ def _elsewhere(found: PoseEstimate, stream: StreamInfo) -> object:
     return None
 
 
-def _infinite(found: PoseEstimate, _: StreamInfo) -> object:
-    for view in found.views:
-        if not (_are_rigid(view.camera_from_world[None]).all() and np.isfinite(view.xy).all()):
-            return (view.span,)
-    return None
-
-
 def _no_indices(view: PosedView, count: int) -> tuple[object, ...]:
     indices = np.asarray(view.points)
     whole = indices.ndim == 1 and indices.dtype.kind in "iu"
@@ -192,15 +185,17 @@ def _no_indices(view: PosedView, count: int) -> tuple[object, ...]:
     return () if right else (count - 1, shown(view.points))
 
 
-def _of_views(sentence: str, check: Callable[[PosedView, int], tuple[object, ...]]) -> Rule:
+def _of_views(sentence: str, check: Callable[[PosedView, int], object]) -> Rule:
     """Require something of every view, whose span comes first in the sentence.
 
     `check` takes a view and the number of points of the scene, and returns what else comes in the sentence if it is wrong.
     """
 
     def wrong(found: PoseEstimate, _: StreamInfo) -> object:
-        count = len(found.points.positions)
-        return next(((view.span, *rest) for view in found.views if (rest := check(view, count))), None)
+        for view in found.views:
+            if rest := check(view, len(found.points.positions)):
+                return view.span, *(rest if isinstance(rest, tuple) else ())
+        return None
 
     return sentence, wrong
 
@@ -232,12 +227,16 @@ POSES: Contract[PoseEstimate] = Contract(
             "expected the pose of the view of {} as float64 of the shape {}, got {}",
             lambda view, _: not_float64(view.camera_from_world, (3, 4)),
         ),
+        _of_views(
+            "the pose of the view of {} must be a finite rotation and translation",
+            lambda view, _: not _are_rigid(view.camera_from_world[None]).all(),
+        ),
         _of_views("the view of {} must show points 0 to {}, got {}", _no_indices),
         _of_views(
             "expected xy of the view of {} as float64 of the shape {}, got {}",
             lambda view, _: not_float64(view.xy, (len(view.points), 2)),
         ),
-        ("the view of {} must have a pose that is a finite rotation and translation, and finite xy", _infinite),
+        _of_views("xy of the view of {} must be finite", lambda view, _: not np.isfinite(view.xy).all()),
         ("frame {} is not located, and no entry of lost says why", _unexplained),
     ]
 )

@@ -259,6 +259,7 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
         "a view with half a pose": view(camera_from_world=lambda it: it.camera_from_world[:2]),
         "a view that is mirrored": view(camera_from_world=lambda it: -it.camera_from_world),
         "points that do not exist": view(points=lambda _: np.arange(1, 4)),
+        "a place that is infinite": view(xy=lambda it: it.xy * np.inf),
         "a place for every other point": view(xy=lambda _: np.zeros((2, 2))),
     },
     "source": {
