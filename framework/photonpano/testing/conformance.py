@@ -22,6 +22,7 @@ from photonpano.errors import PluginError
 from photonpano.registry import KINDS
 from photonpano.registry.plugins import contributions_of
 
+# Libraries that take long to import; numpy is allowed.
 HEAVY = frozenset(
     {
         "PIL",
@@ -48,7 +49,6 @@ HEAVY = frozenset(
         "zarr",
     }
 )
-"""Libraries that take long to import; numpy is allowed."""
 
 _MODULES_OF = """
 import importlib, importlib.util, json, runpy, sys

@@ -37,13 +37,13 @@ def _rolled(degrees: float) -> Homography:
     return np.asarray(centre @ turn @ np.linalg.inv(centre))
 
 
+# Maps from pixels of the moving image to pixels of the fixed one; the rotation is about the centre of 144x192 px.
 MOTIONS: Mapping[str, Homography] = {
     "sub-pixel shift": translation(0.3, -0.2),
     "shift": translation(13.25, -6.5),
     "rotation": translation(4.0, -2.0) @ _rolled(3.0),
     "homography": from_parameters([0.02, 0.006, -0.01, 0.03, -6.0, 3.5, 4e-5, -6e-5]),
 }
-"""Maps from pixels of the moving image to pixels of the fixed one; the rotation is about the centre of 144x192 px."""
 
 
 class LocatorConformance(AnswerConformance):
