@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.rules import BrokenContract, shown
 from photonpano.errors import PluginError
 from photonpano.protocols import (
     ColouredSource,
@@ -24,7 +26,6 @@ from photonpano.protocols import (
     Source,
     WeightedSource,
 )
-from photonpano.protocols.attribution import BrokenContract, attributing, shown
 from photonpano.values import Bayer, BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
 
 if TYPE_CHECKING:

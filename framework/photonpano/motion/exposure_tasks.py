@@ -8,8 +8,9 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeAlias
 
+from photonpano.contracts.information import why_undetermined
+from photonpano.contracts.loop import require_no_standstill, require_valid
 from photonpano.geometry import why_implausible
-from photonpano.motion.checks import require_no_standstill, require_valid, why_undetermined
 from photonpano.motion.closures import exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import FrameHomography, NamedLocator

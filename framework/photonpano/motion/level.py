@@ -9,8 +9,8 @@ from typing import Any, NewType
 
 import numpy as np
 
+from photonpano.contracts.attribution import attributing
 from photonpano.geometry import Camera, rescaled
-from photonpano.motion.attribution import attributing
 from photonpano.motion.recorder import Recorder
 from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler
 from photonpano.values import FloatArray, Located

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from photonpano.context import Context
-from photonpano.motion.checks import require_motion
+from photonpano.contracts.loop import why_still
+from photonpano.errors import PluginError
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.fallbacks import checked_fallbacks
 from photonpano.motion.graph import Evidence, GraphOptions, GraphSolution, components, solve
+from photonpano.motion.level import Level
 from photonpano.motion.merge import VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.tracking import starting_motion
 from photonpano.protocols import camera_of
+from photonpano.text import listed
 from photonpano.threads import thread_pool
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
@@ -103,7 +106,7 @@ def locate(
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
-        require_motion(level, edges, shape, partial(_seen_px, exposures, edges, context))
+        _require_motion(level, edges, shape, partial(_seen_px, exposures, edges, context))
         with exposures.clock("locate"), solving(level.number):
             edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
@@ -184,3 +187,15 @@ def _ambiguity(level: int, alternatives_px: Mapping[tuple[int, int], float], edg
     if not pairs:
         return None
     return Ambiguity(level, pairs, float(np.median([alternatives_px[pair] for pair in pairs])))
+
+
+def _require_motion(level: Level, edges: Sequence[Edge], shape: tuple[int, int], seen_px: Callable[[], float]) -> None:
+    """Refuse a level whose locators do not report their failures: see `why_still`."""
+    located = [(edge.locator, edge.motion.homography) for edge in edges if isinstance(edge.motion, Located)]
+    if problem := why_still([homography for _, homography in located], shape, seen_px):
+        names = {name for name, _ in located}
+        origins = listed(locator.origin for locator in level.locators if locator.name in names)
+        raise PluginError(
+            f"{origins} broke {'its' if len(names) == 1 else 'their'} contract at level {level.number}: {problem}; "
+            "a failure is NotLocated"
+        )

@@ -8,8 +8,8 @@ from functools import partial
 
 from photonpano.capture import seen_through
 from photonpano.context import Context
-from photonpano.motion.attribution import AttributedTrajectory
-from photonpano.motion.checks import require_groups, require_knots_kept
+from photonpano.contracts.attribution import AttributedTrajectory
+from photonpano.contracts.loop import KNOTS, knot_errors, require_groups
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level
@@ -137,7 +137,7 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
 
     def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:
         free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
-        require_knots_kept(free, times, homographies, located.std_px[knots], shape)
+        KNOTS.require(knot_errors(free, times, homographies, located.std_px[knots], shape))
         return free
 
     def fitted(knots: slice, times: FloatArray) -> Trajectory:

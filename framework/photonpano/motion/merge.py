@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.motion.checks import require_exposure
+from photonpano.contracts.loop import EXPOSURE, Asked
 from photonpano.motion.level import Level
 from photonpano.motion.timeline import Timeline
 from photonpano.protocols import Source, Trajectory
@@ -53,7 +53,7 @@ class VirtualExposures:
         level = self.level
         with self.clock("merge"), level.attributing("merger"):
             exposure = level.merger.merge(self.source, self.groups[index], self.previous, level.scale)
-            return require_exposure(exposure, self.groups[index], level.scale, self.frame_shape)
+            return EXPOSURE.require(exposure, Asked(self.groups[index], level.scale, self.frame_shape))
 
 
 def merge(

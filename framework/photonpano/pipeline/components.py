@@ -12,6 +12,9 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from photonpano.capture import Capture, capture_of, part_of
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.loop import require_groups
+from photonpano.contracts.rules import shown
 from photonpano.contributions import (
     ExecutorContext,
     ExporterContribution,
@@ -24,8 +27,6 @@ from photonpano.contributions import (
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
-from photonpano.motion.attribution import attributing, shown
-from photonpano.motion.checks import require_groups
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.motion.recorder import Recorder
 from photonpano.protocols import PoseEstimator, Resampler, Source, light_of

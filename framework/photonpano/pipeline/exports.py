@@ -10,10 +10,11 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.results import FILES
 from photonpano.errors import OutputError
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.panorama import RenderedPanorama
-from photonpano.motion.attribution import BrokenContract, attributing
 from photonpano.protocols import Exporter
 from photonpano.values import Homography, PanoramaRows
 
@@ -88,11 +89,7 @@ class AttributedExporter:
             except OSError as error:
                 reason = f"{path.name} could not be written ({error.strerror or error})"
                 raise OutputError(f"{reason}; what was in the run folder before is unchanged") from error
-            written = {each.name for each in folder.iterdir()} - before
-            if others := sorted(written - {path.name}):
-                raise BrokenContract(f"expected the one file {path.name}, got {', '.join(others)} as well")
-            if not path.is_file() or path.is_symlink() or not path.stat().st_size:
-                raise BrokenContract(f"expected a file {path.name} with content, got none")
+            FILES.require({each.name for each in folder.iterdir()} - before, path)
 
 
 def export_all(exporters: Iterable[AttributedExporter], folder: Path, panorama: RenderedPanorama) -> None:

@@ -7,13 +7,13 @@ import time
 from photonpano.captures.fingerprint import fingerprint
 from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Progress, usual
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.results import POSES
 from photonpano.errors import InputError
-from photonpano.motion.attribution import attributing
 from photonpano.pipeline.checkpoints.finished import finished_run
 from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.failed_run import reporting_failure
 from photonpano.pipeline.observers import Observers
-from photonpano.pipeline.pose_checks import require_estimate
 from photonpano.pipeline.pose_files import write_pose_files
 from photonpano.pipeline.run_steps import begun_run, first_decisions, require_centre, with_report
 from photonpano.poses import in_standard_world
@@ -91,4 +91,4 @@ def _estimated(plan: Plan, source: Source, decisions: list[Decision], progress: 
     require_centre(plan, source)
     estimator = build_pose_estimator(plan, source, decisions)
     with attributing(plan.pose.label, "the capture"):
-        return in_standard_world(require_estimate(estimator.estimate(source, camera_guess(plan), progress), source.info))
+        return in_standard_world(POSES.require(estimator.estimate(source, camera_guess(plan), progress), source.info))

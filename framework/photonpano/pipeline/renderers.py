@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.results import require_panorama
+from photonpano.contracts.rules import BrokenContract
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas
 from photonpano.merging import MergeRenderer
 from photonpano.merging.footprints import by_homographies
-from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.protocols import Renderer, Source, Trajectory, camera_of
 from photonpano.values import FrameSpan, Panorama
 
@@ -81,32 +83,3 @@ class AttributedRenderer:
         with attributing(self.origin, "the panorama"):
             if not coverage_share:
                 raise BrokenContract("no pixel has a positive weight")
-
-
-def require_panorama(found: object, canvas: Canvas) -> Panorama:
-    """Return what a renderer returned, in float32, once its type, shapes and values are checked.
-
-    Args:
-        found: what it returned.
-        canvas: the canvas that it was given.
-
-    Raises:
-        BrokenContract: it is no panorama on this canvas, or flux is not finite exactly where the weight is positive.
-    """
-    if not isinstance(found, Panorama):
-        raise BrokenContract(f"expected a Panorama, got {type(found).__name__}")
-    for name in ("flux", "weight"):
-        image = getattr(found, name)
-        if not isinstance(image, np.ndarray) or image.dtype.kind != "f" or image.shape != canvas.shape:
-            raise BrokenContract(f"{name} is {canvas.shape} of float32, got {shown(image)}")
-    if not np.array_equal(np.asarray(found.canvas), canvas.transform):
-        raise BrokenContract("the canvas of the panorama is the transform of the given canvas, got another one")
-    flux, weight = (np.ascontiguousarray(image, np.float32) for image in (found.flux, found.weight))
-    wrong = (np.isfinite(flux) != (weight > 0)) | (np.isinf(flux)) | ~(weight >= 0) | ~np.isfinite(weight)
-    if wrong.any():
-        row, column = np.argwhere(wrong)[0]
-        raise BrokenContract(
-            "flux is finite where weight is positive, and NaN where weight is 0; "
-            f"at row {row}, column {column} flux is {flux[row, column]:g} and weight {weight[row, column]:g}"
-        )
-    return Panorama(flux, weight, canvas.transform)

@@ -9,19 +9,20 @@ from functools import cached_property, partial
 import numpy as np
 
 from photonpano.context import Context
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.results import REFINED
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import BLOCK_FRAMES, Canvas, FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
 from photonpano.merging.panorama import render
-from photonpano.motion.attribution import BrokenContract, attributing, shown
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
-from photonpano.values import FloatArray, Panorama, Refined
+from photonpano.values import Panorama, Refined
 
 MAX_ROUNDS = 6
 """Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough."""
@@ -198,56 +199,13 @@ def _refined(refiner: NamedRefiner, source: Source, look: Look, number: int) -> 
         found = refiner.component.refine(source, motion.trajectory, std_px, look.residuals.steps(), look.predictions)
         if found is None:
             return None
-        require_refined(found, motion.std_px)
+        found = REFINED.require(found, motion.std_px)
         homographies = inverse(found.homographies[motion.reference]) @ found.homographies
         if motion.camera is not None:
             turned = nearest_rotations(motion.camera.rotations(homographies))
             return replace(found, homographies=motion.camera.homographies(turned[motion.reference].T @ turned))
         homographies /= homographies[:, 2:, 2:].copy()
         return replace(found, homographies=homographies)
-
-
-def require_refined(found: object, std_px: FloatArray) -> Refined:
-    """Return what a refiner returned, once its types, shapes and values are checked.
-
-    Args:
-        found: what it returned.
-        std_px: (T,) the expected errors that it was given.
-
-    Raises:
-        BrokenContract: it is no motion of T frames, or not one that can be inverted, or its expected errors are none.
-    """
-    if not isinstance(found, Refined):
-        raise BrokenContract(f"expected a Refined or None, got {type(found).__name__}")
-    for name in ("homographies", "std_px"):
-        array = getattr(found, name)
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-            raise BrokenContract(f"{name} are arrays of float64, got {shown(array)}")
-    if not isinstance(found.summary, str):
-        raise BrokenContract(f"the summary is a text, got {shown(found.summary)}")
-    n_frames = len(std_px)
-    shapes = np.shape(found.homographies), np.shape(found.std_px)
-    if shapes != ((n_frames, 3, 3), (n_frames,)):
-        raise BrokenContract(
-            f"the capture has {n_frames} frames: expected homographies of the shape ({n_frames}, 3, 3) and std_px of the "
-            f"shape ({n_frames},), got {shapes[0]} and {shapes[1]}"
-        )
-    bad = ~np.isfinite(found.homographies).all(axis=(1, 2)) | np.isnan(found.std_px) | (found.std_px < 0)
-    if bad.any():
-        raise BrokenContract(f"the motion of frame {int(np.argmax(bad))} is not finite, or its std_px is negative or NaN")
-    with np.errstate(all="ignore"):
-        singular = ~(np.abs(np.linalg.det(found.homographies)) > 0) | (found.homographies[:, 2, 2] == 0)
-    if singular.any():
-        first = int(np.argmax(singular))
-        matrix = found.homographies[first].tolist()
-        raise BrokenContract(f"a homography is invertible and has h33 = 1, that of frame {first} is {matrix}")
-    if (lost := np.isfinite(found.std_px) != np.isfinite(std_px)).any():
-        first = int(np.argmax(lost))
-        raise BrokenContract(
-            f"std_px is infinite exactly where it was before; that of frame {first} was {std_px[first]:g}, and is "
-            f"{found.std_px[first]:g}"
-        )
-    return found
 
 
 def _change_px(before: FrameMotion, after: FrameMotion) -> float:

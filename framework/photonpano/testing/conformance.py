@@ -16,12 +16,13 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from photonpano.contracts.rules import BrokenContract
 from photonpano.contributions import Contribution, install_command
 from photonpano.errors import PluginError
-from photonpano.motion.attribution import BrokenContract
 from photonpano.registry import KINDS
 from photonpano.registry.plugins import contributions_of
 
+# Libraries that take long to import; numpy is allowed.
 HEAVY = frozenset(
     {
         "PIL",
@@ -48,7 +49,6 @@ HEAVY = frozenset(
         "zarr",
     }
 )
-"""Libraries that take long to import; numpy is allowed."""
 
 _MODULES_OF = """
 import importlib, importlib.util, json, runpy, sys

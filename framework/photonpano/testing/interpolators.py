@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
 import pytest
 
+from photonpano.contracts.loop import HOMOGRAPHIES, KNOTS, knot_errors
 from photonpano.contributions import InterpolatorContribution
 from photonpano.geometry import corner_displacements, from_parameters, translation
-from photonpano.motion.checks import require_knots_kept
 from photonpano.protocols import Trajectory
 from photonpano.testing.captures import read_only
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, in_threads
-from photonpano.testing.stages import STREAM, StageConformance, accepts_read_only
+from photonpano.testing.stages import STREAM, Answer, AnswerConformance, accepts_read_only
 from photonpano.values import FloatArray
 
 INSTANTS = np.array([24.5, 130.0, 220.5, 340.0, 451.5, 560.0, 649.5, 780.0, 871.0])
 FAR = STREAM.n_frames
+# Standard deviations of p1..p8 of the knots around a pan of 0.15 px per frame.
 _SIZES = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0, 1e-6, 1e-6])
-"""Standard deviations of p1..p8 of the knots around a pan of 0.15 px per frame."""
-_PLACES = np.array([0.05, 0.2, 0.5, 0.85, 0.999])
-"""Positions between two knots, as shares of their distance."""
+_PLACES = np.array([0.05, 0.2, 0.5, 0.85, 0.999])  # between two knots, as shares of their distance
 
 
 def shaken_knots(seed: int = 0) -> FloatArray:
@@ -31,7 +31,7 @@ def shaken_knots(seed: int = 0) -> FloatArray:
     return from_parameters(tremor + np.outer(0.15 * INSTANTS, np.eye(8)[4]))
 
 
-class InterpolatorConformance(StageConformance):
+class InterpolatorConformance(AnswerConformance):
     """Checks of an interpolator.
 
     Attributes:
@@ -43,6 +43,7 @@ class InterpolatorConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "interpolator"
+    contracts = (HOMOGRAPHIES, KNOTS)
 
     contribution: InterpolatorContribution
     tolerance_px: float = 1e-3
@@ -53,6 +54,17 @@ class InterpolatorConformance(StageConformance):
         knots = INSTANTS[:n_knots].copy(), shaken_knots()[:n_knots], information
         trajectory: Trajectory = must_not_raise(f"fit() with {n_knots} knots", self.built().fit, *knots)
         return trajectory
+
+    def answers(self) -> Iterator[Answer]:
+        """Yield what trajectories of few and many knots return, also before the first knot and after the last."""
+        frames = np.linspace(-FAR, 2 * FAR, 301)
+        for n_knots in (1, 2, 3, len(INSTANTS)):
+            trajectory = self.fitted(n_knots)
+            found = np.asarray(trajectory.at(frames))
+            yield f"the homographies of {n_knots} knots", HOMOGRAPHIES, found, frames
+            if HOMOGRAPHIES.first_broken(found, frames) is None:
+                knots = INSTANTS[:n_knots], shaken_knots()[:n_knots], np.full(n_knots, 0.2)
+                yield f"the trajectory of {n_knots} knots", KNOTS, knot_errors(trajectory, *knots, STREAM.frame_shape), None
 
     @pytest.mark.parametrize("n_knots", [1, 2, 3, 4, len(INSTANTS)])
     def test_trajectory_passes_its_knots(self, n_knots: int) -> None:
@@ -74,33 +86,14 @@ class InterpolatorConformance(StageConformance):
             f"it is {worst:.3g} px off"
         )
 
-    @pytest.mark.parametrize("n_knots", [1, 2, 3, len(INSTANTS)])
-    def test_trajectory_is_defined_for_every_instant(self, n_knots: int) -> None:
-        """Frames before the first knot and after the last one are rendered, too."""
-        frames = np.linspace(-FAR, 2 * FAR, 301)
-        homographies = self.fitted(n_knots).at(frames)
-        undefined = frames[~np.isfinite(homographies).all(axis=(1, 2))]
-        assert not undefined.size, (
-            f"at() must be finite for every instant, also beyond the knots (here {n_knots}); it is not at {undefined[0]:g}"
-        )
-        singular = frames[np.linalg.det(homographies) <= 0]
-        assert not singular.size, f"at() must return invertible maps; at {singular[0]:g} it is not"
-
-    def test_homographies_have_h33_of_1(self) -> None:
-        """Later steps rely on this normalisation."""
-        h33 = self.fitted().at(np.linspace(-FAR, 2 * FAR, 301))[:, 2, 2]
-        worst = h33[np.abs(h33 - 1).argmax()]
-        assert abs(worst - 1) < 1e-9, f"homographies must have h33 = 1; at() returned one with {worst:.6g}: divide by it"
-
     def test_instants_are_independent_of_each_other(self) -> None:
         """In any order, as a list or an array, whole numbers or not."""
         trajectory = self.fitted()
         frames = [130, 24.5, 900.25, 130.0, -50, 455]
         together = trajectory.at(frames)
         assert isinstance(together, np.ndarray), f"at() must return an array, got a {type(together).__name__}"
-        shape, wanted = together.shape, (len(frames), 3, 3)
-        assert shape == wanted, f"at() must return (N, 3, 3) for N instants; for {len(frames)} instants it returned {shape}"
-        assert together.dtype == np.float64, f"geometry must be float64; at() returned {together.dtype}"
+        with passing(f"what at() returned for {len(frames)} instants"):
+            HOMOGRAPHIES.require(together, np.array(frames))
         for frame, homography in zip(frames, together, strict=True):
             apart = float(np.abs(trajectory.at(np.array([frame]))[0] - homography).max())
             assert apart < 1e-9, (
@@ -123,13 +116,6 @@ class InterpolatorConformance(StageConformance):
             f"a camera that moves evenly must be followed within tolerance_px = {self.tolerance_px:g}; with {n_knots} knots, "
             f"at instant {frames[errors.argmax()]:g} the trajectory is {worst:.3g} px off"
         )
-
-    @pytest.mark.parametrize("n_knots", [1, 2, 3, len(INSTANTS)])
-    def test_trajectory_passes_the_checks_of_a_run(self, n_knots: int) -> None:
-        """A run refuses a trajectory that has nothing to do with its knots, whatever it smooths."""
-        with passing(f"the trajectory of {n_knots} knots"):
-            std_px = np.full(n_knots, 0.2)
-            require_knots_kept(self.fitted(n_knots), INSTANTS[:n_knots], shaken_knots()[:n_knots], std_px, STREAM.frame_shape)
 
     def test_fit_leaves_inputs_unchanged(self) -> None:
         """The framework uses the knots again, for the report."""

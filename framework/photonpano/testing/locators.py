@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
+from photonpano.contracts.loop import LOCATED, NOT_LOCATED, contract_for
 from photonpano.contributions import LocatorContribution
 from photonpano.geometry import Camera, apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
-from photonpano.motion.checks import require_valid
 from photonpano.protocols import LocatesTurns
 from photonpano.testing.captures import photographed, read_only
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import copied, fingerprint, global_seed, in_threads
 from photonpano.testing.scenes import Scene
-from photonpano.testing.stages import StageConformance, accepts_read_only
+from photonpano.testing.stages import Answer, AnswerConformance, accepts_read_only
 from photonpano.values import FloatArray, Homography, Located, NotLocated, StreamInfo, VirtualExposure
 
 SHAPE = (144, 192)
 STILL = np.eye(3)
 _PLACE = translation(-400.0, 250.0)
-_PAIRS = 6
-"""Pairs whose errors are compared with the information, eight numbers each."""
+_PAIRS = 6  # pairs whose errors are compared with the information, eight numbers each
+_BLANK = {"flat": 0.4, "dark": 0.0, "saturated": 50.0, "unseen": 0.4}  # flux of images without texture
 
 
 def _rolled(degrees: float) -> Homography:
@@ -37,16 +37,16 @@ def _rolled(degrees: float) -> Homography:
     return np.asarray(centre @ turn @ np.linalg.inv(centre))
 
 
+# Maps from pixels of the moving image to pixels of the fixed one; the rotation is about the centre of 144x192 px.
 MOTIONS: Mapping[str, Homography] = {
     "sub-pixel shift": translation(0.3, -0.2),
     "shift": translation(13.25, -6.5),
     "rotation": translation(4.0, -2.0) @ _rolled(3.0),
     "homography": from_parameters([0.02, 0.006, -0.01, 0.03, -6.0, 3.5, 4e-5, -6e-5]),
 }
-"""Maps from pixels of the moving image to pixels of the fixed one; the rotation is about the centre of 144x192 px."""
 
 
-class LocatorConformance(StageConformance):
+class LocatorConformance(AnswerConformance):
     """Checks of a locator on pairs of exposures of 1,000 frames each.
 
     Attributes:
@@ -62,6 +62,7 @@ class LocatorConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "locator"
+    contracts = (LOCATED, NOT_LOCATED)
 
     contribution: LocatorContribution
     tolerance_px: float = 0.5
@@ -72,7 +73,8 @@ class LocatorConformance(StageConformance):
     information_factor: float = 3.0
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
-        """Parametrise checks with the motions of the locator."""
+        """Parametrise checks with the motions of the locator, and with the rules of the contract."""
+        super().pytest_generate_tests(metafunc)
         if "motion" in metafunc.fixturenames:
             metafunc.parametrize("motion", self.motions)
 
@@ -100,6 +102,15 @@ class LocatorConformance(StageConformance):
         )
         return found
 
+    def answers(self) -> Iterator[Answer]:
+        """Yield the answer for each motion, and for images without texture."""
+        for motion in self.motions:
+            found = self.registered(*pair(motion, self.shape), self._start(motion))
+            yield f"the answer for the {motion}", contract_for(found), found, None
+        for what in _BLANK:
+            found = self.registered(_blank(what, self.shape, 1), _blank(what, self.shape, 2))
+            yield f"the answer for {what} images", contract_for(found), found, None
+
     def test_homography_maps_moving_to_fixed(self) -> None:
         """Not the other way around."""
         self._require_motions()
@@ -111,16 +122,6 @@ class LocatorConformance(StageConformance):
             "the homography must map pixels of `moving` to pixels of `fixed`, and this one is the inverse: its error is "
             f"{forwards:.1f} px, and {backwards:.1f} px the other way around. Return its inverse"
         )
-
-    def test_homography_is_float64_with_h33_of_1(self) -> None:
-        """It is a (3, 3) array."""
-        self._require_motions()
-        for motion in self.motions:
-            matrix = self.located(motion, self._start(motion)).homography
-            assert isinstance(matrix, np.ndarray), f"a homography must be an array, got a {type(matrix).__name__}"
-            assert matrix.shape == (3, 3), f"a homography must be (3, 3), got {matrix.shape}"
-            assert matrix.dtype == np.float64, f"geometry must be float64, got a homography of {matrix.dtype}"
-            assert abs(matrix[2, 2] - 1) < 1e-9, f"a homography must have h33 = 1, got {matrix[2, 2]:.6g}: divide by it"
 
     def test_register_finds_motion_without_start(self, motion: str) -> None:
         """As at the first level."""
@@ -153,7 +154,7 @@ class LocatorConformance(StageConformance):
             "from no motion"
         )
 
-    @pytest.mark.parametrize("what", ["flat", "dark", "saturated", "unseen"])
+    @pytest.mark.parametrize("what", _BLANK)
     def test_image_without_texture_is_not_located(self, what: str) -> None:
         """Failure is a value with a reason, never an exception and never an identity matrix."""
         blank, other, scene = _blank(what, self.shape, 1), _blank(what, self.shape, 2), pair("shift", self.shape)[1]
@@ -194,17 +195,9 @@ class LocatorConformance(StageConformance):
             assert isinstance(found, Located), f"the {motion} must be located from the true start; not located: {found.reason}"
             if found.information is None:
                 pytest.skip("the locator has no information")
-            matrix = np.asarray(found.information)
-            assert matrix.shape == (8, 8), (
-                f"information must be (8, 8), one row for each of p1..p8; its shape is {matrix.shape}"
-            )
-            symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
-            assert symmetric, "information must be symmetric, as every inverse covariance is"
-            # In px of corners, all parameters have the same scale.
-            to_corners = jacobian(found.homography, frame).reshape(8, 8)
-            from_corners = np.linalg.inv(to_corners)
-            values = np.linalg.eigvalsh(from_corners.T @ matrix @ from_corners)
-            assert values.min() > 0, f"information must be positive definite; its smallest eigenvalue is {values.min():.3g}"
+            with passing("the answer for a pair"):
+                LOCATED.require(found)
+            matrix, to_corners = found.information, jacobian(found.homography, frame).reshape(8, 8)
             # Expected corner error, given the parameters that are not estimated, which are exact here.
             covariance = np.linalg.inv(matrix[np.ix_(free, free)])
             predicted.append(np.trace(to_corners[:, free] @ covariance @ to_corners[:, free].T))
@@ -216,23 +209,6 @@ class LocatorConformance(StageConformance):
             f"{_PAIRS} pairs the corner error is {actual_px:.3g} px, and it predicts {expected_px:.3g} px "
             f"(they may differ by a factor of {self.information_factor:g})"
         )
-
-    def test_answers_pass_the_checks_of_a_run(self) -> None:
-        """A run refuses matrices, residuals, information and evidence that are no finite real numbers."""
-        found: dict[str, Any] = {f"the {motion}": self.located(motion, self._start(motion)) for motion in self.motions}
-        found["flat images"] = self.registered(_blank("flat", self.shape, 1), _blank("flat", self.shape, 2))
-        for what, answer in found.items():
-            with passing(f"the answer for {what}"):
-                require_valid(answer)
-
-    def test_residual_and_evidence_are_finite(self) -> None:
-        """They are written to `run.json` and to messages."""
-        located = [self.located(motion, self._start(motion)) for motion in self.motions[:1]]
-        for found in (*located, self.registered(_blank("flat", self.shape, 1), _blank("flat", self.shape, 2))):
-            wrong = {key: value for key, value in found.evidence.items() if not np.isfinite(value)}
-            assert not wrong, f"evidence must be finite numbers by name; got {wrong}"
-            residual = getattr(found, "residual_px", None)
-            assert residual is None or 0 <= residual < np.inf, f"residual_px must be a finite number or None, got {residual}"
 
     def test_turning_locates_turns_and_nothing_else(self) -> None:
         """A shift is a turn before a camera of long focal length."""
@@ -251,7 +227,7 @@ class LocatorConformance(StageConformance):
                 continue
             assert isinstance(found, Located), f"a turn must be located; not located: {found.reason}"
             with passing("the answer for a turn"):
-                require_valid(found)
+                LOCATED.require(found)
             error = self._error(found.homography, MOTIONS["shift"])
             assert error <= self.tolerance_px, f"a turn is {error:.2f} px off (tolerance_px = {self.tolerance_px:g})"
 
@@ -341,8 +317,7 @@ def pair(motion: str, shape: tuple[int, int] = SHAPE, seed: int = 0) -> tuple[Vi
 
 
 def _blank(what: str, shape: tuple[int, int], seed: int) -> VirtualExposure:
-    flux = {"flat": 0.4, "dark": 0.0, "saturated": 50.0, "unseen": 0.4}[what]
-    return photographed(np.full(shape, flux), seed=seed, unseen=np.full(shape, what == "unseen"))
+    return photographed(np.full(shape, _BLANK[what]), seed=seed, unseen=np.full(shape, what == "unseen"))
 
 
 def _read_only(exposure: VirtualExposure) -> VirtualExposure:

@@ -10,34 +10,29 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonpano.contracts.loop import EXPOSURE, Asked
 from photonpano.contributions import MergerContribution
 from photonpano.errors import InputError
 from photonpano.geometry import translation
-from photonpano.motion.checks import require_exposure
 from photonpano.protocols import Merger, Source, Trajectory
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
-from photonpano.testing.conformance import passing
 from photonpano.testing.sameness import copied, fingerprint, in_threads
 from photonpano.testing.scenes import Scene
-from photonpano.testing.stages import StageConformance, accepts_read_only
+from photonpano.testing.stages import Answer, AnswerConformance, accepts_read_only
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, FrameSpan, Group, Homography, VirtualExposure
 
 SHAPE = (40, 56)
 N_FRAMES = 240
 GROUP = Group(FrameSpan(20, 220), 119.5)
-EARLY = Group(FrameSpan(20, 220), 40.0)
-"""A group whose reference is near its beginning."""
+EARLY = Group(FrameSpan(20, 220), 40.0)  # its reference is near its beginning
 _STILL = np.array([[1, 0, 300.0], [0, 1, -80.0], [0, 0, 1]])
-_Z = 4.5
-"""Standard errors of a significant bias: noise exceeds them once in 150,000 times."""
+_Z = 4.5  # standard errors of a significant bias: noise exceeds them once in 150,000 times
 _BANDS = 4
-_DARK_RATE = np.float64(0.2)
-"""Dark counts per pixel per frame."""
-_MARGIN = 8
-"""Width of the border that few frames of the moving camera see, px."""
+_DARK_RATE = np.float64(0.2)  # dark counts per pixel per frame
+_MARGIN = 8  # width of the border that few frames of the moving camera see, px
 
 
-class MergerConformance(StageConformance):
+class MergerConformance(AnswerConformance):
     """Checks of a merger on binary frames of 40x56 px, of a still camera and of one that pans and rolls.
 
     Attributes:
@@ -50,6 +45,7 @@ class MergerConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "merger"
+    contracts = (EXPOSURE,)
 
     contribution: MergerContribution
     tolerance_px: float = 0.1
@@ -69,56 +65,14 @@ class MergerConformance(StageConformance):
         exposure: VirtualExposure = self.built(source.info, threads).merge(source, group, trajectory, scale)
         return exposure
 
-    def _cases(self) -> Iterator[tuple[str, VirtualExposure, float]]:
+    def answers(self) -> Iterator[Answer]:
+        """Yield exposures of all scales, merged with and without a motion."""
+        source = MemorySource(moving_frames(), dead_pixels())
         for scale in self.scales:
+            asked = Asked(GROUP, scale, SHAPE, source.response)
             for what, trajectory in (("no motion", None), ("a known motion", MOTION)):
-                source = MemorySource(moving_frames(), dead_pixels())
-                yield f"{what} and scale {scale:g}", self.merged(source, GROUP, trajectory, scale), scale
-
-    def test_exposure_has_scaled_frame_shape(self) -> None:
-        """Flux and weight are float32, on the rescaled grid of a frame."""
-        for where, exposure, scale in self._cases():
-            assert isinstance(exposure, VirtualExposure), (
-                f"merge() must return a VirtualExposure, got a {type(exposure).__name__}"
-            )
-            wanted = tuple(round(side * scale) for side in SHAPE)
-            for name, image in (("flux", exposure.flux), ("weight", exposure.weight)):
-                assert image.shape == wanted, (
-                    f"with {where}, {name} must have the shape {wanted}, got {image.shape}; "
-                    "set scales = (1.0,) if no other is supported"
-                )
-                assert image.dtype == np.float32, f"with {where}, {name} must be float32, got {image.dtype}"
-
-    def test_exposure_names_group_scale_and_response(self) -> None:
-        """Later stages rely on these attributes."""
-        source = MemorySource(still_frames())
-        for scale in self.scales:
-            exposure = self.merged(source, GROUP, None, scale)
-            named = exposure.group, exposure.scale, exposure.response
-            assert named == (GROUP, scale, source.response), (
-                f"an exposure must have the given group and scale, and the response of the source; got {named}"
-            )
-
-    def test_exposures_pass_the_checks_of_a_run(self) -> None:
-        """A run refuses an exposure of another group, scale or shape, and one whose flux and weight do not go together."""
-        for where, exposure, scale in self._cases():
-            with passing(f"the exposure with {where}"):
-                require_exposure(exposure, GROUP, scale, SHAPE)
-
-    def test_flux_is_nan_exactly_where_weight_is_0(self) -> None:
-        """Unknown pixels are NaN with weight 0; all others are finite and not negative."""
-        for where, exposure, _ in self._cases():
-            unknown, unseen = np.isnan(exposure.flux), exposure.weight == 0
-            wrong = int((unknown & ~unseen).sum()), int((unseen & ~unknown).sum())
-            assert wrong == (0, 0), (
-                f"flux must be NaN exactly where the weight is 0; with {where}, {wrong[0]} pixels are NaN and have a weight, "
-                f"and {wrong[1]} have a flux and weight 0"
-            )
-            known = exposure.flux[~unknown]
-            finite = bool(np.isfinite(known).all() and np.isfinite(exposure.weight).all())
-            assert finite, f"with {where}, flux or weight is infinite at some pixels; response.flux() is always finite"
-            least = min(float(known.min()), float(exposure.weight.min()))
-            assert least >= 0, f"with {where}, flux or weight is negative at some pixels, at least {least:.3g}"
+                described = f"the exposure with {what} and scale {scale:g}, one of `scales`"
+                yield described, EXPOSURE, self.merged(source, GROUP, trajectory, scale), asked
 
     def test_weight_is_number_of_frames(self) -> None:
         """A still camera sees every pixel in all frames of the group."""
@@ -309,8 +263,7 @@ def _to_scene(frame: float) -> Homography:
     return np.asarray(translation(300 + 0.1 * frame, -80 + 0.04 * frame) @ centre @ roll @ np.linalg.inv(centre))
 
 
-MOTION = KnownMotion(_to_scene)
-"""Pixels of a frame of the moving camera to points of the scene."""
+MOTION = KnownMotion(_to_scene)  # pixels of a frame of the moving camera to points of the scene
 SCENE = Scene(seed=3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from typing import Any, ClassVar
@@ -10,23 +11,23 @@ import cv2
 import numpy as np
 
 from photonpano.context import Quiet
+from photonpano.contracts.results import POSES
 from photonpano.contributions import PoseEstimatorContribution
 from photonpano.errors import LocationError
 from photonpano.evaluation import pose_errors
 from photonpano.geometry import camera_matrix, rotation_matrices
-from photonpano.pipeline.pose_checks import require_estimate
 from photonpano.poses import in_standard_world
 from photonpano.testing.captures import MemorySource, ReadOnlySource
 from photonpano.testing.conformance import must_not_raise, passing
-from photonpano.testing.stages import StageConformance
+from photonpano.testing.stages import Answer, AnswerConformance
 from photonpano.values import CameraGuess, FloatArray, PoseEstimate
 
 SHAPE = (128, 160)
 FOCAL_PX = 150.0
 N_FRAMES = 320
 _MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
+# Depth, and left, top, right and bottom edge, in m: the farthest first.
 _PLANES = ((6.0, (-4, -4, 4, 4)), (3.5, (-1.6, -1.0, -0.5, 0.6)), (4.2, (0.4, -1.2, 1.6, 0.1)), (3.0, (-0.3, 0.2, 1.0, 1.1)))
-"""Depth, and left, top, right and bottom edge, in m: the farthest first."""
 
 
 def true_poses(travels: bool = True) -> FloatArray:
@@ -60,7 +61,7 @@ def capture(travels: bool = True) -> MemorySource:
     return ReadOnlySource(frames)
 
 
-class PoseEstimatorConformance(StageConformance):
+class PoseEstimatorConformance(AnswerConformance):
     """Checks of a pose estimator.
 
     Attributes:
@@ -72,22 +73,30 @@ class PoseEstimatorConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "pose-estimator"
+    contracts = (POSES,)
 
     contribution: PoseEstimatorContribution
     tolerance: float = 0.03
     tolerance_deg: float = 2.0
     std_factor: float = 3.0
-    _first: ClassVar[PoseEstimate]
+    _first: ClassVar[Any]
 
-    def estimated(self, travels: bool = True) -> PoseEstimate:
-        """Estimate the poses of the capture, as a run does."""
+    def estimated(self, travels: bool = True) -> Any:
+        """Estimate the poses of the capture."""
         source = capture(travels)
         estimator: Any = self.built(source.info)
-        with passing("what estimate() returned"):
-            return require_estimate(estimator.estimate(source, CameraGuess(FOCAL_PX), Quiet()), source.info)
+        return estimator.estimate(source, CameraGuess(FOCAL_PX), Quiet())
+
+    def answers(self) -> Iterator[Answer]:
+        """Yield the estimate."""
+        yield "what estimate() returned", POSES, self._first_answer(), capture().info
 
     def first_estimate(self) -> PoseEstimate:
         """Estimate the poses once for several checks."""
+        with passing("what estimate() returned"):
+            return POSES.require(self._first_answer(), capture().info)
+
+    def _first_answer(self) -> Any:
         if "_first" not in type(self).__dict__:
             type(self)._first = must_not_raise("estimate() of a capture with texture and parallax", self.estimated)
         return type(self)._first

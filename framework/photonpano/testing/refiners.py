@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar
@@ -10,29 +11,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonpano.contracts.results import REFINED
 from photonpano.contributions import RefinerContribution
 from photonpano.geometry import corner_displacements, translation
 from photonpano.protocols import Source, Trajectory
-from photonpano.residuals.refinement import require_refined
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, read_only, recorded
-from photonpano.testing.conformance import must_not_raise, passing
+from photonpano.testing.conformance import must_not_raise
 from photonpano.testing.sameness import fingerprint
 from photonpano.testing.scenes import Scene
-from photonpano.testing.stages import StageConformance, accepts_read_only
+from photonpano.testing.stages import Answer, AnswerConformance, accepts_read_only
 from photonpano.values import FloatArray, FrameSpan, Refined, SpanResiduals
 
 SHAPE = (32, 48)
 FRAMES = 512
-LOCATED = FrameSpan(16, 488)
-"""The frames that were located: the expected error of the others is infinite."""
+LOCATED = FrameSpan(16, 488)  # the frames that were located: the expected error of the others is infinite
 SPAN_FRAMES = 8
 REFERENCE = 256
 TREMOR_PX = 1.5
 PERIOD_FRAMES = 64
-SHARE_OF_NOISE = 0.4
-"""The expected error of the motion that refiners are given, as a share of the error of the shift of a span."""
-TOLERANCE = 4.0
-"""The largest correction of a motion without error, in expected errors."""
+SHARE_OF_NOISE = 0.4  # expected error of the motion that refiners are given, over the error of the shift of a span
+TOLERANCE = 4.0  # largest correction of a motion without error, in expected errors
 
 
 class SeenScene:
@@ -100,7 +98,7 @@ def measured(source: Source, view: SeenScene, spans: tuple[FrameSpan, ...]) -> S
     return SpanResiduals(spans, read_only(np.array(steps)), read_only(np.array(information)))
 
 
-class RefinerConformance(StageConformance):
+class RefinerConformance(AnswerConformance):
     """Checks of a refiner.
 
     The capture has 512 binary frames of 32x48 px, of which 472 are located, and residuals of spans of 8 frames. Its frame rate
@@ -112,57 +110,24 @@ class RefinerConformance(StageConformance):
     """
 
     kind: ClassVar[str] = "refiner"
+    contracts = (REFINED,)
 
     contribution: RefinerContribution
 
     def refined(self, given: Case) -> Refined | None:
-        """Refine the motion of a case, and require the promised arrays."""
+        """Refine the motion of a case."""
         refiner = self.built(given.source.info)
         found: Refined | None = must_not_raise(
             "refine()", refiner.refine, given.source, given.trajectory, given.std_px, given.residuals, given.view
         )
-        if found is not None:
-            assert isinstance(found, Refined), f"refine() must return a Refined or None, got a {type(found).__name__}"
         return found
 
-    @pytest.mark.parametrize("tremor_px", [0.0, TREMOR_PX])
-    def test_refined_homographies_are_finite_with_h33_of_1(self, tremor_px: float) -> None:
-        """One for each frame of the capture, also for those that were not located."""
-        if (found := self.refined(case(tremor_px))) is None:
-            return
-        homographies = found.homographies
-        shape, wanted = np.shape(homographies), (FRAMES, 3, 3)
-        assert shape == wanted, f"homographies must have the shape {wanted}, one for each frame of the capture; got {shape}"
-        assert homographies.dtype == np.float64, f"geometry must be float64; homographies are {homographies.dtype}"
-        bad = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
-        assert not bad.size, f"homographies must be finite; that of frame {bad[0]} is {homographies[bad[0]].tolist()}"
-        h33 = homographies[:, 2, 2]
-        worst = h33[np.abs(h33 - 1).argmax()]
-        assert abs(worst - 1) < 1e-9, f"homographies must have h33 = 1; one has {worst:.6g}: divide by it"
-
-    @pytest.mark.parametrize("tremor_px", [0.0, TREMOR_PX])
-    def test_refined_motion_passes_the_checks_of_a_run(self, tremor_px: float) -> None:
-        """A run refuses arrays of other types, and homographies that cannot be inverted."""
-        given = case(tremor_px)
-        if (found := self.refined(given)) is not None:
-            with passing("the refined motion"):
-                require_refined(found, given.std_px)
-
-    @pytest.mark.parametrize("tremor_px", [0.0, TREMOR_PX])
-    def test_expected_errors_are_kept_infinite_where_nothing_was_located(self, tremor_px: float) -> None:
-        """The expected error of a frame is not negative; it is infinite where nothing was located, and only there."""
-        given = case(tremor_px)
-        if (found := self.refined(given)) is None:
-            return
-        shape = np.shape(found.std_px)
-        assert shape == (FRAMES,), f"std_px must have the shape ({FRAMES},), a value for each frame; got {shape}"
-        bad = np.flatnonzero(~(found.std_px >= 0))
-        assert not bad.size, f"std_px must not be negative or NaN; that of frame {bad[0]} is {found.std_px[bad[0]]:g}"
-        other = np.flatnonzero(np.isfinite(found.std_px) != np.isfinite(given.std_px))
-        assert not other.size, (
-            f"std_px must be infinite exactly where the given one is; for frame {other[0]} it is {found.std_px[other[0]]:g}, "
-            f"and {given.std_px[other[0]]:g} was given"
-        )
+    def answers(self) -> Iterator[Answer]:
+        """Yield the refined motion of a still camera, and of one with a tremor."""
+        for tremor_px in (0.0, TREMOR_PX):
+            given = case(tremor_px)
+            if (found := self.refined(given)) is not None:
+                yield f"the refined motion with a tremor of {tremor_px:g} px", REFINED, found, given.std_px
 
     @pytest.mark.parametrize("tremor_px", [0.0, TREMOR_PX])
     def test_reference_frame_stays_the_identity(self, tremor_px: float) -> None:
@@ -174,14 +139,6 @@ class RefinerConformance(StageConformance):
             f"the homography of the reference frame, here {REFERENCE}, must stay the identity; it differs by {apart:.3g}: "
             "multiply all homographies by its inverse, from the left"
         )
-
-    def test_summary_is_one_line(self) -> None:
-        """It is logged, and recorded in `run.json`."""
-        if (found := self.refined(case(TREMOR_PX))) is None:
-            return
-        assert isinstance(found.summary, str), f"the summary must be text, got a {type(found.summary).__name__}"
-        line = " ".join(found.summary.split())
-        assert line == found.summary != "", f"the summary must be one line that says what was corrected, got {found.summary!r}"
 
     def test_photon_noise_is_not_corrected(self) -> None:
         """Where the motion is right, the residuals are photon noise: `None`, or a correction within the expected error."""

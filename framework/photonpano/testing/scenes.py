@@ -10,8 +10,8 @@ from photonpano.values import FloatArray, Homography
 
 _WAVES = 64
 _PERIODS_PX = (6.0, 120.0)
+# Slope of the sigmoid that limits the sum of waves to the range of the flux, and gives blobs and edges.
 _CONTRAST = 2.5
-"""Slope of the sigmoid that limits the sum of waves to the range of the flux, and gives blobs and edges."""
 
 
 class Scene:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar, TypeAlias
 
+import pytest
+
+from photonpano.contracts.rules import Contract, Rule
 from photonpano.contributions import StageContext, StageContribution
 from photonpano.errors import CaptureUnreadError
 from photonpano.photometry import BinaryResponse
 from photonpano.testing.conformance import Conformance
 from photonpano.values import CaptureSummary, DecisionValue, StreamInfo
 
-STREAM = StreamInfo(2000, 254, 496, frame_rate_hz=96_800.0)
-"""The capture for which components are built by default."""
+STREAM = StreamInfo(2000, 254, 496, frame_rate_hz=96_800.0)  # the capture for which components are built by default
 SUMMARY = CaptureSummary(flux=0.5, speed_px=0.15, how="set by the conformance kit")
+# What a component returned, described for messages; its contract; the value; and the facts for the contract.
+Answer: TypeAlias = tuple[str, Contract[Any], Any, Any]
 
 
 class StageConformance(Conformance):
@@ -44,6 +49,45 @@ class StageConformance(Conformance):
         problems = self.contribution.check(self.settings(), STREAM)
         assert not isinstance(problems, str), f"check() must return a sequence of sentences, got the text {problems!r}"
         assert not list(problems), f"check() must accept the config under test for {STREAM}; it returned: {'; '.join(problems)}"
+
+
+class AnswerConformance(StageConformance):
+    """Checks of components whose answers have a contract: one check for each of its rules."""
+
+    contracts: ClassVar[tuple[Contract[Any], ...]]
+    _verdicts: ClassVar[tuple[str, list[tuple[str, Rule]]]]
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Parametrise the check of the contract with its rules."""
+        if "rule" in metafunc.fixturenames:
+            rules = self.rules()
+            metafunc.parametrize("rule", rules, ids=[re.sub("{.*?}", "_", sentence) for sentence, _ in rules])
+
+    @classmethod
+    def rules(cls) -> list[Rule]:
+        """Return the rules of all contracts, each once."""
+        return list(dict.fromkeys(rule for contract in cls.contracts for rule in (*contract.rules, *contract.strict)))
+
+    def answers(self) -> Iterator[Answer]:
+        """Yield what the component returns for several inputs."""
+        raise NotImplementedError
+
+    def test_answers_keep_the_contract(self, rule: Rule) -> None:
+        """See `photonpano.contracts`: a run refuses what breaks most of these rules, and converts or ignores the rest."""
+        for complaint, broken in self._complaints():
+            kept = broken is not rule
+            assert kept, complaint
+
+    def _complaints(self) -> list[tuple[str, Rule]]:
+        """Return what is wrong with each answer that breaks a rule; the component is called once for all rules."""
+        key, kept = repr(self.config), type(self).__dict__.get("_verdicts")
+        if kept is None or kept[0] != key:
+            kept = type(self)._verdicts = key, []
+            for what, contract, found, facts in self.answers():
+                if broken := contract.first_broken(found, facts):
+                    refused = f"a run refuses {what}" if broken[0] in contract.rules else f"{what} breaks the contract"
+                    kept[1].append((f"{refused}: {broken[1]}", broken[0]))
+        return kept[1]
 
 
 class _Summary:

@@ -10,7 +10,7 @@ import pytest
 
 from photonpano import FrameSpan, InputError, KnowsSharpViews, KnowsTruth, LinearlyCorrectedSource, PackedSource, PluginError
 from photonpano.capture import capture_of
-from photonpano.motion.attribution import AttributedTrajectory
+from photonpano.contracts.attribution import AttributedTrajectory
 from photonpano.protocols import ColouredSource
 
 ORIGIN = "source 'toy' of toys 1.0"

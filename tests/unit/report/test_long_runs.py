@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from photonpano import Refined
+from photonpano.contracts.results import REFINED
 from photonpano.geometry import FrameTrajectory, nearest_rotations, steps_px
 from photonpano.merging import chunks_of
 from photonpano.merging.canvas_plan import plan_canvas
@@ -23,7 +24,7 @@ from photonpano.pipeline.run_folder import run_folder
 from photonpano.report import render_report
 from photonpano.report.viewer import shared_instant
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.refinement import Explained, require_refined
+from photonpano.residuals.refinement import Explained
 from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, standing_out, unexplained_px
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.refiners.short_spans import ShortSpansRefiner
@@ -105,7 +106,7 @@ def bytes_a_frame(work: Callable[[End], object], ends: tuple[End, End]) -> float
         pytest.param(lambda end: bounded_std_px(end.motion.std_px, end.residuals), 80, id="bounds"),
         pytest.param(End.refined, 150, id="refinement"),
         pytest.param(
-            lambda end: require_refined(Refined(end.motion.homographies, end.motion.std_px, ""), end.motion.std_px),
+            lambda end: REFINED.require(Refined(end.motion.homographies, end.motion.std_px, ""), end.motion.std_px),
             40,
             id="check",
         ),

@@ -46,7 +46,7 @@ def test_subclass_is_collected_and_reports_failure(pytester, monkeypatch):
     pytester.syspathinsert()
     pytester.makepyfile(toy=TOY, test_toy=TESTS)
     result = pytester.runpytest_inprocess("-p", "no:cacheprovider")
-    result.assert_outcomes(passed=17, failed=2)
+    result.assert_outcomes(passed=18, failed=2)
     result.stdout.fnmatch_lines(
         ["*AssertionError: groups() must raise an InputError if a capture is too short; with 1 frames it raised Value*"]
     )

@@ -3,18 +3,39 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import count
 from typing import Any
 
 import pytest
 
-from photonpano import hookimpl
+from photonpano import FrameSpan, hookimpl
 from photonpano.errors import described
 from photonpano.registry import Observer
 from photonpano.registry.plugins import observation_of
 from photonpano.testing import KnownMotion
 
-from .strange import ERRORS, ORIGIN, Odd, Outcome, instead, raising, require_named
+from .strange import ERRORS, ORIGIN, Around, Odd, Outcome, around, instead, raising, require_named
+
+
+def failing_at(start: int, stop: int, error: BaseException) -> Callable[[Any], Any]:
+    """Return a source that cannot read one span."""
+
+    def counts(inner: Any, span: FrameSpan) -> Any:
+        return raising(error)() if span == FrameSpan(start, stop) else inner.counts(span)
+
+    return lambda inner: Around(inner, counts=partial(counts, inner))
+
+
+def failing_later(error: BaseException) -> Callable[[Any], Any]:
+    """Return an interpolator whose trajectory fails after the two calls of the check that follows the fit."""
+
+    def at(found: Any, calls: Iterator[int], frames: Any) -> Any:
+        return found.at(frames) if next(calls) < 2 else raising(error)()
+
+    return around("fit", lambda found, *_: Around(found, at=partial(at, found, count())))
+
 
 PLACES: Mapping[str, tuple[str, Callable[[BaseException], Callable[[Any], Any]], str]] = {
     "build a source": ("source", raising, "could not be built: "),
@@ -30,6 +51,9 @@ PLACES: Mapping[str, tuple[str, Callable[[BaseException], Callable[[Any], Any]],
         lambda error: instead("fit", lambda *_: KnownMotion(raising(error))),
         "failed at level 1: ",
     ),
+    "at, after the fit": ("interpolator", lambda error: failing_later(error), "failed at level 1: "),
+    "counts of a group": ("source", lambda error: failing_at(40, 80, error), "failed at frames 40 to 79: "),
+    "counts of a rendered frame": ("source", lambda error: failing_at(150, 151, error), "failed at frame 150: "),
     "refine": ("refiner", lambda error: instead("refine", raising(error)), "failed at round 1: "),
     "render": ("renderer", lambda error: instead("render", raising(error)), "failed at the panorama: "),
     "build a pose estimator": ("pose-estimator", raising, "could not be built: "),

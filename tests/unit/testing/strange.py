@@ -23,8 +23,8 @@ from photonpano.registry import Origin
 
 ORIGIN = Origin("strange-plugin", "1.2", "strange = strange.hooks")
 SHAPE, FRAMES = (48, 64), 160
-NOTHING: Any = None
-"""What a plugin that is not typed gives instead of a text."""
+NOTHING: Any = None  # what a plugin that is not typed gives instead of a text
+# The section that chooses a kind, its contribution, and the component that the strange one is built around.
 KINDS: Mapping[str, tuple[str, Any, str]] = {
     "source": ("source", SourceContribution, "memory"),
     "resampler": ("resample", ResamplerContribution, "midpoint"),
@@ -35,11 +35,15 @@ KINDS: Mapping[str, tuple[str, Any, str]] = {
     "renderer": ("render", RendererContribution, "merge"),
     "pose-estimator": ("pose", PoseEstimatorContribution, "known-path"),
 }
-"""The section that chooses a kind, its contribution, and the component that the strange one is built around."""
 
 
 class Keys(Config):
     """No keys."""
+
+
+def without_config(build: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return the build function of a contribution without keys; checks of the kit import its module alone."""
+    return lambda _, context: build(context)
 
 
 class Odd(BaseException):
@@ -52,6 +56,7 @@ class SpeechlessError(Exception):
 
 
 ERRORS: Mapping[str, tuple[BaseException, str]] = {
+    "an error": (RuntimeError("the cable came loose"), "RuntimeError: the cable came loose"),
     "sys.exit": (SystemExit(0), "SystemExit: 0"),
     "KeyboardInterrupt": (KeyboardInterrupt(), "KeyboardInterrupt"),
     "BaseException": (Odd("stop"), "Odd: stop"),
@@ -78,7 +83,14 @@ class Around:
 
 def around(method: str, change: Callable[..., Any]) -> Callable[[Any], Any]:
     """Return what replaces a method of a good component: `change` gets what the good method returns, and its arguments."""
-    return lambda inner: Around(inner, **{method: lambda *given: change(getattr(inner, method)(*given), *given)})
+    return lambda inner: Around(inner, **{method: lambda *all_, **named: change(getattr(inner, method)(*all_, **named), *all_)})
+
+
+def given(method: str, change: Callable[..., tuple[Any, ...]]) -> Callable[[Any], Any]:
+    """Return what replaces a method of a good component: `change` makes of its arguments those that the good method gets."""
+    return lambda inner: Around(
+        inner, **{method: lambda *all_, **named: getattr(inner, method)(*change(*all_, *named.values()))}
+    )
 
 
 def instead(method: str, answer: Callable[..., Any]) -> Callable[[Any], Any]:
@@ -99,14 +111,9 @@ def holed(image: np.ndarray, value: float) -> np.ndarray:
     return image
 
 
-def cases_of(kinds: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> Mapping[str, tuple[Any, ...]]:
-    """Return the cases of all kinds by an id, each with its kind before it."""
-    return {f"{kind}: {name}": (kind, *case) for kind, cases in kinds.items() for name, case in cases.items()}
-
-
 @dataclass(frozen=True)
 class Outcome:
-    """What the command `run` ends with: its exit code, what it prints, and the files that it leaves."""
+    """What the command `run` ends with: its exit code, what it prints, and the files of the run folder that it wrote."""
 
     code: int
     printed: str

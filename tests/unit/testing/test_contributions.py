@@ -191,7 +191,7 @@ def test_checks_pass_on_correct_component(checks_of, failure):
 def test_check_is_skipped_if_library_is_missing(failure):
     missing = {"requires": (Requirement("no_such_library", "photonpano[none]"),)}
     with pytest.raises(pytest.skip.Exception, match=r'toy needs no_such_library: pip install "photonpano\[none\]"'):
-        failure(ResamplerConformance, "test_groups_lie_inside_capture", All, record=missing)
+        failure(ResamplerConformance, "test_groups_returns_tuple", All, record=missing)
 
 
 def test_models_in_finds_nested_models():

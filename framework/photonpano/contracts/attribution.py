@@ -8,19 +8,12 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import ArrayLike
 
+from photonpano.contracts.loop import HOMOGRAPHIES
+from photonpano.contracts.rules import BrokenContract
 from photonpano.errors import PhotonpanoError, PluginError, described
 from photonpano.interrupts import is_interrupt
-from photonpano.protocols.motion import Trajectory
+from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray
-
-
-class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
-    """What a component returned although its protocol does not allow it, as a clause; raised inside `attributing`."""
-
-
-def shown(value: object) -> str:
-    """Describe a value by its type, and an array by its shape and type."""
-    return f"{value.shape} of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
 
 
 @contextmanager
@@ -68,14 +61,5 @@ class AttributedTrajectory:
         """
         frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
         with attributing(self._origin, f"level {self._level}"):
-            found = np.asarray(self._trajectory.at(frame_indices))
-            if found.dtype.kind not in "fiu":
-                raise BrokenContract(f"homographies are float64, got {shown(found)}")
-            if found.shape != (len(frames), 3, 3):
-                raise BrokenContract(f"expected homographies of the shape ({len(frames)}, 3, 3), got {found.shape}")
-            if (bad := ~np.isfinite(found).all(axis=(1, 2)) | (found[:, 2, 2] == 0)).any():
-                first = int(np.argmax(bad))
-                raise BrokenContract(
-                    f"a homography is finite with h33 = 1, that of frame {frames[first]:g} is {found[first].tolist()}"
-                )
+            found = HOMOGRAPHIES.require(np.asarray(self._trajectory.at(frame_indices)), frames)
             return np.asarray(found, dtype=np.float64)

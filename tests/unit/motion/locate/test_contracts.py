@@ -2,54 +2,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
+from photonpano.contracts.information import why_undetermined
+from photonpano.contracts.loop import KNOTS, knot_errors, require_valid
+from photonpano.contracts.rules import BrokenContract
 from photonpano.geometry import jacobian, rescaled, translation
-from photonpano.motion.attribution import BrokenContract
-from photonpano.motion.checks import require_knots_kept, require_valid, why_undetermined
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-BROKEN = [
-    (None, "expected Located or NotLocated, got NoneType"),
-    (np.eye(3), "expected Located or NotLocated, got ndarray"),
-    (
-        Located(np.full((3, 3), np.nan)),
-        "a homography is a finite (3, 3) matrix with h33 = 1, got [[nan, nan, nan], [nan, nan, nan], [nan, nan, nan]]; "
-        "a failure is NotLocated",
-    ),
-    (
-        Located(np.eye(2)),
-        "a homography is a finite (3, 3) matrix with h33 = 1, got [[1.0, 0.0], [0.0, 1.0]]; a failure is NotLocated",
-    ),
-    (
-        Located(np.diag([1.0, 1.0, 0.0])),
-        "a homography is a finite (3, 3) matrix with h33 = 1, got [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]; "
-        "a failure is NotLocated",
-    ),
-    *(
-        (
-            Located(np.eye(3), information),
-            "information is an inverse covariance: an (8, 8) matrix, finite and positive definite; None if there is none",
-        )
-        for information in (np.eye(9), -np.eye(8), np.zeros((8, 8)), np.full((8, 8), np.nan))
-    ),
-    (Located(translation(3, 1), evidence={"inliers": "many"}), "evidence consists of numbers, got inliers = 'many'"),
-    (NotLocated("lost", {"matches": [3, 4]}), "evidence consists of numbers, got matches = [3, 4]"),
-]
-
-
-@pytest.mark.parametrize(("answer", "problem"), BROKEN)
-def test_invalid_motion_is_refused_with_the_name_of_the_locator(
-    run: Callable, make_level: Callable, pan: Callable, answer: Any, problem: str
-) -> None:
+def test_invalid_motion_is_refused_with_the_name_of_the_locator(run: Callable, make_level: Callable, pan: Callable) -> None:
     with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.3), lambda *_: answer))
+        run(make_level(pan(0.3), lambda *_: None))
+    problem = "expected Located or NotLocated, got NoneType"
     assert str(caught.value) == f"locator 'toy' of toys 1.0 broke its contract at level 1: {problem}"
 
 
@@ -159,11 +128,11 @@ def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make
     )
 
 
-KNOTS = np.array([translation(5.0 * index, 0) for index in range(9)])
+PLACES = np.array([translation(5.0 * index, 0) for index in range(9)])
 
 
 def knots_kept(trajectory: Trajectory, std_px: float = 0.05) -> None:
-    require_knots_kept(trajectory, np.arange(0, 90, 10.0), KNOTS, np.full(9, std_px), (40, 60))
+    KNOTS.require(knot_errors(trajectory, np.arange(0, 90, 10.0), PLACES, np.full(9, std_px), (40, 60)))
 
 
 def test_trajectory_may_smooth_its_knots_and_miss_outliers(known_motion: type) -> None:

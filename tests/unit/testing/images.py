@@ -1,0 +1,242 @@
+"""Mergers and renderers that keep their contract and break another promise: the check of the kit that finds each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, discover
+from photonpano.geometry import Canvas, inverse, translation
+from photonpano.merging import MergeRenderer
+from photonpano.testing import KnownMotion, MemorySource
+
+from .strange import Around, around, given
+
+Build: TypeAlias = Callable[[Any], Any]
+Row: TypeAlias = tuple[str, Build, str]
+PHOTON_MLE = discover().find("merger", "photon-mle").contribution
+
+
+def merger(context: Any) -> Any:
+    return PHOTON_MLE.build(PHOTON_MLE.config(tolerance_px=0.5), context)
+
+
+def renderer(context: Any) -> Any:
+    return MergeRenderer(context.in_order)
+
+
+def merges(change: Callable[..., Any]) -> Build:
+    """Build a merger whose exposures are what `change` makes of good ones and of the arguments."""
+    return lambda context: around("merge", change)(merger(context))
+
+
+def merges_given(change: Callable[..., tuple[Any, ...]]) -> Build:
+    """Build a merger that gets other arguments."""
+    return lambda context: given("merge", change)(merger(context))
+
+
+def renders(change: Callable[..., Any]) -> Build:
+    """Build a renderer whose panoramas are what `change` makes of good ones and of the arguments."""
+    return lambda context: around("render", change)(renderer(context))
+
+
+def renders_given(change: Callable[..., tuple[Any, ...]]) -> Build:
+    """Build a renderer that gets another source, trajectory, span and canvas."""
+    return lambda context: given("render", lambda *all_: (*change(*all_[:4]), *all_[4:]))(renderer(context))
+
+
+def flux_times(factor: Any) -> Callable[..., Any]:
+    """Return a change of an exposure or a panorama: its flux is multiplied with `factor(found, ...)`."""
+    return lambda found, *all_: replace(found, flux=found.flux * np.float32(factor(found, *all_)))
+
+
+class Unmasked:
+    def __init__(self, source: Any) -> None:
+        self.source, self.valid = source, np.ones_like(source.valid)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+
+def uncorrected(source: Any) -> MemorySource:
+    """Return the frames of a source, whose dark counts stay in."""
+    return MemorySource(source.frames(source.info.span), source.valid)
+
+
+def refusing_dark_counts(source: Any, *rest: Any) -> tuple[Any, ...]:
+    if isinstance(source, LinearlyCorrectedSource):
+        raise InputError("no")
+    return source, *rest
+
+
+def average_of_logarithms(found: Any, source: Any, group: Any, *_: Any) -> Any:
+    """Estimate the flux of ten frames at a time: the logarithm of an average is not the average of logarithms."""
+    frames = source.frames(group.span).reshape(-1, 10, *source.info.frame_shape)
+    return replace(
+        found, flux=np.mean([source.response.flux(ten.mean(axis=0, dtype=np.float32), 10) for ten in frames], axis=0)
+    )
+
+
+def every_other_frame(found: Any, source: Any, group: Any, *_: Any) -> Any:
+    counts = source.frames(group.span)[::2].mean(axis=0, dtype=np.float32)
+    return replace(found, flux=source.response.flux(counts, 100))
+
+
+def half_a_pixel_off(source: Any, group: Any, trajectory: Any, scale: float) -> tuple[Any, ...]:
+    def at(frame: float) -> np.ndarray:
+        return trajectory.at([frame])[0] @ (np.eye(3) if frame == group.reference else translation(0.5, 0.5))
+
+    return source, group, trajectory and KnownMotion(at), scale
+
+
+def backwards(source: Any, group: Any, trajectory: Any, scale: float) -> tuple[Any, ...]:
+    return source, group, trajectory and KnownMotion(lambda frame: inverse(trajectory.at([frame])[0])), scale
+
+
+def all_frames_of_the_capture(context: Any) -> Any:
+    inner = merger(context)
+    flux_of_all = lambda source, group, *rest: inner.merge(source, replace(group, span=source.info.span), *rest).flux  # noqa: E731
+    return around("merge", lambda found, *all_: replace(found, flux=flux_of_all(*all_)))(inner)
+
+
+def seen_from_the_plane(found: Any, source: Any, group: Any, trajectory: Any, scale: float) -> Any:
+    """Shift the image with the reference plane."""
+    turn = 0 if trajectory is None else int(trajectory.at([group.reference])[0, 0, 2]) // 1000
+    return replace(found, flux=np.roll(found.flux, turn, axis=1))
+
+
+def clearing_the_mask(source: Any, *rest: Any) -> tuple[Any, ...]:
+    source.valid[0, 0] = not source.valid[0, 0]
+    return source, *rest
+
+
+def writing_to_counts(source: Any, *rest: Any) -> tuple[Any, ...]:
+    source.counts(FrameSpan(0, 3))[0, 0] = 0
+    return source, *rest
+
+
+def depends_on_threads(build: Build, method: str) -> Build:
+    return lambda context: around(method, flux_times(lambda *_: 1 + 1e-6 * context.threads))(build(context))
+
+
+def still(source: Any, trajectory: Any, span: FrameSpan, canvas: Canvas) -> tuple[Any, ...]:
+    """Sum the frames where the middle one lies."""
+    middle = trajectory.at([span.centre])[0]
+    return source, KnownMotion(lambda _: middle), span, canvas
+
+
+def beside(source: Any, trajectory: Any, span: FrameSpan, canvas: Canvas) -> tuple[Any, ...]:
+    return source, trajectory, span, replace(canvas, transform=translation(0.5, 0.5) @ canvas.transform)
+
+
+MERGERS: Sequence[Row] = (
+    (
+        "test_merger_works_in_other_processes",
+        lambda context: Around(merger(context), gain=lambda flux: flux),
+        "a merger must survive pickling, so that other processes can use it",
+    ),
+    (
+        "test_weight_is_number_of_frames",
+        merges(lambda found, *_: replace(found, weight=found.weight / found.weight.max())),
+        "for a group of 200 frames and a still camera it is 1 at some pixels",
+    ),
+    (
+        "test_flux_depends_on_frames_of_group_only",
+        all_frames_of_the_capture,
+        "that of frames 20 to 219 changes with frames before",
+    ),
+    ("test_flux_is_unbiased_on_photon_noise", merges(average_of_logarithms), r"the mean is off by \+\d+.\d standard errors"),
+    (
+        "test_flux_has_no_more_than_photon_noise",
+        merges(every_other_frame),
+        r"variance of the flux is (1.9|2.0|2.1)\d times",
+    ),
+    (
+        "test_dark_counts_are_subtracted_or_source_is_refused",
+        merges_given(lambda source, *rest: (uncorrected(source), *rest)),
+        r"the mean count is 0.\d+, not 0.\d+",
+    ),
+    (
+        "test_masked_pixels_have_no_influence",
+        merges_given(lambda source, *rest: (Unmasked(source), *rest)),
+        "for a still camera the weight must be 0 where source.valid is false; it is 200",
+    ),
+    (
+        "test_masked_pixels_have_no_influence_along_motion",
+        merges_given(lambda source, group, motion, scale: (Unmasked(source) if motion else source, group, motion, scale)),
+        "along a known motion the flux changes with",
+    ),
+    (
+        "test_merge_compensates_known_motion",
+        merges_given(lambda source, group, _, scale: (source, group, None, scale)),
+        r"contrast is \d\d% .* unwarped average \d\d%",
+    ),
+    ("test_merge_compensates_known_motion", merges_given(backwards), "along a known motion the image must stay sharp"),
+    (
+        "test_merge_compensates_known_motion",
+        merges_given(half_a_pixel_off),
+        r"displaced by \([+-]0.[45]\d, [+-]0.[45]\d\) px in x and y",
+    ),
+    (
+        "test_exposure_does_not_depend_on_reference_plane",
+        merges(seen_from_the_plane),
+        r"moved by \(5000, -700\) px the flux changes by",
+    ),
+    (
+        "test_flux_does_not_depend_on_scale",
+        merges(flux_times(lambda found, *_: found.scale**-2)),
+        "at scale 0.5 the mean count is",
+    ),
+    ("test_merge_leaves_inputs_unchanged", merges_given(clearing_the_mask), "modifies source.valid"),
+    ("test_merge_leaves_inputs_unchanged", merges_given(writing_to_counts), "fails with read-only arrays"),
+    ("test_merge_is_deterministic", depends_on_threads(merger, "merge"), "with four threads, the exposure differs"),
+)
+RENDERERS: Sequence[Row] = (
+    (
+        "test_unseen_pixels_are_unknown",
+        renders(lambda found, *_: replace(found, flux=np.nan_to_num(found.flux), weight=np.maximum(found.weight, 1))),
+        "must have weight 0 and flux NaN; beside the frames it is 1",
+    ),
+    (
+        "test_flux_depends_on_frames_of_span_only",
+        renders_given(lambda source, trajectory, _, canvas: (source, trajectory, source.info.span, canvas)),
+        "frames 20 to 219 must not depend on other frames",
+    ),
+    (
+        "test_masked_pixels_have_no_influence",
+        renders_given(lambda source, *rest: (Unmasked(source), *rest)),
+        "masked pixels must have no influence",
+    ),
+    (
+        "test_panorama_shows_scene_in_its_place",
+        renders_given(still),
+        r"the panorama must be sharp; at scale 0.5 its contrast is",
+    ),
+    ("test_panorama_shows_scene_in_its_place", renders_given(beside), r"at scale 0.5 it is displaced by 1\.\d+ px"),
+    (
+        "test_flux_does_not_depend_on_scale",
+        renders(flux_times(lambda found, *_: found.canvas[0, 0] ** -2)),
+        "at scale 0.5 the mean count is",
+    ),
+    (
+        "test_dark_counts_are_subtracted_or_source_is_refused",
+        renders_given(lambda source, *rest: (uncorrected(source), *rest)),
+        r"the mean count is 0.\d+, not 0.\d+",
+    ),
+    (
+        "test_progress_adds_up_to_the_frames",
+        lambda context: given("render", lambda *all_: (*all_[:-1], lambda _: None))(renderer(context)),
+        r"must be called with 200 frames in all, got 0",
+    ),
+    (
+        "test_tiles_fit_together",
+        renders(flux_times(lambda found, *_: np.linspace(1, 1.2, found.flux.shape[1]))),
+        "must not depend on its tile; pixels of the right half differ by",
+    ),
+    ("test_render_leaves_inputs_unchanged", renders_given(clearing_the_mask), "modifies source.valid"),
+    ("test_render_leaves_inputs_unchanged", renders_given(writing_to_counts), "fails with read-only arrays"),
+    ("test_render_is_deterministic", depends_on_threads(renderer, "render"), "with 4 threads the panorama differs"),
+)
