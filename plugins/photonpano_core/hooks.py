@@ -333,9 +333,9 @@ def photonpano_executors() -> Iterator[ExecutorContribution]:
 
 
 def _threads(_: ThreadsConfig, context: ExecutorContext) -> Executor:
-    from photonpano.execution import Here
+    from photonpano.execution import LocalExecutor
 
-    return Here(context.threads)
+    return LocalExecutor(context.threads)
 
 
 def _exr(config: ExrConfig, _: StageContext) -> Exporter:
