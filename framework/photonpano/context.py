@@ -9,7 +9,7 @@ from functools import partial
 from itertools import chain
 from typing import Any, Protocol, TypeVar
 
-from photonpano.execution import Executor, Here
+from photonpano.execution import Executor, LocalExecutor
 from photonpano.notebooks import NotebookBars, in_notebook
 from photonpano.threads import batched, in_order
 
@@ -132,7 +132,7 @@ class Context:
     progress: Progress = field(default_factory=Quiet)
     on_level: Callable[[Any], object] = lambda _: None
     checkpoints: Checkpoints = field(default_factory=KeepNothing)
-    executor: Executor = field(default_factory=Here)
+    executor: Executor = field(default_factory=LocalExecutor)
 
     def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:
         """Yield the results of `work` in the order of the items, in tasks of the executor: see `threads.in_order`."""

@@ -245,6 +245,6 @@ def _build_merge(_: MergeConfig, context: StageContext) -> Renderer:
 
 
 def _build_threads(_: ThreadsConfig, context: ExecutorContext) -> Executor:
-    from photonpano.execution import Here
+    from photonpano.execution import LocalExecutor
 
-    return Here(context.threads)
+    return LocalExecutor(context.threads)

@@ -35,7 +35,7 @@ from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulate
 import photonpano.pipeline.run as run_module
 from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
 from photonpano.context import Quiet
-from photonpano.execution import CaptureElsewhere, Here
+from photonpano.execution import CaptureElsewhere, LocalExecutor
 from photonpano.execution.packing import packed
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
@@ -50,7 +50,7 @@ EMPTY_TASKS = 2000
 PATH_FRAMES = 400_000
 
 
-class Measuring(Here):
+class Measuring(LocalExecutor):
     """Works on each task here, and notes what it takes and what would travel."""
 
     def __init__(self, capture: Source, stage: Callable[[], str]) -> None:

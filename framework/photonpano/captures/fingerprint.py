@@ -19,8 +19,7 @@ from photonpano.protocols import Source
 from photonpano.reading.remote import remote_file
 from photonpano.specs.plan import Plan
 
-_PLACES, _FRAMES = 16, 4
-"""4 frames at each of 16 places are hashed: at the most 1 MB of a packed capture of 254x496 px."""
+_PLACES, _FRAMES = 16, 4  # 4 frames at each of 16 places are hashed: at the most 1 MB of a packed capture of 254x496 px
 
 
 class FileRecord(TypedDict):

@@ -18,24 +18,15 @@ from photonpano.protocols import Source
 from photonpano.reading import other_order, sampled_spans
 from photonpano.values import Decision, FrameSpan
 
-_PLACES, _FRAMES = 5, 256
-"""Five spans of at most 256 frames are looked at."""
-_ALIKE = 0.7
-"""An image repeats if another shift fits at least this well, as a share of the best one."""
-_DIP = 0.5
-"""Between two peaks, the correlation falls below this share of the best one; on the slope of one peak it does not."""
-_AGREE = 0.2
-"""Periods of spans agree within this share of their median."""
-_SURE = 6.0
-"""Standard deviations from which the best correlation is not chance."""
-_MOST_PEAKS = 200
-"""Most peaks that are compared."""
-_REACH = 1 / 3
-"""Largest shift that is looked at, as a share of the frame."""
-_FILTER_BLUR_PX = 1.0
-"""Standard deviation of the Gaussian that blurs a colour filter array."""
-_STANDING = 0.3
-"""Share of the frame from which what stands still is named."""
+_PLACES, _FRAMES = 5, 256  # spans all over the capture, and most frames of each
+_ALIKE = 0.7  # an image repeats if another shift fits at least this well, as a share of the best one
+_DIP = 0.5  # between two peaks, the correlation falls below this share of the highest one
+_AGREE = 0.2  # largest difference of the periods of spans from their median, relative to it
+_SURE = 6.0  # standard deviations from which the best correlation is not chance
+_MOST_PEAKS = 200  # most peaks that are compared
+_REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
+_FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
+_STANDING = 0.3  # share of the frame from which what stands still is named
 
 
 def order_warning(source: Source) -> str | None:

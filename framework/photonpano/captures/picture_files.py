@@ -15,15 +15,12 @@ from photonpano.atomic import atomic_folder, atomic_path
 from photonpano.contributions import Requirement, install_command
 from photonpano.errors import OutputError
 
-Picture = NDArray[np.uint8] | NDArray[np.uint16]
-"""Of 16 bits in a folder of PNGs only."""
+Picture = NDArray[np.uint8] | NDArray[np.uint16]  # of 16 bits in a folder of PNGs only
 
-MOST_ANIMATED = 500
-"""Pictures of an animated WebP or GIF, which is made in memory."""
+MOST_ANIMATED = 500  # pictures of an animated WebP or GIF, which is made in memory
 _MOST_H264_PX = 16_384
 _ANIMATED = {".webp": "WebP", ".gif": "GIF"}
-_WEBP_QUALITY, _CRF = 90, "18"
-"""Quality of lossy compression, whose errors are hardly visible."""
+_WEBP_QUALITY, _CRF = 90, "18"  # quality of lossy compression, whose errors are hardly visible
 
 
 def require_writable(path: Path, n_pictures: int) -> None:

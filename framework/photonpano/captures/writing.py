@@ -21,8 +21,7 @@ from photonpano.values import FrameSpan, StreamInfo
 
 FolderWriter = Callable[[Path, StreamInfo, Iterable[NDArray[np.uint8]]], None]
 
-_BLOCK_BYTES = 8 * 1024**2
-"""Bytes of the frames that are read at once, packed if the source is."""
+_BLOCK_BYTES = 8 * 1024**2  # bytes of the frames that are read at once, packed if the source is
 
 
 def truth_path(path: Path) -> Path:

@@ -25,8 +25,7 @@ _ALL: tuple[type[Correction], ...] = (
     *TURNS,
     *(Mask, HotPixels, StillPixels, DarkCounts, FlatField, ColourFilter),
 )
-CORRECTIONS = {correction.name: correction for correction in _ALL}
-"""All corrections by their names in specs."""
+CORRECTIONS = {correction.name: correction for correction in _ALL}  # all corrections by their names in specs
 
 __all__ = [
     "CORRECTIONS",

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from photonpano.values import FluxImage
 
 DARK_FILE = "a file from `photonpano dark`, or a .npy file of rates, of the size of the frames at this place of the list"
-_AT_ONCE = 1024
-"""Frames summed between two reports of progress."""
+_AT_ONCE = 1024  # frames summed between two reports of progress
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -127,8 +127,7 @@ def _turns() -> tuple[type[Turn], ...]:
     return tuple(type(name, (Turn,), {"name": name, "turn": staticmethod(turn), "__doc__": doc}) for name, turn, doc in table)
 
 
-TURNS = _turns()
-"""A class for each way to turn a frame."""
+TURNS = _turns()  # A class for each way to turn a frame
 
 
 class Preset(Rearrangement):

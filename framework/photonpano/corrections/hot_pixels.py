@@ -21,20 +21,15 @@ if TYPE_CHECKING:
     from photonpano.corrections.pixels import Decide, Pixels
     from photonpano.values import BoolArray, FluxImage
 
-THRESHOLD = 10.0
-"""Default threshold, in robust standard deviations: it finds a few percent of the pixels of real sensors."""
-_SPANS, _SPAN_FRAMES = 16, 256
-"""16 spans of 256 frames are summed all over the capture, which blurs the scene."""
-_REACH, _LONGEST_REACH = 2, 5
-"""Neighbourhood radius, px; the longer one is for colours of which a filter array has few pixels."""
-_ENOUGH = 6.5
-"""Known neighbours, on average, from which on the neighbourhood is not widened."""
+THRESHOLD = 10.0  # default threshold, in robust standard deviations: it finds a few percent of the pixels of real sensors
+_SPANS, _SPAN_FRAMES = 16, 256  # spans all over the capture, and frames of each; their sum blurs the scene
+_REACH, _LONGEST_REACH = 2, 5  # neighbourhood radius, px; the longer one is for colours of which a filter array has few pixels
+_ENOUGH = 6.5  # known neighbours, on average, from which on the neighbourhood is not widened
+# A pixel is hot if it is brighter than the top 1/6 of its neighbours by the threshold. A straight edge or a line of the scene
+# makes at least 1/6 of them bright, at the border of the frame as well. Where many pixels are hot, it is the share of the
+# neighbours that are hot by chance, and two standard deviations of it.
 _LINE_SHARE = 1 / 6
-"""A pixel is hot if it is brighter than the top 1/6 of its neighbours by the threshold. A straight edge or a line of the scene
-makes at least 1/6 of them bright, at the border of the frame as well. Where many pixels are hot, it is the share of the
-neighbours that are hot by chance, and two standard deviations of it."""
-_MIN_KNOWN = 6
-"""A pixel with fewer known neighbours than this is not compared."""
+_MIN_KNOWN = 6  # least number of known neighbours of a pixel that is compared
 
 
 class HotPixels(Correction):

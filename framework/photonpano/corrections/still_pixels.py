@@ -22,33 +22,22 @@ if TYPE_CHECKING:
     from photonpano.protocols import Source
     from photonpano.values import BoolArray, FluxImage
 
-_SPANS, _SPAN_FRAMES = 32, 128
-"""32 spans of at most 128 frames are summed all over the capture."""
-_THRESHOLD = 6.0
-"""Smallest deviation of a hot or dead pixel from its neighbours, in robust standard deviations."""
-_BLUR_PX = 1.0
-"""Standard deviation of the Gaussian blur against photon noise, px."""
-_SIDE_PX = 15
-"""Side of the square over which a pixel's variances are averaged, px."""
-_LEAST_PIXELS = 40
-"""Fewer connected pixels than this do not make a part that stands."""
-_REACH_PX = 24
-"""What stands still is continued over flat parts, which show neither motion nor rest, up to this distance, px."""
-_SURE = 4.0
-"""Standard errors from which a variance is not chance."""
+_SPANS, _SPAN_FRAMES = 32, 128  # 32 spans of at most 128 frames are summed all over the capture
+_THRESHOLD = 6.0  # smallest deviation of a hot or dead pixel from its neighbours, in robust standard deviations
+_BLUR_PX = 1.0  # standard deviation of the Gaussian blur against photon noise, px
+_SIDE_PX = 15  # side of the square over which a pixel's variances are averaged, px
+_LEAST_PIXELS = 40  # least connected pixels of a part that stands
+_REACH_PX = 24  # what stands still is continued over flat parts, which show neither motion nor rest, up to this distance, px
+_SURE = 4.0  # standard errors from which a variance is not chance
+# A part stands if it moved by less than 0.1 px (root mean square), and by less than 0.7 px with certainty.
 _MOVED_PX, _STOOD_PX = 0.7, 0.1
-"""A part that moved by less than 0.1 px (root mean square) stands; it must be certain that it moved by less than 0.7 px."""
-_CALM = 0.25
-"""It must also be certain that it varies by less than a quarter of the variance where the frame moves."""
-_STEADY = 0.03
-"""A hot pixel varies by less than this fraction of its squared deviation more than its neighbours."""
-_HALO = 0.2
-"""Least fraction of a point's brightness in the pixels that touch it."""
-_LEAST_MOVING = 0.01
-"""A frame of which less than this share moves stands still."""
+_CALM = 0.25  # most variance of a part that stands, with certainty, relative to that where the frame moves
+_STEADY = 0.03  # most excess variance of a hot pixel over its neighbours, as a fraction of its squared deviation
+_HALO = 0.2  # least fraction of a point's brightness in the pixels that touch it
+_LEAST_MOVING = 0.01  # least share of a frame that moves, for the frame not to stand still
+# Structure is compared if its squared gradient is at least this fraction of the variance where the frame moves. A sensor
+# whose pixels differ by a few percent has less before a sky.
 _FAINT = 0.005
-"""Structure is compared if its squared gradient is at least this fraction of the variance where the frame moves. A sensor whose
-pixels differ by a few percent has less before a sky."""
 _HALF = 0.5
 _SHARE_OF = "share of the frame that stands still, of the parts that show motion or rest"
 

@@ -12,12 +12,11 @@ from typing import Any, Protocol, TypeVar, cast
 from photonpano.execution.packing import packed, unpacked
 from photonpano.interrupts import interrupted
 
-_LOOK_S = 0.2
-"""How often threads that wait look whether the program was interrupted."""
+_POLL_S = 0.2  # from one check for an interrupt to the next, in threads that wait
+# Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client.
 _MOST_AT_ONCE = 8
-"""Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client."""
+# Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last.
 _TASKS_UNDER_WAY = 4
-"""Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last."""
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
@@ -114,7 +113,7 @@ class Remote:
         """Wait for a result. Once the program is interrupted, its threads do not wait any longer."""
         done = Event()
         self._workers.when_done(pending, done.set)
-        while not done.wait(_LOOK_S):
+        while not done.wait(_POLL_S):
             if interrupted():
                 raise KeyboardInterrupt
         return pending.result()

@@ -9,24 +9,19 @@ import numpy as np
 
 from photonpano.context import Context
 from photonpano.geometry import corner_displacements, inverse
+from photonpano.lighting.flicker import LocalFlicker, local_frequency, measure_local_flicker
 from photonpano.lighting.gains import Gains, seen_cells, solve_gains
-from photonpano.lighting.lamps import Lamps, lamp_frequency, measure_lamps
 from photonpano.lighting.series import gain_of_frames
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import Decision, FloatArray, FrameSpan, Homography, Light
 
-LIGHT_DECISION = "light"
-"""What a record names the decision to divide by the gain of the light."""
+LIGHT_DECISION = "light"  # what a record names the decision to divide by the gain of the light
+# Least root mean square of changes of the light, between instants that see the same places, that are divided out.
 LEAST_CHANGE = 0.03
-"""Root mean square of the changes of the light, between instants that see the same places, from which it is divided out."""
-_LEAST_SIGMAS = 3.0
-"""They also exceed their noise by this factor."""
-_PROBES, _PROBE_FRAMES = 128, 16
-"""Spans all over the capture, and frames of each, that are compared to find out."""
-_MOST_SPANS, _FEWEST_FRAMES = 640, 4
-"""Most spans, and fewest frames of each, with which the light is measured."""
-_SPAN_PX = 4.0
-"""The image moves by no more than this in a span."""
+_LEAST_SIGMAS = 3.0  # least ratio of these changes to their noise
+_PROBES, _PROBE_FRAMES = 128, 16  # spans all over the capture, and frames of each, that are compared to find out
+_MOST_SPANS, _FEWEST_FRAMES = 640, 4  # most spans, and fewest frames of each, with which the light is measured
+_SPAN_PX = 4.0  # the image moves by no more than this in a span
 
 
 def find_light(source: Source, trajectory: Trajectory, context: Context) -> Light | None:
@@ -40,11 +35,11 @@ def find_light(source: Source, trajectory: Trajectory, context: Context) -> Ligh
     n_frames = source.info.n_frames
     longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
     gains = _gains(source, trajectory, _spread(n_frames, longest), context)
-    return measure_light(source, trajectory, context) if changes(gains) or lamp_frequency(gains) else None
+    return measure_light(source, trajectory, context) if changes(gains) or local_frequency(gains) else None
 
 
 def changes(gains: Gains) -> bool:
-    """Return whether the light changes by more than a steady one seems to."""
+    """Return whether the changes of the light exceed those of steady light, and noise."""
     return gains.change > max(LEAST_CHANGE, _LEAST_SIGMAS * float(np.median(gains.std)))
 
 
@@ -60,9 +55,9 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
     length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
     gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
-    frequency = lamp_frequency(gains)
+    frequency = local_frequency(gains)
     if frequency and gains.seen.to_cells is not None:
-        return _light_of(measure_lamps(gains, frequency), gains.seen.to_cells, gains, n_frames)
+        return _light_of(measure_local_flicker(gains, frequency), gains.seen.to_cells, gains, n_frames)
     lengths = np.array([len(span) for span in gains.seen.spans], float)
     gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
     mean = float(gain.mean())
@@ -93,13 +88,13 @@ def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray
     return Light.of_frames(found / mean, frequency, noise / mean)
 
 
-def _light_of(lamps: Lamps, to_map: Homography, gains: Gains, n_frames: int) -> Light:
-    """Return the light of each frame, with lamps over parts of the scene."""
+def _light_of(flicker: LocalFlicker, to_map: Homography, gains: Gains, n_frames: int) -> Light:
+    """Return the light of each frame, which flickers differently at each place."""
     frames = np.arange(n_frames)
-    slow, std = (np.interp(frames, gains.seen.instants, each) for each in (lamps.slow, gains.std))
-    turns = 2 * np.pi * lamps.frequency * frames
-    maps = np.stack([lamps.cosine, lamps.sine])
-    return Light(slow / slow.mean(), np.stack([np.cos(turns), np.sin(turns)]), maps, to_map, lamps.frequency, std)
+    slow, std = (np.interp(frames, gains.seen.instants, each) for each in (flicker.slow, gains.std))
+    phase = 2 * np.pi * flicker.frequency * frames
+    maps = np.stack([flicker.cosine, flicker.sine])
+    return Light(slow / slow.mean(), np.stack([np.cos(phase), np.sin(phase)]), maps, to_map, flicker.frequency, std)
 
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:

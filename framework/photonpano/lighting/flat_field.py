@@ -16,24 +16,18 @@ from photonpano.lighting.gains import SMOOTHING, STRUCTURE, SeenCells, seen_cell
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography
 
-_SPANS, _SPAN_PX = 128, 4.0
-"""Most spans of frames that are compared; the image moves by no more than this in each."""
-_KNOTS = 12
-"""Knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear."""
-_LENGTH = 0.5
-"""Distance over which knots are correlated, relative to the shorter side of a frame."""
-_WIDEST = 1.0
-"""Standard deviation of the logarithm of a gain of which nothing is known."""
+_SPANS, _SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
+_KNOTS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
+_LENGTH = 0.5  # distance over which knots are correlated, relative to the shorter side of a frame
+_WIDEST = 1.0  # prior standard deviation of the logarithm of the gain
+# Rounds of least squares, in which noise and spread of the gain are measured. Outliers keep their weight: counts of few
+# photons are skewed, and down-weighting would bias their mean.
 _ROUNDS = 4
-"""The equations are solved this many times, and the noise and the spread of the gain measured. Outliers keep their weight:
-squares of few photons are skewed, and it would change their mean."""
+# Standard deviation of the logarithm of the light before it is measured, and the least. A gain that falls along x and light
+# that changes as the image shifts look alike, so that the light changes by no more than the gain leaves over.
 _STEADY, _LEAST_CHANGE = 0.03, 1e-3
-"""Standard deviation of the logarithm of the light before it is measured, and the least. A gain that falls along x and light
-that changes as the image shifts look alike, so that the light changes by no more than the gain leaves over."""
-_LEAST_KNOWN = 0.5
-"""Share of the variance of the gain that photons and motion must determine."""
-_NARROWEST = 1e-3
-"""Least standard deviation of the prior."""
+_LEAST_KNOWN = 0.5  # least share of the prior variance of the gain that photons and motion must remove
+_NARROWEST = 1e-3  # least standard deviation of the prior
 
 
 @dataclass(frozen=True, slots=True, eq=False)

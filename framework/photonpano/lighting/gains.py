@@ -18,34 +18,26 @@ from photonpano.protocols import Source, Trajectory, camera_of_motion
 from photonpano.robust import huber_weights, robust_std
 from photonpano.values import FloatArray, FrameSpan, Homography
 
-_CELLS = 24
-"""Squares of the scene along the shorter side of a frame."""
-_LARGEST_PX = 32
-"""Largest side of a square, px."""
+_CELLS = 24  # squares of the scene along the shorter side of a frame
+_LARGEST_PX = 32  # largest side of a square, px
+# Standard deviation of the Gaussian that weights the pixels of a square, in sides: sums must not depend on the sub-pixel
+# position of a frame.
 _BLUR = 0.75
-"""Standard deviation of the Gaussian that weights the pixels of a square, in sides: what it sees must not depend on the
-fraction of a pixel at which a frame lies."""
+# Of frames before the reference plane, relative to its own frame: squares are at most four times as wide there.
 _LEAST_DEPTH = 0.25
-"""Of frames before the reference plane, relative to its own frame: squares are at most four times as wide there."""
+# Factor by which the Gaussian lowers the noise of a square; errors of neighbours are correlated instead.
 SMOOTHING = 2 * _BLUR * np.sqrt(np.pi)
-"""Factor by which this lowers the noise of a square; neighbours share photons instead, and their errors are correlated."""
-_COVERED = 0.999
-"""Squares that the border of a frame cuts are left out."""
-_MOST_CELLS = 16_000
-"""Squares of the whole scene: they are larger where the motion is long."""
+_COVERED = 0.999  # least covered share of a square: those at the border of a frame are left out
+_MOST_CELLS = 16_000  # squares of the whole scene: they are larger if the motion is long
+# Relative error of a square beside photon noise: frames sample its structure at different sub-pixel positions.
 STRUCTURE = 0.1
-"""Relative error of a square beside photon noise: its structure is sampled at other fractions of a pixel in each frame."""
-_ROUNDS = 4
-"""The equations are solved this many times, with outliers down-weighted."""
-_OUTLIER = 3.0
-"""Standard deviations from which a square is down-weighted (Huber), as one that an object crosses."""
-_DARKEST = -7.0
-"""Least logarithm of a gain."""
+_ROUNDS = 4  # of iteratively reweighted least squares
+_OUTLIER = 3.0  # standard deviations from which a square is down-weighted (Huber), such as one that an object crosses
+_DARKEST = -7.0  # least logarithm of a gain
+# Weight of the prior of steady light, relative to that of the photons: it matters where frames share no place.
 _WEAK = 1e-6
-"""Weight of the prior that the light is steady, relative to that of the photons: it decides where frames share no place."""
 
-_WIDEST = np.pi / 2
-"""Widest field of view, in radians, of which squares lie on a plane."""
+_WIDEST = np.pi / 2  # widest field of view, in radians, of which squares lie on a plane
 
 
 @dataclass(frozen=True, slots=True, eq=False)

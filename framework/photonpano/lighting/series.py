@@ -1,4 +1,4 @@
-"""The gain of each frame from the gains of spans: a smooth curve, and the sum of a few harmonics where the light flickers."""
+"""Interpolate the gains of spans to each frame: with a smooth curve, and harmonics of a flicker."""
 
 from __future__ import annotations
 
@@ -10,18 +10,12 @@ from scipy.interpolate import UnivariateSpline
 
 from photonpano.values import FloatArray
 
-_HARMONICS = 3
-"""Harmonics of a flicker that are fitted."""
-_FEWEST_PERIODS, _FEWEST_SPANS = 2.5, 32
-"""A flicker is searched for if the capture has this many periods, and spans."""
-_FINER = 16
-"""Frequencies are compared at this many steps for each that the capture tells apart."""
-_LINE_SHARE = 0.6
-"""A flicker explains this share, at least, of the changes of the light that are no slow curve."""
-_SMALLEST = 0.01
-"""Root mean square of the smallest flicker, relative to the light."""
-_DARKEST = 0.02
-"""Spans with less light than this tell nothing of slow changes."""
+_HARMONICS = 3  # harmonics of a flicker that are fitted
+_FEWEST_PERIODS, _FEWEST_SPANS = 2.5, 32  # of the capture, for a flicker to be searched for
+_FINER = 16  # oversampling of frequency: steps per 1/T, for a capture of the duration T
+_LINE_SHARE = 0.6  # least share of the changes of the light, without a slow curve, that a flicker explains
+_SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
+_DARKEST = 0.02  # least gain of spans from which slow changes are fitted
 
 
 def flicker_frequency(instants: FloatArray, gain: FloatArray) -> float:
@@ -42,7 +36,7 @@ def flicker_frequency(instants: FloatArray, gain: FloatArray) -> float:
     first = int(_FEWEST_PERIODS * _FINER)
     peak = first + int(power[first:].argmax())
     frequencies = (peak + np.linspace(-1, 1, 41)) / (_FINER * n * spacing)
-    left = [_left_over(instants, rest, slow, each) for each in frequencies]
+    left = [_residual(instants, rest, slow, each) for each in frequencies]
     frequency = float(frequencies[int(np.argmin(left))])
     total = float((rest**2).sum())
     explained = total - min(left)
@@ -96,8 +90,8 @@ def _waves(instants: FloatArray, frequency: float, lengths: FloatArray) -> Float
     return np.stack(columns, axis=1)
 
 
-def _left_over(instants: FloatArray, series: FloatArray, slow: FloatArray, frequency: float) -> float:
-    """Return the sum of squares that a wave of one frequency, beside a slow curve, does not explain."""
+def _residual(instants: FloatArray, series: FloatArray, slow: FloatArray, frequency: float) -> float:
+    """Return the residual sum of squares of a fit of a wave of one frequency and a slow curve."""
     turns = 2 * np.pi * frequency * instants[:, None]
     columns = np.concatenate([slow, np.cos(turns), np.sin(turns)], axis=1)
     return float(((series - columns @ np.linalg.lstsq(columns, series)[0]) ** 2).sum())

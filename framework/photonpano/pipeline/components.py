@@ -44,10 +44,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-HALVED_LEVELS = 2
-"""With `scale: auto`, the first two levels are located at half size."""
-LARGE_FRAME_PX = 192
-"""Frames whose shorter side is below this are not halved: the pyramids of locators need pixels."""
+HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
+LARGE_FRAME_PX = 192  # frames whose shorter side is below this are not halved: the pyramids of locators need pixels
 
 
 @contextmanager

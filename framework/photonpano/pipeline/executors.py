@@ -15,7 +15,7 @@ from uuid import uuid4
 from photonpano.capture import PluginSource, capture_of
 from photonpano.contributions import ExecutorContext
 from photonpano.errors import InputError, PhotonpanoError
-from photonpano.execution import CaptureElsewhere, Executor, Here, differences
+from photonpano.execution import CaptureElsewhere, Executor, LocalExecutor, differences
 from photonpano.pipeline.components import build_source, built
 from photonpano.protocols import Source
 from photonpano.record.environment import library_versions, plugin_records
@@ -34,7 +34,7 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
         PluginError: a library is missing, or the plugin failed in its own way.
     """
     if plan.executor is None:
-        yield Here(thread_count(plan.run.threads))
+        yield LocalExecutor(thread_count(plan.run.threads))
         return
     read = as_read(source)
     names = ("photonpano", *library_versions(plan), *(each["plugin"] for each in plugin_records(plan)))
@@ -62,7 +62,7 @@ class CaptureOpener:
     """Opens a capture in another process, for the tasks of one run.
 
     Attributes:
-        run: a word of this run alone, by which openers are told apart: workers may live longer than a run, and files change.
+        run: unique ID of the run: workers may outlive a run, and files may change.
         seed: of the run.
         source: the name of the source.
         keys: its keys under `with`.

@@ -18,8 +18,7 @@ from photonpano.testing.conformance import Conformance, must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
 from photonpano.values import FrameSpan, StreamInfo
 
-_MAX_FRAMES = 200
-"""Frames that are checked, half of them at each end of a longer capture."""
+_MAX_FRAMES = 200  # frames that are checked, half of them at each end of a longer capture
 
 
 class SourceConformance(Conformance):

@@ -11,9 +11,6 @@ import pytest
 from photonpano import (
     Config,
     FrameSpan,
-    InputError,
-    LinearlyCorrectedSource,
-    PackedSource,
     SourceContribution,
     SpecError,
     open_source,
@@ -21,36 +18,12 @@ from photonpano import (
     run,
     simulate,
 )
-from photonpano.capture import part_of
 from photonpano.captures.writing import truth_path
 from photonpano.pipeline.components import build_source
-from photonpano.testing import MemorySource
 
 
 def part(path: Path, start: int, stop: int) -> dict[str, Any]:
     return {"use": "packed-npy", "with": {"path": str(path), "frames": [start, stop]}}
-
-
-def test_part_of_capture_numbers_its_frames_from_zero(memory_source: type[MemorySource]) -> None:
-    frames = np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8)
-    part = part_of(memory_source(frames), FrameSpan(2, 7))
-    assert part.info.n_frames == 5
-    np.testing.assert_array_equal(part.counts(FrameSpan(1, 4)), frames[3:6].sum(axis=0))
-    np.testing.assert_array_equal(part.frames(FrameSpan(0, 5)), frames[2:7])
-    with pytest.raises(InputError, match="the capture has 5 frames"):
-        part.counts(FrameSpan(3, 6))
-
-
-def test_part_of_capture_has_the_optional_methods_of_the_capture(memory_source: type[MemorySource]) -> None:
-    whole: Any = memory_source(np.random.default_rng(0).integers(0, 2, (9, 4, 8), dtype=np.uint8))
-    assert not isinstance(part_of(whole, FrameSpan(2, 7)), PackedSource | LinearlyCorrectedSource)
-    whole.packed = lambda span: np.packbits(whole.frames(span), axis=-1)
-    whole.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
-    part = part_of(whole, FrameSpan(2, 7))
-    assert isinstance(part, PackedSource)
-    assert isinstance(part, LinearlyCorrectedSource)
-    np.testing.assert_array_equal(part.packed(FrameSpan(1, 4)), whole.packed(FrameSpan(3, 6)))
-    assert part.corrected(np.uint32([[5]]), 3) == 2
 
 
 def test_part_holds_the_frames_of_its_span(small_capture: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import Config, FrameSpan, InputError, LinearlyCorrectedSource, PackedSource, SourceContribution
+from photonpano import Config, FrameSpan, InputError, PackedSource, SourceContribution
 from photonpano.corrections import CORRECTIONS, corrected_source
 from photonpano.corrections.geometry import Crop, MissingRow
 from photonpano.testing import MemorySource, SourceConformance
@@ -48,17 +48,6 @@ def test_packed_equals_packed_frames(
     assert isinstance(source, PackedSource)
     np.testing.assert_array_equal(source.packed(FrameSpan(3, 9)), np.packbits(source.frames(FrameSpan(3, 9)), axis=-1))
     np.testing.assert_array_equal(source.counts(SPAN), source.frames(SPAN).sum(axis=0))
-
-
-def test_corrected_source_has_optional_methods_only_where_they_apply(
-    frames: np.ndarray, corrections: Callable, tmp_path: Path
-) -> None:
-    plain = corrected_source(MemorySource(frames), corrections("rot180"))
-    assert not isinstance(plain, PackedSource)
-    assert not isinstance(plain, LinearlyCorrectedSource)
-    np.save(tmp_path / "dark.npy", np.zeros(SHAPE))
-    dark = corrected_source(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
-    assert isinstance(dark, LinearlyCorrectedSource)
 
 
 def test_masks_of_source_and_corrections_are_combined_and_moved(

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from photonpano import Config, ExecutorContribution, LocationError
-from photonpano.execution import Here
+from photonpano.execution import LocalExecutor
 from photonpano.testing import ExecutorConformance
 from photonpano.testing.executors import N_FRAMES, capture
 
@@ -12,14 +12,14 @@ class NoConfig(Config):
     pass
 
 
-class Forgetful(Here):
+class Forgetful(LocalExecutor):
     """Keeps nothing."""
 
     def keep(self, work, *given):
         return None, work(*given)[1]
 
 
-class Mute(Here):
+class Mute(LocalExecutor):
     """Swallows errors."""
 
     def call(self, work, *given):
@@ -29,7 +29,7 @@ class Mute(Here):
             return None
 
 
-class Stale(Here):
+class Stale(LocalExecutor):
     """Reads another capture."""
 
     def call(self, work, *given):
@@ -37,7 +37,7 @@ class Stale(Here):
         return done + 1 if given and given[0] is capture() else done
 
 
-class Unordered(Here):
+class Unordered(LocalExecutor):
     """Takes the last item for all."""
 
     def call(self, work, *given):
@@ -53,13 +53,13 @@ class Unordered(Here):
         (Unordered, "test_shared_values_are_given_to_many_tasks"),
     ],
 )
-def test_broken_executor_is_found(broken: type[Here], check: str) -> None:
+def test_broken_executor_is_found(broken: type[LocalExecutor], check: str) -> None:
     class Checks(ExecutorConformance):
         contribution = ExecutorContribution(
             name="broken", summary="Breaks a promise", config=NoConfig, build=lambda _, context: broken(context.threads)
         )
 
-    getattr(Checks(), check)(Here(2))
+    getattr(Checks(), check)(LocalExecutor(2))
     with pytest.raises((AssertionError, TypeError, pytest.fail.Exception)):
         getattr(Checks(), check)(broken(2))
     assert capture().info.n_frames == N_FRAMES

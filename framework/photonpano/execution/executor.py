@@ -1,4 +1,4 @@
-"""The interface of executors."""
+"""The interface of executors, and the one of a single process."""
 
 from __future__ import annotations
 
@@ -40,3 +40,31 @@ class Executor(Protocol):
     def close(self) -> None:
         """Cancel what is under way, and release what was started for the run."""
         ...
+
+
+class LocalExecutor:
+    """Works on each task in the thread that asks for it: the executor of a single process."""
+
+    def __init__(self, threads: int = 1) -> None:
+        """Take the number of threads of the run."""
+        self.under_way = threads
+
+    def at_once(self, number: int) -> int:
+        """Return 1."""
+        del number
+        return 1
+
+    def share(self, value: ValueT) -> ValueT:
+        """Return the value itself."""
+        return value
+
+    def call(self, work: Callable[..., ResultT], *given: Any) -> ResultT:
+        """Work on a task."""
+        return work(*given)
+
+    def keep(self, work: Callable[..., tuple[ValueT, ResultT]], *given: Any) -> tuple[ValueT, ResultT]:
+        """Work on a task with two results."""
+        return work(*given)
+
+    def close(self) -> None:
+        """Do nothing."""

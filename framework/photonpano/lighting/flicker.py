@@ -1,4 +1,4 @@
-"""Lamps that light parts of a scene and flicker at one frequency: their amplitude and phase at each place."""
+"""Measure light that flickers at one frequency, with amplitude and phase of its own at each place of the scene."""
 
 from __future__ import annotations
 
@@ -10,30 +10,21 @@ import numpy as np
 from photonpano.lighting.gains import STRUCTURE, Gains, SeenCells
 from photonpano.values import FloatArray, FluxImage
 
-_PERIODS = 2.5
-"""A place is seen for this many periods of a flicker that is found."""
-_FINER = 3
-"""Frequencies are compared at this many steps for each that the time for which a place is seen tells apart."""
-_STANDS_OUT = 3.0
-"""The power of a flicker is this many times the median of all frequencies."""
-_LINE = 10.0
-"""The power of a line in the spectrum of the light of all of the scene is this many times the median nearby."""
-_SMALLEST = 0.05
-"""Root mean square, over places and time, of the flicker that is divided out."""
-_SPREAD = 0.5
-"""Standard deviation of the amplitudes that is expected beforehand, where photons tell little."""
-_SMOOTH_CELLS = 1.0
-"""Standard deviation of the Gaussian over which neighbouring squares share their photons: lamps have no sharp borders."""
+_PERIODS = 2.5  # periods for which a place must be in view
+_FINER = 3  # oversampling of frequency: steps per 1/T, where a place is in view for T
+_STANDS_OUT = 3.0  # least power of a flicker, relative to the median over frequencies
+_LINE = 10.0  # least power of a line in the spectrum of the light of all of the scene, relative to the median nearby
+_SMALLEST = 0.05  # least root mean square, over places and time, of a flicker that is divided out
+_SPREAD = 0.5  # prior standard deviation of the amplitudes
+_SMOOTH_CELLS = 1.0  # standard deviation of the Gaussian that smooths the amplitudes: lamps have no sharp borders
+# Standard deviation of the Gaussian over which a flicker has one phase; brightness that a tremor changes has not.
 _ALIKE_CELLS = 3.0
-"""Standard deviation of the Gaussian over which a flicker has one phase: what a tremor does changes from edge to edge."""
-_ROUNDS = 2
-"""Amplitudes and slow changes of the light are fitted in turn this many times."""
-_MOST = 1.5
-"""Largest amplitude, relative to the mean light of a place."""
+_ROUNDS = 2  # of fitting amplitudes and slow changes of the light in turn
+_MOST = 1.5  # largest amplitude, relative to the mean light of a place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lamps:
+class LocalFlicker:
     """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light.
 
     Attributes:
@@ -49,11 +40,11 @@ class Lamps:
     slow: FloatArray
 
 
-def lamp_frequency(gains: Gains) -> float:
+def local_frequency(gains: Gains) -> float:
     """Return the frequency at which places flicker, each at its own phase, in cycles per frame; 0 if none stands out.
 
-    The power of all squares is added up, whatever their phase. A square is seen for a short time only, so that few frequencies
-    can be told apart.
+    The power of all squares is added up, whatever their phase. A square is in view for a short time only, which limits the
+    resolution of the frequency.
     """
     seen = gains.seen
     instants = seen.instants
@@ -74,8 +65,8 @@ def lamp_frequency(gains: Gains) -> float:
     series -= weights * (series.sum(axis=1) / total)[:, None]
 
     def power(each: FloatArray) -> FloatArray:
-        turns = np.exp(-2j * np.pi * np.outer(instants, each))
-        return np.asarray((np.abs(series @ turns) ** 2 / total[:, None]).sum(axis=0))
+        waves = np.exp(-2j * np.pi * np.outer(instants, each))
+        return np.asarray((np.abs(series @ waves) ** 2 / total[:, None]).sum(axis=0))
 
     found = power(frequencies)
     peak = int(found.argmax())
@@ -85,14 +76,14 @@ def lamp_frequency(gains: Gains) -> float:
     # Of a wave of amplitude a, this power is a^2 / 4 for each unit of weight.
     if found[peak] < _STANDS_OUT * float(np.median(found)) or 2 * excess / weight.sum() < _SMALLEST**2:
         return 0.0
-    return best if _differs(gains, _of_all(gains, best, 1 / duration)) else 0.0
+    return best if _is_local(gains, _of_all(gains, best, 1 / duration)) else 0.0
 
 
 def _of_all(gains: Gains, frequency: float, within: float) -> float:
     """Return the frequency of the light of all of the scene near another one; that one, if no line stands out.
 
-    The whole capture tells more frequencies apart than the time for which a square is seen. At a wrong frequency, a light of
-    one phase seems to have another one at each place.
+    The resolution of the whole capture is higher than that of the time for which a square is in view. At a wrong frequency, the
+    phase of uniform light seems to differ from place to place.
     """
     instants = gains.seen.instants
     step = 1 / (8 * (instants[-1] - instants[0]))
@@ -103,7 +94,7 @@ def _of_all(gains: Gains, frequency: float, within: float) -> float:
 
 
 def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
-    """Return the values of the observations, each shared among the neighbours that a lamp lights alike: (C, S)."""
+    """Return the values of the observations, each shared among neighbours that flicker alike: (C, S)."""
     found = np.zeros((len(seen.spans), seen.n_cells))
     found[seen.times, seen.cells] = values
     for row in found:
@@ -111,17 +102,17 @@ def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
     return found.T
 
 
-def _differs(gains: Gains, frequency: float) -> bool:
-    """Return whether places flicker differently at a frequency."""
-    lamps = measure_lamps(gains, frequency)
+def _is_local(gains: Gains, frequency: float) -> bool:
+    """Return whether amplitude or phase of the flicker at a frequency differ from place to place."""
+    flicker = measure_local_flicker(gains, frequency)
     seen = np.bincount(gains.seen.cells, gains.seen.photons, gains.seen.n_cells).reshape(gains.seen.shape)
-    wave = lamps.cosine - 1j * lamps.sine
+    wave = flicker.cosine - 1j * flicker.sine
     mean = (seen * wave).sum() / seen.sum()
     scatter = float(np.sqrt((seen * np.abs(wave - mean) ** 2).sum() / seen.sum() / 2))
     return scatter > _SMALLEST
 
 
-def measure_lamps(gains: Gains, frequency: float) -> Lamps:
+def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
     """Fit the amplitude and the phase of each square of the scene.
 
     Args:
@@ -130,9 +121,9 @@ def measure_lamps(gains: Gains, frequency: float) -> Lamps:
     """
     seen = gains.seen
     lengths = np.array([len(span) for span in seen.spans], float)
-    turns = 2 * np.pi * frequency * seen.instants
+    phase = 2 * np.pi * frequency * seen.instants
     averaged = np.sinc(frequency * lengths)
-    waves = np.stack([np.ones(len(turns)), averaged * np.cos(turns), averaged * np.sin(turns)])
+    waves = np.stack([np.ones(len(phase)), averaged * np.cos(phase), averaged * np.sin(phase)])
     period = max(1, round(1 / (frequency * float(np.median(np.diff(seen.instants))))))
     slow = np.ones(len(seen.spans))
     for _ in range(_ROUNDS):
@@ -145,7 +136,7 @@ def measure_lamps(gains: Gains, frequency: float) -> Lamps:
         slow = slow / slow.mean()
     brightness = coefficients[:, 0]
     cosine, sine = _smoothed(seen, waves, slow, brightness)
-    return Lamps(frequency, cosine, sine, slow)
+    return LocalFlicker(frequency, cosine, sine, slow)
 
 
 def _relative(gains: Gains) -> tuple[FloatArray, FloatArray]:
