@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import Canvas, apply, inverse
 from photonpano.merging.light import amplitudes_on
 from photonpano.report.drawing import (
@@ -27,7 +28,6 @@ from photonpano.report.drawing import (
 )
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.unexplained import SYSTEMATIC_PX
 from photonpano.values import FloatArray, Light
 
 if TYPE_CHECKING:  # importing matplotlib takes a second

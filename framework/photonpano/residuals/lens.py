@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX
 from photonpano.values import FloatArray
 
 _INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
-_SYSTEMATIC_PX = 0.015  # error of the shift of a block beside photon noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def lens_distortion(
     if known.sum() < _INSTANTS // 4 or len(homographies) < 2:
         return None
     pattern = _pattern(known, homographies, frame_shape)
-    covariance = np.linalg.inv(information[known]) + _SYSTEMATIC_PX**2 * np.eye(2)
+    covariance = np.linalg.inv(information[known]) + SYSTEMATIC_PX**2 * np.eye(2)
     weighted = np.linalg.solve(covariance, pattern[..., None])[..., 0]
     energy = float((pattern * weighted).sum())
     if energy < 1:

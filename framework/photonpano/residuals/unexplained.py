@@ -7,11 +7,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import corners
 from photonpano.residuals.measure import Residuals
 from photonpano.values import BoolArray, FloatArray
 
-SYSTEMATIC_PX = 0.015  # error of measured shifts where frames and panorama are interpolated at different fractions of a pixel
 _SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
 _LOCAL_SPANS = 33  # the size is averaged over this many spans
 # Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations.

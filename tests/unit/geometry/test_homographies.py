@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from photonpano import geometry, photometry
 from photonpano.geometry import (
     corner_displacements,
     corners,
@@ -28,7 +29,7 @@ homographies = st.builds(lambda *p: from_parameters(p), small, small, small, sma
 points = st.lists(st.tuples(st.floats(-10, 600), st.floats(-10, 300)), min_size=1, max_size=5).map(np.array)
 
 
-def test_apply_divides_by_depth() -> None:
+def test_transform_points_divides_by_depth() -> None:
     tilted = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.001, 0.0, 1.0]])
     np.testing.assert_allclose(transform_points(tilted, [[100, 50], [0, 0]]), [[105 / 1.1, 50 / 1.1], [5, 0]])
 
@@ -40,7 +41,7 @@ def test_step_motions_shift_roll_and_zoom_about_centre_of_frame() -> None:
     np.testing.assert_allclose(transform_points(zoomed, [[10, 5], [14, 7]]), [[10, 5], [16, 8]], atol=1e-12)
 
 
-def test_apply_takes_x_as_column_and_y_as_row() -> None:
+def test_transform_points_takes_x_as_column_and_y_as_row() -> None:
     image = np.zeros((5, 7), np.float32)
     image[1, 2] = 1
     moved = cv2.warpPerspective(image, translation(3, 1), (7, 5))
@@ -49,12 +50,12 @@ def test_apply_takes_x_as_column_and_y_as_row() -> None:
     assert moved[int(y), int(x)] == 1
 
 
-def test_apply_returns_infinity_on_the_horizon_without_warning() -> None:
+def test_transform_points_returns_infinity_on_the_horizon_without_warning() -> None:
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
     assert np.isinf(transform_points(horizon, [[100, 50]])).all()
 
 
-def test_apply_maps_stacks_with_shared_or_own_points() -> None:
+def test_transform_points_maps_stacks_with_shared_or_own_points() -> None:
     stack = np.stack([translation(1, 0), translation(0, 2)])
     np.testing.assert_array_equal(transform_points(stack, [[5, 5]]), [[[6, 5]], [[5, 7]]])
     np.testing.assert_array_equal(transform_points(stack, [[[5, 5]], [[0, 0]]]), [[[6, 5]], [[0, 2]]])
@@ -135,6 +136,11 @@ def test_jacobian_agrees_with_finite_differences(homography: np.ndarray, where: 
     assert derivatives.shape == (len(where), 2, 8)
     # The derivatives by p7 and p8 grow with the square of the coordinates.
     np.testing.assert_allclose(derivatives, np.stack(differences, axis=-1), rtol=1e-4, atol=1e-2)
+
+
+def test_old_names_stay() -> None:
+    assert geometry.apply is transform_points
+    assert photometry.tapered is photometry.hann_window
 
 
 def test_corners_are_pixel_centres_clockwise() -> None:

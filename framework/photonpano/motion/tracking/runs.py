@@ -14,7 +14,7 @@ from photonpano.motion.tracking.spans import shifts_between, span_image, spectra
 from photonpano.protocols import Source
 from photonpano.values import FloatArray, FrameSpan
 
-_FEWEST = 6  # fewer sums are not tracked
+_MIN_SUMS = 6  # of a track
 DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
 _BLOCK = 32  # sums that are tracked in one task
 
@@ -57,7 +57,7 @@ def track_sums(source: Source, runs: Sequence[Sequence[FrameSpan]], context: Con
     for spans, of_run in zip(runs, blocks, strict=True):
         light, track = _joined(spans, list(islice(parts, len(of_run))))
         lit = light > DARK * np.median(light) if len(light) else light
-        if np.count_nonzero(lit) < _FEWEST:
+        if np.count_nonzero(lit) < _MIN_SUMS:
             yield None
         elif lit.all():
             yield track
