@@ -84,6 +84,19 @@ class Planes:
         return rows
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Planes with their textures.
+
+    Attributes:
+        planes: the rectangles.
+        textures: the light that each sends to the camera, up to a factor: (height, width) float16 each.
+    """
+
+    planes: Planes
+    textures: tuple[NDArray[np.float16], ...]
+
+
 @compiled
 def trace(points: FloatArray, maps: FloatArray, radii: FloatArray, owner: NDArray[np.int32], inverse_depth: FloatArray) -> None:
     """Find the nearest plane on the rays of some points of a frame.

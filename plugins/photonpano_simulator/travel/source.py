@@ -12,7 +12,7 @@ from photonpano_simulator.sensor import Draw, SpadSensor, generator
 from photonpano_simulator.travel.config import TravelConfig
 from photonpano_simulator.travel.paths import matrix_of, poses_of, require_free
 from photonpano_simulator.travel.rendering import View, atlas_of
-from photonpano_simulator.travel.scenes import Stage, with_objects
+from photonpano_simulator.travel.stage import Stage, with_objects
 from photonpano_simulator.travel.truth import TravelTruth, sharp_view
 
 _METERED = 9
@@ -34,7 +34,7 @@ class TravelSource(SingleFrameSource):
         taken = delivered(config.n_frames, config.drops, config.repeats)
         stage, matrix = Stage(config), matrix_of(config)
         poses = poses_of(config, stage.middle, self._seed)
-        require_free(poses, matrix, config.frame_shape, stage.planes, stage.room)
+        require_free(poses, matrix, config.frame_shape, stage.planes, stage.free)
         scene = stage.drawn(context.threads)
         metered = View(scene.planes, atlas_of(scene.textures), matrix, config.frame_shape)
         frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
@@ -108,7 +108,7 @@ def problems_of(config: TravelConfig) -> list[str]:
     )
     try:
         stage = Stage(still)
-        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.room)
+        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.free)
     except InputError as error:
         problems.append(str(error))
     return problems

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano_simulator.street import street
+from photonpano_simulator.scenes import street
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (333, 500), (64, 160), (300, 64)])

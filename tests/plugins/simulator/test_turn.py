@@ -16,7 +16,7 @@ from photonpano.geometry import Camera, corner_displacements, rotation_vectors
 from photonpano_simulator import scenes
 from photonpano_simulator.config import CameraSimulatorConfig, SimulatorConfig
 from photonpano_simulator.source import SimulatorSource
-from photonpano_simulator.street import street
+from photonpano_simulator.scenes import street
 
 SHAPE = (64, 96)
 FOCAL = 80.0
