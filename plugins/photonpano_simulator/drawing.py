@@ -208,14 +208,14 @@ class Drawing(Chance):
                 tones = np.linspace(tone, self.number(mark["to"], names), region.shape[0], dtype=np.float32)[:, None]
             region[:] = tones if "tone" in mark else region * tones
 
-    def _shape_of(self, shape: str | Sequence[Sequence[float]], box: Box, tone: float) -> None:
+    def _shape_of(self, shape: Any, box: Box, tone: float) -> None:
         """Fill a disc, or a polygon with corners at shares of the box."""
         x, y, width, height = box
         if shape == "disc":
             middle, radii = self._fixed([(x + width / 2, y + height / 2), (width / 2, height / 2)]).tolist()
             cv2.ellipse(self._image, middle, radii, 0, 0, 360, tone, -1, cv2.LINE_8, _FRACTION_BITS)
         else:
-            points = [(x + width * float(across), y + height * float(down)) for across, down in shape]
+            points = [(x + width * float(point[0]), y + height * float(point[1])) for point in shape]
             cv2.fillPoly(self._image, [self._fixed(points)], tone, cv2.LINE_8, _FRACTION_BITS)
 
     def _bricks(self, mark: Mark, box: Box, names: Names) -> None:

@@ -1,4 +1,4 @@
-"""Scenes as pictures: the flux of a photograph, or of the built-in street by day or at night."""
+"""Scenes as pictures: the flux of a photograph, or of the built-in street by day or at night, and lamps that flicker."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
 from photonpano.reading import look_first, read_picture
-from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
+from photonpano_simulator.config import Lamp, NightScene, PhotoScene, StreetScene
 from photonpano_simulator.drawing import Drawing, pictures_of, read_scene
 
 _LUMINANCE = (0.0722, 0.7152, 0.2126)  # of blue, green and red, in the order of OpenCV (IEC 61966-2-1)
@@ -101,7 +101,7 @@ def _paint(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     logs = np.clip(_COLOUR_STD * rng.standard_normal((n_patches, 2)), -_STRONGEST_COLOUR, _STRONGEST_COLOUR)
     shares = np.exp(np.stack([logs[:, 0], np.zeros(n_patches), logs[:, 1]], axis=-1))
     shares /= shares.sum(axis=-1, keepdims=True)
-    nearest = KDTree(places).query(np.stack(np.indices(shape), axis=-1).reshape(-1, 2))[1].reshape(shape)
+    nearest = KDTree(places).query(np.indices(shape).reshape(2, -1).T)[1].reshape(shape)
     return np.asarray(shares[nearest], np.float32)
 
 
@@ -149,3 +149,35 @@ def photograph(path: Path, width: int | None = None, in_colour: bool = False) ->
             f"{path} is {linear.shape[1]}x{linear.shape[0]} px; set scene.width so that no side exceeds {_LARGEST} px"
         )
     return linear
+
+
+def brightness(lamp: Lamp, n_frames: int, frame_rate_hz: float) -> NDArray[np.float64]:
+    """Return the light of a lamp in each frame: (n_frames,), 1 on average."""
+    turns = np.arange(n_frames) / frame_rate_hz * lamp.frequency_hz
+    return np.asarray(1 + lamp.depth * np.cos(2 * np.pi * turns + np.deg2rad(lamp.phase_deg)))
+
+
+def shares(lamps: tuple[Lamp, ...], scene_shape: tuple[int, int], is_round: bool = False) -> NDArray[np.float32]:
+    """Return the share of each lamp in the light of each place of the scene.
+
+    Args:
+        lamps: of the scene.
+        scene_shape: (height, width).
+        is_round: whether the left and the right end of the scene meet.
+
+    Returns:
+        (N, Hs, Ws); where the lamps together would give more than all of the light, each gives less.
+    """
+    height, width = scene_shape
+    found = np.ones((len(lamps), height, width), np.float32)
+    for lamp, share in zip(lamps, found, strict=True):
+        if lamp.at is not None:
+            x, y = lamp.at[0] * width - 0.5, lamp.at[1] * height - 0.5
+            std_px = lamp.radius * height
+            beside = np.arange(width) - x
+            if is_round:
+                beside = np.mod(beside + width / 2, width) - width / 2
+            across = np.exp(-(beside**2) / (2 * std_px**2))
+            down = np.exp(-((np.arange(height) - y) ** 2) / (2 * std_px**2))
+            share[:] = np.outer(down, across)
+    return np.asarray(found / np.maximum(found.sum(axis=0), 1), np.float32)

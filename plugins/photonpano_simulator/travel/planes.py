@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.compiling import compiled
 
-_EDGE_ON = 1e-9
-"""A rectangle is not seen from its plane: the volume that it spans with the camera, relative to that of a box."""
+_EDGE_ON = 1e-9  # a rectangle is not seen from its plane: the volume that it spans with the camera, relative to that of a box
 
 
 @dataclass(frozen=True, slots=True, eq=False)

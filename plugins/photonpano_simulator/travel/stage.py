@@ -37,9 +37,9 @@ from photonpano_simulator.drawing import Chance, Drawing, Names, pictures_of, re
 from photonpano_simulator.objects import texture_of
 from photonpano_simulator.scenes import photograph
 from photonpano_simulator.sensor import Draw, generator
-from photonpano_simulator.travel.config import TravelConfig, WorldObject
 from photonpano_simulator.travel.lighting import Lighting, light_on
 from photonpano_simulator.travel.planes import Planes, Scene
+from photonpano_simulator.travel_config import TravelConfig, WorldObject
 
 _NEAREST_M = 0.6  # textures are as fine as pixels at the distance of their plane, but not finer than pixels at this distance
 _MOST_TEXELS = 24_000_000  # beyond, all textures are coarser; texels take 2 bytes each in the truth
@@ -115,9 +115,7 @@ class Stage:
         with ThreadPoolExecutor(max(1, threads)) as pool:
             return Scene(self.planes, tuple(pool.map(texture, range(len(self._sheets)))))
 
-    def _placed(
-        self, things: Sequence[Mapping[str, Any]], place: _Place, names: Names
-    ) -> Iterator[tuple[_Sheet, str | None]]:
+    def _placed(self, things: Sequence[Mapping[str, Any]], place: _Place, names: Names) -> Iterator[tuple[_Sheet, str | None]]:
         """Yield the rectangles of some things, each with the side that a photograph changes."""
         for thing in things:
             for at in thing.get("each", [thing.get("at", (0, 0, 0))]):

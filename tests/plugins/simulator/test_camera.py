@@ -7,8 +7,7 @@ import pytest
 
 from photonpano import FrameSpan, SourceContext
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor
-from photonpano_simulator.intensity import IntensityCamera
-from photonpano_simulator.sensor import Draw, generator
+from photonpano_simulator.sensor import Draw, IntensityCamera, generator
 from photonpano_simulator.source import SimulatorSource
 
 SHAPE = (200, 301)

@@ -15,8 +15,8 @@ from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.geometry import Camera, corner_displacements, rotation_vectors
 from photonpano_simulator import scenes
 from photonpano_simulator.config import CameraSimulatorConfig, SimulatorConfig
-from photonpano_simulator.source import SimulatorSource
 from photonpano_simulator.scenes import street
+from photonpano_simulator.source import SimulatorSource
 
 SHAPE = (64, 96)
 FOCAL = 80.0
