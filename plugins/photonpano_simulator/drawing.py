@@ -15,7 +15,7 @@ A picture is a list of marks, which are drawn one over the other. A mark is a ma
     shape: `disc`, or the corners of a polygon, as shares of the box; a rectangle by default
     bricks: [width, height], of a `tone` with a standard deviation of `spread`, and of joints of the tone `joint`
     noise: [amount, finest, coarsest]: 1/f noise from spots of one size to spots of another, by which tones are multiplied
-    text: letters, or a list of them, as large as fit, in a `tone`, of a `weight` from 100 to 900
+    text: letters, or a list of them, as large as fit, in a `tone`, of a `weight` from 100 to 900 and a `font`, sans or italic
 
 A number is written as itself, as a share of the side of the box ("30%", "100%-20"), as a name ("wall", "wall*0.8"), as
 [low, high] for any number between, or as a longer list, of which one is taken.
