@@ -227,10 +227,13 @@ def looking(ahead: FloatArray) -> FloatArray:
     Convention:
         x right, y down, z ahead. A camera cannot be level that looks straight up or down.
     """
-    ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-    right = np.stack([ahead[:, 2], np.zeros(len(ahead)), -ahead[:, 0]], axis=1)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    x, y, z = ahead.T
+    side = np.hypot(x, z)
+    reach, zero = np.hypot(side, y), np.zeros_like(x)
+    sin_yaw, cos_yaw, sin_pitch, cos_pitch = x / side, z / side, y / reach, side / reach
+    right = np.stack([cos_yaw, zero, -sin_yaw], axis=1)
+    down = np.stack([-sin_yaw * sin_pitch, cos_pitch, -cos_yaw * sin_pitch], axis=1)
+    return np.stack([right, down, np.stack([sin_yaw * cos_pitch, sin_pitch, cos_yaw * cos_pitch], axis=1)], axis=1)
 
 
 def _rotations(displacements: FloatArray, focal: float) -> FloatArray:
