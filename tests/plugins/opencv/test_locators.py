@@ -81,7 +81,7 @@ def test_masked_third_does_not_bias_motion(name: str, seen_from: Callable) -> No
     assert error_px(motion, true) < 2 * TOLERANCE_PX[name]
 
 
-@pytest.mark.parametrize(("name", "seeds"), [("opencv-sift", (1, 2)), ("opencv-orb", (0, 2))], indirect=["name"])
+@pytest.mark.parametrize(("name", "seeds"), [("opencv-sift", (21, 28)), ("opencv-orb", (0, 7))], indirect=["name"])
 def test_turning_locates_pairs_in_the_dark_that_homographies_lose(
     name: str, seeds: tuple[int, ...], seen_from: Callable
 ) -> None:
