@@ -12,7 +12,6 @@ import pytest
 from photonpano import FrameSpan, Group
 from photonpano.context import Context
 from photonpano.motion.start import StartingMotion, starting_motion
-from photonpano.testing.scenes import detected
 
 SHAPE = (64, 96)
 LENGTH = 32
@@ -30,10 +29,11 @@ def started(memory_source: type) -> Callable[..., StartingMotion | None]:
     """Simulate a pan over a scene in steps of a px, behind what stands in front, and measure its start."""
 
     def started(scene: np.ndarray, px_per_frame: float, n_frames: int = 128, front: np.ndarray | None = None) -> Any:
+        rng = np.random.default_rng(0)
         views = [scene[:, int(px_per_frame * frame) :][:, : SHAPE[1]] for frame in range(n_frames)]
         if front is not None:
             views = [np.where(np.isnan(front), view, front) for view in views]
-        source = memory_source(detected(views))
+        source = memory_source([rng.random(SHAPE) < -np.expm1(-view) for view in views])
         length = LENGTH if front is None else 2 * LENGTH
         spans = [FrameSpan(start, start + length) for start in range(0, n_frames, length)]
         return starting_motion(source, [Group(span, span.centre) for span in spans], Context())
