@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from photonpano import InputError, SourceContribution, hookimpl
 from photonpano.reading import missing_file
 from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig
-from photonpano_simulator.travel.config import TravelConfig
+from photonpano_simulator.travel_config import TravelConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from photonpano_simulator.source import SimulatorSource
     from photonpano_simulator.travel.source import TravelSource
 
-_CHECKED_FRAMES = 5000
-"""Frames of a path that are checked before a run, to find out whether it leaves the scene."""
+_CHECKED_FRAMES = 5000  # frames of a path that are checked before a run, to find out whether it leaves the scene
 
 
 def _build(config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> SimulatorSource:
@@ -29,7 +28,7 @@ def _build(config: SimulatorConfig | CameraSimulatorConfig, context: SourceConte
 
 def _check(config: SimulatorConfig | CameraSimulatorConfig) -> Sequence[str]:
     """Look for missing files, for wrong ranges of frames, and for a path that leaves the scene where its size is known."""
-    from photonpano_simulator.delivery import delivered
+    from photonpano_simulator.recording import delivered
 
     files = [config.sensor.dark_rates, config.sensor.hot_pixels] if isinstance(config.sensor, Sensor) else []
     if isinstance(config.sensor, Sensor) and isinstance(config.sensor.filters, Path):

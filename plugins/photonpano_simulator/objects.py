@@ -10,8 +10,7 @@ from photonpano import FloatArray
 from photonpano_simulator.config import FrameObject
 from photonpano_simulator.sensor import Draw, generator
 
-_DETAIL_PX = (1.5, 5.0, 15.0)
-"""Standard deviations of the Gaussian kernels that make a texture of white noise."""
+_DETAIL_PX = (1.5, 5.0, 15.0)  # standard deviations of the Gaussian kernels that make a texture of white noise
 
 
 class DrawnObject:

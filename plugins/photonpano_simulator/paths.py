@@ -10,11 +10,12 @@ Convention:
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import Camera, apply, inverse, normalised, rescaling, rotation_matrices
+from photonpano.geometry import Camera, apply, camera_matrix, inverse, normalised, rescaling, rotation_matrices
 from photonpano.reading import read_array, read_arrays
 from photonpano_simulator.config import (
     FilePath,
@@ -30,12 +31,13 @@ from photonpano_simulator.config import (
 from photonpano_simulator.lens import camera, outline
 from photonpano_simulator.sensor import Draw, generator
 
-_DENSE = 100_000
-"""Points of a curve before it is resampled at constant speed; the error is far below 0.001 px."""
-_POINTS_OF_A_SIDE = 17
-"""Points along each side of a frame that must lie in the panorama."""
-_BLOCK = 8192
-"""Frames that are checked at a time, which bounds the memory."""
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+_DENSE = 100_000  # points of a curve before it is resampled at constant speed; the error is far below 0.001 px
+_POINTS_OF_A_SIDE = 17  # points along each side of a frame that must lie in the panorama
+_BLOCK = 8192  # frames that are checked at a time, which bounds the memory
+_SPLINE_REACH = (1.0, 0.5)  # how far a random path reaches along x and y, relative to each other
 
 
 def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
@@ -58,7 +60,7 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
         rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
         homographies = to_scene @ _intrinsics(in_frame_px, focal) @ rotations @ np.linalg.inv(frame)
     if path.shake is not None:
-        shaking = _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
+        shaking = shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
         homographies = homographies @ frame @ shaking @ np.linalg.inv(frame)
     homographies = normalised(homographies)
     _require_inside(homographies, outline(config), scene_shape)
@@ -111,7 +113,7 @@ def _turn(config: SimulationConfig, path: TurnPath, scene_shape: tuple[int, int]
     rotations = rotations @ rotation_matrices(np.stack([zero, zero, roll], axis=1))
     if path.shake is not None:
         random = generator(seed, Draw.SHAKE)
-        rotations = rotations @ _shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, random)
+        rotations = rotations @ shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, random)
     _require_seen(rotations, camera(config), outline(config), scene_shape)
     return camera(config).homographies(rotations)
 
@@ -147,7 +149,8 @@ def _centres(path: PanPath | ScanPath | LoopPath | SplinePath | HandShakePath, n
             ellipse = np.stack([path.aspect * np.cos(angles), np.sin(angles)], axis=1)
             return _at_constant_speed(ellipse * (path.length_px / _length(ellipse)), n_frames)
         case SplinePath():
-            return _spline(path, n_frames)
+            rng = generator(path.seed, Draw.PATH)
+            return random_path(_SPLINE_REACH, path.length_px, path.knots, np.linspace(0, 1, n_frames), rng)
         case HandShakePath():
             return np.zeros((n_frames, 2))
 
@@ -171,15 +174,30 @@ def _raster(path: ScanPath) -> FloatArray:
     return np.concatenate(points)
 
 
-def _spline(path: SplinePath, n_frames: int) -> FloatArray:
-    """Return a cubic spline through random points, evenly spaced in time."""
-    from scipy.interpolate import CubicSpline
+def random_path(
+    reach: tuple[float, ...], length: float, knots: int, progress: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Return a cubic spline through random points, (T, D), around 0, whose speed changes on the way.
 
-    knots = generator(path.seed, Draw.PATH).uniform((-1.0, -0.5), (1.0, 0.5), (path.knots, 2))
-    spline = CubicSpline(np.linspace(0, 1, path.knots), knots, bc_type="natural")
+    Args:
+        reach: how far it reaches along each axis, relative to each other.
+        length: of the path.
+        knots: number of random points, evenly spaced in time.
+        progress: (T,) times from 0 to 1.
+        rng: draws the points.
+    """
+    spline = random_spline(reach, knots, rng)
     dense = spline(np.linspace(0, 1, _DENSE))
     middle = (dense.min(axis=0) + dense.max(axis=0)) / 2
-    return np.asarray((spline(np.linspace(0, 1, n_frames)) - middle) * (path.length_px / _length(dense)))
+    return np.asarray((spline(progress) - middle) * (length / _length(dense)))
+
+
+def random_spline(reach: tuple[float, ...], knots: int, rng: np.random.Generator) -> CubicSpline[np.float64]:
+    """Return a spline from times, 0 to 1, to points (T, D) between -reach and reach."""
+    from scipy.interpolate import CubicSpline
+
+    points = rng.uniform(-1, 1, (knots, len(reach))) * np.array(reach)
+    return CubicSpline(np.linspace(0, 1, knots), points, bc_type="natural")
 
 
 def _length(points: FloatArray) -> float:
@@ -200,31 +218,33 @@ def _middle(shape: tuple[float, float]) -> FloatArray:
 
 def _intrinsics(shape: tuple[float, float], focal: float) -> FloatArray:
     x, y = _middle(shape)
-    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
+    return camera_matrix(focal, (x, y))
+
+
+def looking(ahead: FloatArray) -> FloatArray:
+    """Return rotations of the world to level cameras that look along directions (T, 3): (T, 3, 3).
+
+    Convention:
+        x right, y down, z ahead. A camera cannot be level that looks straight up or down.
+    """
+    x, y, z = ahead.T
+    side = np.hypot(x, z)
+    reach, zero = np.hypot(side, y), np.zeros_like(x)
+    sin_yaw, cos_yaw, sin_pitch, cos_pitch = x / side, z / side, y / reach, side / reach
+    right = np.stack([cos_yaw, zero, -sin_yaw], axis=1)
+    down = np.stack([-sin_yaw * sin_pitch, cos_pitch, -cos_yaw * sin_pitch], axis=1)
+    return np.stack([right, down, np.stack([sin_yaw * cos_pitch, sin_pitch, cos_yaw * cos_pitch], axis=1)], axis=1)
 
 
 def _rotations(displacements: FloatArray, focal: float) -> FloatArray:
     """Return rotations, first about x and then about y, that move the centre of the image by (T, 2) px: (T, 3, 3)."""
-    x, y = displacements.T
-    side = np.hypot(x, focal)
-    reach = np.hypot(side, y)
-    sin_yaw, cos_yaw, sin_pitch, cos_pitch = x / side, focal / side, y / reach, side / reach
-    zero = np.zeros_like(x)
-    return _stacked(
-        [
-            [cos_yaw, -sin_yaw * sin_pitch, sin_yaw * cos_pitch],
-            [zero, cos_pitch, sin_pitch],
-            [-sin_yaw, -cos_yaw * sin_pitch, cos_yaw * cos_pitch],
-        ]
-    )
+    return np.swapaxes(looking(np.column_stack([displacements, np.full(len(displacements), focal)])), 1, 2)
 
 
-def _shake_rotations(shake: Shake, n_frames: int, frame_rate_hz: float, focal: float, rng: np.random.Generator) -> FloatArray:
+def shake_rotations(shake: Shake, n_frames: int, frame_rate_hz: float, focal: float, rng: np.random.Generator) -> FloatArray:
     """Return the rotations of a shaking camera: (T, 3, 3)."""
     x, y, roll = sums_of_sines(3, shake.frequencies_hz, n_frames, frame_rate_hz, rng)
-    roll = np.deg2rad(shake.roll_rms_deg) * roll
-    zero, one = np.zeros(n_frames), np.ones(n_frames)
-    rolls = _stacked([[np.cos(roll), -np.sin(roll), zero], [np.sin(roll), np.cos(roll), zero], [zero, zero, one]])
+    rolls = rotation_matrices(np.outer(np.deg2rad(shake.roll_rms_deg) * roll, (0, 0, 1)))
     return np.asarray(_rotations(shake.rms_px * np.stack([x, y], axis=1), focal) @ rolls)
 
 
@@ -236,11 +256,6 @@ def sums_of_sines(
     phase = 2 * np.pi * np.asarray(frequencies_hz)[:, None] * np.arange(n_frames) / frame_rate_hz
     # The sum of n sines of amplitude sqrt(2 / n) has the root mean square 1.
     return np.asarray(np.sqrt(2 / len(frequencies_hz)) * np.sin(phase + phases).sum(axis=1))
-
-
-def _stacked(rows: list[list[FloatArray]]) -> FloatArray:
-    """Return (T, 3, 3) from three rows of three arrays (T,)."""
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tuple[int, int]) -> None:

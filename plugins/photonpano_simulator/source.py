@@ -5,32 +5,65 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FrameSpan, SourceContext, StreamInfo
+from photonpano import FloatArray, FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.reading import SingleFrameSource
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig, TurnPath
-from photonpano_simulator.delivery import delivered
-from photonpano_simulator.intensity import IntensityCamera
-from photonpano_simulator.lamps import brightness, shares
 from photonpano_simulator.lens import camera, distorts, transmission, undistorted
 from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.paths import camera_path, camera_rotations, scene_motion
-from photonpano_simulator.scenes import scene_flux
-from photonpano_simulator.sensor import Draw, SpadSensor, bayer_of, filter_array, generator
+from photonpano_simulator.recording import delivered
+from photonpano_simulator.scenes import brightness, scene_flux, shares
+from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, bayer_of, filter_array, generator
+from photonpano_simulator.travel_config import TravelConfig
 from photonpano_simulator.views import Views
 
 
-class SimulatorSource(SingleFrameSource):
-    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
+class SimulatedSource(SingleFrameSource):
+    """A simulated camera, whose frames depend only on the config, the seed and their index.
 
-    A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread.
+    Raises:
+        InputError: a file of the sensor cannot be used, or frames are dropped that do not exist.
+    """
+
+    def __init__(self, config: SimulatorConfig | CameraSimulatorConfig | TravelConfig, context: SourceContext) -> None:
+        self._seed = context.seed if config.seed is None else config.seed
+        self._taken = delivered(config.n_frames, config.drops, config.repeats)
+        self._light: FloatArray = config.drift ** np.linspace(0, 1, config.n_frames)
+        self._sensor: SpadSensor | IntensityCamera
+        if isinstance(config.sensor, IntensitySensor):
+            self._sensor = IntensityCamera(config.sensor, config.frame_shape)
+        else:
+            self._sensor = SpadSensor(config.sensor, config.frame_shape, self._seed)
+        kind, bits, bayer = self._sensor.kind, self._sensor.bits, bayer_of(config.sensor)
+        self.info = StreamInfo(len(self._taken), *config.frame_shape, config.frame_rate_hz, kind, bits, bayer)
+        self.response = self._sensor.response
+        self.valid: NDArray[np.bool_] = self._sensor.valid
+        self.valid.flags.writeable = False
+
+    def truth(self) -> dict[str, NDArray[np.generic]]:
+        """Return the ground truth of any camera: shape, rate, seed, and that of its sensor."""
+        return {
+            "frame_shape": np.array(self.info.frame_shape),
+            "frame_rate_hz": np.array(self.info.frame_rate_hz),
+            "seed": np.array(self._seed),
+            **self._sensor.truth(),
+        }
+
+    def _exposed(self, flux: NDArray[np.float32], taken: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
+        """Return a frame of the flux at its pixels, (H, W), which is overwritten."""
+        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
+
+
+class SimulatorSource(SimulatedSource):
+    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
 
     Raises:
         InputError: a file cannot be used, the camera path leaves the scene, or frames are dropped that do not exist.
     """
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> None:
-        self._seed = context.seed if config.seed is None else config.seed
+        super().__init__(config, context)
         flux = config.flux * config.sensor.quantum_efficiency
         filters = filter_array(config.sensor, config.frame_shape) if isinstance(config.sensor, Sensor) else None
         self._filters = filters
@@ -40,31 +73,19 @@ class SimulatorSource(SingleFrameSource):
         self._homographies = camera_path(config, (height, width), self._seed)
         self._config, self._views = config, Views(config)
         self._averages = self._views.averaged(self._scene)
-        self._taken = delivered(config.n_frames, config.drops, config.repeats)
         motion = (
             scene_motion(self._homographies, config.frame_shape, config.path)
             if config.objects
             else np.zeros((config.n_frames, 2))
         )
         self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
-        self._light = config.drift ** np.linspace(0, 1, config.n_frames)
         self._lamps = shares(config.lamps, (height, width), is_round)
         self._lit_parts = [self._views.averaged(np.ascontiguousarray((self._scene.T * share.T).T)) for share in self._lamps]
         self._lamp_light = np.zeros((len(config.lamps), config.n_frames))
         for place, lamp in enumerate(config.lamps):
             self._lamp_light[place] = brightness(lamp, config.n_frames, config.frame_rate_hz)
-        self._sensor: SpadSensor | IntensityCamera
-        if isinstance(config.sensor, IntensitySensor):
-            self._sensor = IntensityCamera(config.sensor, config.frame_shape)
-        else:
-            self._sensor = SpadSensor(config.sensor, config.frame_shape, self._seed)
         self._gains = transmission(config.lens, config.frame_shape) * self._sensor.gains
         self._is_uniform = bool(np.all(self._gains == 1)) and config.drift == 1
-        kind, bits = self._sensor.kind, self._sensor.bits
-        self.info = StreamInfo(len(self._taken), *config.frame_shape, config.frame_rate_hz, kind, bits, bayer_of(config.sensor))
-        self.response = self._sensor.response
-        self.valid: NDArray[np.bool_] = self._sensor.valid
-        self.valid.flags.writeable = False
 
     def frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
         """Return a frame: (H, W) of zeros and ones, or of grey levels."""
@@ -72,7 +93,7 @@ class SimulatorSource(SingleFrameSource):
         flux = self._flux(taken)
         if not self._is_uniform:
             flux *= self._gains * np.float32(self._light[taken])
-        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
+        return self._exposed(flux, taken)
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the frames.
@@ -98,11 +119,8 @@ class SimulatorSource(SingleFrameSource):
         truth: dict[str, NDArray[np.generic]] = {
             "homographies": self._homographies[self._taken],
             "scene": self._scene,
-            "frame_shape": np.array(self.info.frame_shape),
-            "frame_rate_hz": np.array(self.info.frame_rate_hz),
-            "seed": np.array(self._seed),
             "scene_projection": np.array("spherical" if isinstance(self._config.path, TurnPath) else "planar"),
-            **self._sensor.truth(),
+            **super().truth(),
         }
         rotations = camera_rotations(self._config, self._homographies[self._taken], self._scene.shape[:2])
         if rotations is not None:

@@ -90,16 +90,9 @@ def _look_around(
     columns: NDArray[np.float32],
     rows: NDArray[np.float32],
 ) -> None:
-    """Write where points of a frame lie in an equirectangular panorama.
+    """Write where `points` (2, H, W), pixels that `rays` (3, 3) maps to directions, lie in a panorama of 360 degrees.
 
-    Args:
-        points: (2, H, W), x and y of pixels of the frame.
-        rays: (3, 3), pixels of the frame to directions.
-        width: of the panorama: 360 degrees.
-        height: of the panorama, whose middle is the horizon.
-        offset: subtracted from the positions.
-        columns: (H, W) output, at least 0 and below `width`.
-        rows: (H, W) output.
+    `columns` and `rows` (H, W) are the outputs, less `offset`: columns from 0 to below `width`; the middle row is the horizon.
     """
     per_radian = width / (2 * np.pi)
     for i in range(columns.shape[0]):

@@ -38,9 +38,9 @@ from photonpano_core.robust_merge import RobustMerger
 from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.source import SimulatorSource
-from photonpano_simulator.travel.config import TravelConfig
 from photonpano_simulator.travel.source import TravelSource
 from photonpano_simulator.travel.truth import flow, truth_of
+from photonpano_simulator.travel_config import TravelConfig
 
 SHAPE = (254, 496)
 BORDER_PX, AWAY_PX, MOVES_PX, EVERY = 12, 8, 1.0, 20

@@ -1,4 +1,4 @@
-"""A scene whose flux is defined at every point, so that every view of it is exact."""
+"""Scenes and what a binary camera sees of them: exact views, textures, pans, and photon noise."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from photonpano.geometry import apply
-from photonpano.values import FloatArray, Homography
+from photonpano.values import BoolArray, FloatArray, Homography
 
 _WAVES = 64
 _PERIODS_PX = (6.0, 120.0)
-# Slope of the sigmoid that limits the sum of waves to the range of the flux, and gives blobs and edges.
-_CONTRAST = 2.5
+_CONTRAST = 2.5  # slope of the sigmoid that limits the sum of waves to the range of the flux, and gives blobs and edges
+_DETAIL_PX = (1, 2, 4, 8)  # standard deviations of the Gaussian kernels that make a texture of white noise
 
 
 class Scene:
@@ -53,3 +53,44 @@ class Scene:
         """
         y, x = np.mgrid[: shape[0], : shape[1]]
         return self.flux(apply(homography, np.stack([x.ravel(), y.ravel()], axis=1))).reshape(shape)
+
+
+def textured(shape: tuple[int, int], flux: float = 0.5, contrast: float = 0.8, seed: int = 0) -> FloatArray:
+    """Return an image of flux, (H, W), with details of 2 to 20 px: its mean, and the standard deviation of its logarithm."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    noise = np.sum([size * cv2.GaussianBlur(rng.normal(0, 1, shape), (0, 0), size) for size in _DETAIL_PX], axis=0)
+    scene = np.exp(contrast * noise / noise.std())
+    return np.asarray(scene * (flux / scene.mean()))
+
+
+def seen_along(scene: ArrayLike, homographies: ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Return what frames see of an image of flux.
+
+    Args:
+        scene: (Hs, Ws) flux; it is mirrored at its border, and interpolated linearly.
+        homographies: (T, 3, 3), pixels of a frame to pixels of the scene.
+        shape: (height, width) of a frame.
+
+    Returns:
+        (T, H, W) flux.
+    """
+    import cv2
+
+    scene, size = np.asarray(scene), shape[::-1]
+    flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REFLECT
+    maps = np.asarray(homographies, np.float64).reshape(-1, 3, 3)
+    return np.stack([cv2.warpPerspective(scene, there, size, flags=flags, borderMode=border) for there in maps])
+
+
+def detected(flux: ArrayLike, seed: int | np.random.Generator = 0) -> BoolArray:
+    """Draw the frames of a binary camera (paper, equation 2): 1 with the probability 1 - exp(-flux), of the shape of `flux`."""
+    flux = np.asarray(flux)
+    return np.asarray(np.random.default_rng(seed).random(flux.shape, np.float32) < -np.expm1(-flux), np.bool_)
+
+
+def z_scores(counts: ArrayLike, n_frames: int, flux: ArrayLike) -> FloatArray:
+    """Return the deviations of counts of a binary camera from a flux, in standard deviations of photon noise."""
+    chance = -np.expm1(-np.asarray(flux, np.float64))
+    return np.asarray((np.asarray(counts) - n_frames * chance) / np.sqrt(n_frames * chance * (1 - chance)))

@@ -11,14 +11,10 @@ from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano_simulator.travel.planes import Planes
 
-_SPACING_M = 0.1
-"""Distance between the places of a plane at which light is computed."""
-_MOST_PLACES = 90
-"""Places along a side, at most."""
-_DIRECTIONS, _POINTS = 48, 16
-"""Directions of the light from everywhere, and points of each lamp."""
-_GAP_M = 1e-3
-"""Rays begin this far above their plane."""
+_SPACING_M = 0.1  # distance between the places of a plane at which light is computed
+_MOST_PLACES = 90  # places along a side, at most
+_DIRECTIONS, _POINTS = 48, 16  # directions of the light from everywhere, and points of each lamp
+_GAP_M = 1e-3  # rays begin this far above their plane
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +44,12 @@ def light_on(planes: Planes, index: int, lighting: Lighting) -> NDArray[np.float
     places = planes.corner[index] + _GAP_M * towards + a[None, :, None] * along + b[:, None, None] * down
     points = places.reshape(-1, 3)
     inverses = np.linalg.inv(np.stack([planes.along, planes.down, np.cross(planes.along, planes.down)], axis=-1))
-    light = np.full(len(points), 0.0)
-    directions = _around(towards)
     open_share = np.zeros(len(points))
-    for direction in directions:
-        _unblocked(points, np.broadcast_to(direction * lighting.shadow_m, points.shape), planes.corner, inverses, open_share)
-    light += lighting.ambient * open_share / len(directions)
+    # Points of a sphere that touches the plane lie in directions that are denser where the light counts more: by the cosine.
+    for direction in _ball(_DIRECTIONS) + towards:
+        way = direction * (lighting.shadow_m / np.linalg.norm(direction))
+        _unblocked(points, np.broadcast_to(way, points.shape), planes.corner, inverses, open_share)
+    light = lighting.ambient * open_share / _DIRECTIONS
     for x, y, z, radius, power in lighting.lamps:
         for offset in _ball(_POINTS):
             ways = np.array([x, y, z]) + radius * offset - points
@@ -85,18 +81,6 @@ def _unblocked(points: FloatArray, ways: FloatArray, corners: FloatArray, invers
                 break
         if is_free:
             total[n] += 1.0
-
-
-def _around(towards: FloatArray) -> FloatArray:
-    """Return directions of the half space above a plane, (N, 3), denser where the light counts more: by the cosine."""
-    steps = np.arange(_DIRECTIONS) + 0.5
-    sine, turn = np.sqrt(steps / _DIRECTIONS), np.pi * (3 - 5**0.5) * steps
-    helper = np.eye(3)[np.abs(towards).argmin()]
-    right = np.cross(towards, helper)
-    right /= np.linalg.norm(right)
-    up = np.cross(towards, right)
-    flat = (sine * np.cos(turn))[:, None] * right + (sine * np.sin(turn))[:, None] * up
-    return np.asarray(flat + np.sqrt(1 - sine**2)[:, None] * towards)
 
 
 def _ball(count: int) -> FloatArray:

@@ -11,21 +11,15 @@ import numpy as np
 
 from photonpano import FloatArray, InputError
 from photonpano.geometry import Camera, camera_matrix, rotation_matrices
-from photonpano_simulator.paths import sums_of_sines
+from photonpano_simulator.paths import looking, random_path, random_spline, shake_rotations, sums_of_sines
 from photonpano_simulator.sensor import Draw, generator
-from photonpano_simulator.travel.config import TravelConfig, TravelPath
 from photonpano_simulator.travel.planes import Planes, trace
+from photonpano_simulator.travel_config import TravelConfig, TravelPath
 
-_DENSE = 20_000
-"""Points of a path from which its length is measured."""
-_CHECKED = 2000
-"""Frames at which a path is checked, at most."""
-_LOOKED = 60
-"""Frames of which it is checked that they see the scene everywhere, at most."""
-_GRID = 9
-"""Points along each side of such a frame."""
-_REACH = (1.0, 0.45, 0.6)
-"""How far a random path reaches along x, y and z, relative to each other."""
+_CHECKED = 2000  # frames at which a path is checked, at most
+_LOOKED = 60  # frames of which it is checked that they see the scene everywhere, at most
+_GRID = 9  # points along each side of such a frame
+_REACH = (1.0, 0.45, 0.6)  # how far a random path reaches along x, y and z, relative to each other
 
 
 def matrix_of(config: TravelConfig) -> FloatArray:
@@ -50,19 +44,18 @@ def poses_of(config: TravelConfig, middle: FloatArray, seed: int) -> FloatArray:
     target = middle if path.look_at is None else np.array(path.look_at)
     progress = np.linspace(0, 1, n_frames)
     if isinstance(path, TravelPath):
-        positions, turns = _travel(path, progress)
-        rotations = rotation_matrices(turns) @ _looking(positions, target)
+        rng, gaze = generator(path.seed, Draw.PATH), random_spline((1, 1, 1), path.knots, generator(path.seed, Draw.GAZE))
+        positions = np.array(path.centre) + random_path(_REACH, path.length_m, path.knots, progress, rng)
+        rotations = rotation_matrices(np.deg2rad(path.wander_deg) * gaze(progress)) @ _looking(positions, target)
     else:
         positions = np.broadcast_to(np.array(path.centre), (n_frames, 3))
         yaw = np.deg2rad(path.degrees) * (progress - 0.5)
-        about_the_vertical = rotation_matrices(np.stack([0 * yaw, -yaw, 0 * yaw], axis=1))
-        rotations = _looking(positions[:1], target) @ about_the_vertical
+        rotations = _looking(positions[:1], target) @ rotation_matrices(np.outer(-yaw, (0, 1, 0)))
     if path.tremor is not None:
-        tremor = path.tremor
-        sines = sums_of_sines(6, tremor.frequencies_hz, n_frames, config.frame_rate_hz, generator(seed, Draw.SHAKE)).T
-        small = np.array([*2 * [tremor.rms_px / config.focal_px], np.deg2rad(tremor.roll_rms_deg)])
-        rotations = rotation_matrices(small * sines[:, :3]) @ rotations
-        positions = positions + tremor.rms_mm / 1000 * sines[:, 3:]
+        tremor, rng = path.tremor, generator(seed, Draw.SHAKE)
+        rotations = shake_rotations(tremor, n_frames, config.frame_rate_hz, config.focal_px, rng) @ rotations
+        sines = sums_of_sines(3, tremor.frequencies_hz, n_frames, config.frame_rate_hz, rng).T
+        positions = positions + tremor.rms_mm / 1000 * sines
     return np.concatenate([rotations, -rotations @ positions[:, :, None]], axis=2)
 
 
@@ -135,31 +128,12 @@ def _first_crossing(at: FloatArray, planes: Planes) -> tuple[int, FloatArray] | 
     return found
 
 
-def _travel(path: TravelPath, progress: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return positions, (T, 3) in m, and rotation vectors of the wandering gaze, (T, 3)."""
-    from scipy.interpolate import CubicSpline
-
-    times = np.linspace(0, 1, path.knots)
-    dense = np.linspace(0, 1, _DENSE)
-    places = CubicSpline(times, generator(path.seed, Draw.PATH).uniform(-1, 1, (path.knots, 3)) * _REACH, bc_type="natural")
-    way = places(dense)
-    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-    middle = (way.min(axis=0) + way.max(axis=0)) / 2
-    gaze = CubicSpline(times, generator(path.seed, Draw.GAZE).uniform(-1, 1, (path.knots, 3)), bc_type="natural")
-    turns = np.deg2rad(path.wander_deg) * gaze(progress)
-    return np.array(path.centre) + (places(progress) - middle) * (path.length_m / length), turns
-
-
 def _looking(positions: FloatArray, target: FloatArray) -> FloatArray:
     """Return rotations of the world to cameras that look at a point, level: (T, 3, 3)."""
     ahead = target - positions
-    distance = np.linalg.norm(ahead, axis=1, keepdims=True)
-    right = np.stack([ahead[:, 2], np.zeros(len(ahead)), -ahead[:, 0]], axis=1)
-    level = np.linalg.norm(right, axis=1, keepdims=True)
-    if (level <= 1e-6 * np.maximum(distance, 1.0)).any():
+    if (np.hypot(ahead[:, 0], ahead[:, 2]) <= 1e-6 * np.maximum(np.linalg.norm(ahead, axis=1), 1.0)).any():
         raise InputError(
             f"the camera cannot look at {_point(target)}: on its path that is where it is, or straight above or below it; "
             "move path.look_at"
         )
-    ahead, right = ahead / distance, right / level
-    return np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    return looking(ahead)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.compiling import compiled
 
-_EDGE_ON = 1e-9
-"""A rectangle is not seen from its plane: the volume that it spans with the camera, relative to that of a box."""
+_EDGE_ON = 1e-9  # a rectangle is not seen from its plane: the volume that it spans with the camera, relative to that of a box
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +81,19 @@ class Planes:
         bounds[~ahead.any(axis=1)] = 0, 0
         rows: NDArray[np.int64] = np.clip(bounds, 0, height).astype(np.int64)
         return rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Planes with their textures.
+
+    Attributes:
+        planes: the rectangles.
+        textures: the light that each sends to the camera, up to a factor: (height, width) float16 each.
+    """
+
+    planes: Planes
+    textures: tuple[NDArray[np.float16], ...]
 
 
 @compiled

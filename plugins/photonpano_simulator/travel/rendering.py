@@ -19,18 +19,12 @@ from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano_simulator.travel.planes import Planes
 
-_PARTS = 4
-"""Parts of a pixel along each axis, for the edges of planes."""
-_SAMPLES = 16
-"""Samples of a texture along the longer axis of the area of a pixel, at most."""
-_LEVELS = 16
-"""Levels of a texture, at most: each has half the size of the one before."""
-_STRETCH = 0.3
-"""By how much the area of a sample may be longer than wide."""
-_BLOCK = 16
-"""Pixels of a row that are averaged in the same way."""
-_SMALLEST = 1e-9
-"""Inverse depth of the furthest point that is seen, in 1 / m."""
+_PARTS = 4  # parts of a pixel along each axis, for the edges of planes
+_SAMPLES = 16  # samples of a texture along the longer axis of the area of a pixel, at most
+_LEVELS = 16  # levels of a texture, at most: each has half the size of the one before
+_STRETCH = 0.3  # by how much the area of a sample may be longer than wide
+_BLOCK = 16  # pixels of a row that are averaged in the same way
+_SMALLEST = 1e-9  # inverse depth of the furthest point that is seen, in 1 / m
 
 
 class Atlas(NamedTuple):

@@ -5,24 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import InputError, SourceContext, StreamInfo
-from photonpano.reading import SingleFrameSource
-from photonpano_simulator.delivery import delivered
-from photonpano_simulator.sensor import Draw, SpadSensor, generator
-from photonpano_simulator.travel.config import TravelConfig
+from photonpano import InputError, SourceContext
+from photonpano_simulator.recording import delivered
+from photonpano_simulator.source import SimulatedSource
 from photonpano_simulator.travel.paths import matrix_of, poses_of, require_free
 from photonpano_simulator.travel.rendering import View, atlas_of
-from photonpano_simulator.travel.scenes import Stage, with_objects
+from photonpano_simulator.travel.stage import Stage, with_objects
 from photonpano_simulator.travel.truth import TravelTruth, sharp_view
+from photonpano_simulator.travel_config import TravelConfig
 
-_METERED = 9
-"""Frames along the path over which the mean flux is taken."""
+_METERED = 9  # frames along the path over which the mean flux is taken
 
 
-class TravelSource(SingleFrameSource):
+class TravelSource(SimulatedSource):
     """A single-photon camera that travels through a scene with depth.
-
-    A frame depends only on the config, the seed and its index, so spans may be read in any order and from any thread.
 
     Raises:
         InputError: a file cannot be used, the camera leaves the scene or passes through something, or frames are dropped that
@@ -30,37 +26,30 @@ class TravelSource(SingleFrameSource):
     """
 
     def __init__(self, config: TravelConfig, context: SourceContext) -> None:
-        self._seed = context.seed if config.seed is None else config.seed
-        taken = delivered(config.n_frames, config.drops, config.repeats)
+        super().__init__(config, context)
         stage, matrix = Stage(config), matrix_of(config)
         poses = poses_of(config, stage.middle, self._seed)
-        require_free(poses, matrix, config.frame_shape, stage.planes, stage.room)
+        require_free(poses, matrix, config.frame_shape, stage.planes, stage.free)
         scene = stage.drawn(context.threads)
         metered = View(scene.planes, atlas_of(scene.textures), matrix, config.frame_shape)
         frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
         mean = float(np.mean([metered.flux(poses[frame], frame) for frame in frames]))
-        light = config.drift ** np.linspace(0, 1, config.n_frames)
         self._truth = TravelTruth(
-            poses[taken],
+            poses[self._taken],
             matrix,
             config.frame_shape,
-            taken,
-            light[taken],
+            self._taken,
+            self._light[self._taken],
             with_objects(scene, config.objects, poses[0], matrix, config.frame_shape, mean),
             config.flux * config.sensor.quantum_efficiency / mean,
         )
         # Rendered from the first thread on, it is made once.
         _ = self._truth.view
-        self._sensor = SpadSensor(config.sensor, config.frame_shape, self._seed)
-        self.info = StreamInfo(len(taken), *config.frame_shape, config.frame_rate_hz, self._sensor.kind, self._sensor.bits)
-        self.response = self._sensor.response
-        self.valid: NDArray[np.bool_] = self._sensor.valid
-        self.valid.flags.writeable = False
 
-    def frame(self, index: int) -> NDArray[np.bool_]:
+    def frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
         """Return a frame: (H, W) of zeros and ones."""
         flux = sharp_view(self._truth, index) * self._sensor.gains
-        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, int(self._truth.taken[index])))
+        return self._exposed(flux, int(self._taken[index]))
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the frames.
@@ -79,13 +68,7 @@ class TravelSource(SingleFrameSource):
             `gains` (H, W) float32.
         """
         gains = {"gains": self._sensor.gains} if (self._sensor.gains != 1).any() else {}
-        return {
-            **self._truth.arrays(),
-            "frame_rate_hz": np.array(self.info.frame_rate_hz),
-            "seed": np.array(self._seed),
-            **self._sensor.truth(),
-            **gains,
-        }
+        return {**super().truth(), **self._truth.arrays(), **gains}
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
         """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
@@ -108,7 +91,7 @@ def problems_of(config: TravelConfig) -> list[str]:
     )
     try:
         stage = Stage(still)
-        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.room)
+        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.free)
     except InputError as error:
         problems.append(str(error))
     return problems

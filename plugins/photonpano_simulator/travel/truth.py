@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, InputError
 from photonpano.reading import read_arrays
 from photonpano_simulator.lens import pixel_grid
-from photonpano_simulator.travel.building import Scene
-from photonpano_simulator.travel.planes import Planes, trace
+from photonpano_simulator.travel.planes import Planes, Scene, trace
 from photonpano_simulator.travel.rendering import View, atlas_of
 
-_SAME = 1e-6
-"""Inverse depths that differ by less, relative to each other, are those of one point."""
+_SAME = 1e-6  # inverse depths that differ by less, relative to each other, are those of one point
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ def test_information_predicts_scatter_over_noisy_pairs(seen_from: Callable, brig
     assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
 
 
-def test_direct_reaches_cramer_rao_bound_within_30_percent(seen_from: Callable, street: np.ndarray) -> None:
+def test_direct_reaches_cramer_rao_bound_within_40_percent(seen_from: Callable, street: np.ndarray) -> None:
     """At flux 0.1, over 48 pairs with perturbed initial motions. Shifts by whole pixels, since the fixture interpolates its
     street between them."""
     errors, bounds = [], []
@@ -78,7 +78,7 @@ def test_direct_reaches_cramer_rao_bound_within_30_percent(seen_from: Callable, 
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] + shift[::-1, None, None]
         also_seen = (x < SHAPE[1]) & (y >= 0) & (y < SHAPE[0])
         bounds.append(pair_bound_px(0.2 * street[rows, columns], BinaryResponse(), 250, np.where(also_seen, 250.0, 0.0)))
-    assert np.sqrt(np.mean(errors)) < 1.3 * np.sqrt(np.mean(np.square(bounds)))
+    assert np.sqrt(np.mean(errors)) < 1.4 * np.sqrt(np.mean(np.square(bounds)))
 
 
 def test_masked_hot_pixels_are_interpolated(seen_from: Callable) -> None:

@@ -129,7 +129,7 @@ def test_initial_motion_resolves_repeated_texture(name: str, photograph: Callabl
         assert error_px(register(name, moving, fixed, translation(5 + 40 * wallpapers, 2)), true) < TOLERANCE_PX[name]
 
 
-@pytest.mark.parametrize(("name", "seeds"), [("opencv-sift", (1, 2)), ("opencv-orb", (0, 2))])
+@pytest.mark.parametrize(("name", "seeds"), [("opencv-sift", (21, 28)), ("opencv-orb", (0, 7))])
 def test_turning_locates_pairs_in_the_dark_that_homographies_lose(
     name: str, seeds: tuple[int, ...], seen_from: Callable
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import apply, corners
+from photonpano.testing.scenes import z_scores
 from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
 from photonpano_simulator.lens import undistorted
 from photonpano_simulator.objects import DrawnObject
@@ -23,14 +24,12 @@ if TYPE_CHECKING:
     Simulated = Callable[..., SimulatorSource]
 
 STILL: dict[str, Any] = {"path": {"kind": "pan", "length_px": 1e-6}, "n_frames": 2000}
-SHAPE = (40, 52)
+SHAPE, WIDE = (40, 52), (40, 60)
 
 
-def z_scores(source: SimulatorSource, flux: np.ndarray) -> np.ndarray:
+def deviations(source: SimulatorSource, flux: np.ndarray) -> np.ndarray:
     """Return the deviations of the counts of a capture from a constant flux, in standard deviations."""
-    n = source.info.n_frames
-    chance = 1 - np.exp(-flux.astype(np.float64))
-    return (source.counts(source.info.span) - n * chance) / np.sqrt(n * chance * (1 - chance))
+    return z_scores(source.counts(source.info.span), source.info.n_frames, flux)
 
 
 def radii(points: np.ndarray) -> np.ndarray:
@@ -61,12 +60,12 @@ def test_distorted_frames_agree_with_the_truth(simulated: Simulated) -> None:
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
     seen = apply(truth["homographies"][0], undistorted(lensed(-0.2, 0.05), pixels)).astype(np.float32)
     flux = cv2.remap(truth["scene"], seen[:, :1], seen[:, 1:], cv2.INTER_LINEAR).reshape(SHAPE)
-    z = z_scores(source, flux)
+    z = deviations(source, flux)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 5 * np.sqrt(2 / z.size)
     np.testing.assert_allclose(truth["undistorted_corners"], undistorted(lensed(-0.2, 0.05), corners(SHAPE)))
     # A lens without distortion images something else there.
-    assert z_scores(simulated(**STILL), flux).var() > 2
+    assert deviations(simulated(**STILL), flux).var() > 2
 
 
 def test_vignette_takes_its_fraction_of_the_light_at_the_corner(simulated: Simulated) -> None:
@@ -100,7 +99,7 @@ def test_gains_scale_the_flux_of_the_frames(simulated: Simulated) -> None:
     truth = source.truth()
     x, y = apply(truth["homographies"][0], np.stack(np.meshgrid(np.arange(52), np.arange(40)), axis=-1).reshape(-1, 2)).T
     scene = cv2.remap(truth["scene"], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).reshape(SHAPE)
-    assert abs(z_scores(source, scene * truth["gains"]).var() - 1) < 5 * np.sqrt(2 / scene.size)
+    assert abs(deviations(source, scene * truth["gains"]).var() - 1) < 5 * np.sqrt(2 / scene.size)
     assert "gains" not in clean.truth()
 
 
@@ -188,3 +187,28 @@ def test_lamp_lights_its_place_of_the_scene(simulated: Simulated) -> None:
     assert truth["lamps"][0, 75, 40] > 0.95
     assert truth["lamps"][0, 75, 160] < 0.01
     assert truth["lamps"].sum(axis=0).max() <= 1 + 1e-6
+
+
+def covered(**settings: object) -> np.ndarray:
+    """Return the share of each pixel that an object covers: it is dark, and drawn over light."""
+    config = FrameObject.model_validate({"flux": 0.0, **settings})
+    view = np.ones(WIDE, np.float32)
+    DrawnObject(config, WIDE, 1.0, np.zeros((10, 2))).draw(view, 4)
+    return 1 - view
+
+
+@pytest.mark.parametrize("size", [(0.5, 0.5), (0.2, 0.9), (0.31, 0.47)])
+def test_a_disc_is_the_largest_in_its_rectangle(size: tuple[float, float]) -> None:
+    disc, rectangle = covered(shape="disc", size=size), covered(size=size)
+    diameter = min(size[0] * WIDE[1], size[1] * WIDE[0])
+    assert disc.sum() == pytest.approx(np.pi / 4 * diameter**2, rel=0.005)
+    assert not disc[rectangle == 0].any()
+    y, x = np.nonzero(disc > 0.5)
+    assert (x.mean(), y.mean()) == pytest.approx((29.5, 19.5), abs=1e-9)
+    assert max(np.ptp(x), np.ptp(y)) + 1 == pytest.approx(diameter, abs=1.01)
+
+
+def test_a_disc_moves_as_its_rectangle() -> None:
+    disc = covered(shape="disc", size=(0.3, 0.3), at=(0.25, 0.5), moves_px=(1.5, -0.5))
+    y, x = np.mgrid[: WIDE[0], : WIDE[1]]
+    assert ((disc * x).sum() / disc.sum(), (disc * y).sum() / disc.sum()) == pytest.approx((14.5 + 6, 19.5 - 2), abs=0.01)

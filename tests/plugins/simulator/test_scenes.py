@@ -1,14 +1,23 @@
+"""Scenes: photographs, the street by day and at night, and the files that describe what is drawn."""
+
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from photonpano import InputError
+from photonpano_simulator import drawing
 from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
-from photonpano_simulator.scenes import scene_flux
+from photonpano_simulator.drawing import Chance, Drawing, pictures_of, read_scene
+from photonpano_simulator.scenes import scene_flux, street
+from photonpano_simulator.travel import stage
 
 
 def written(path: Path, image: np.ndarray) -> Path:
@@ -75,3 +84,107 @@ def test_wrong_photographs_are_refused(tmp_path: Path) -> None:
     assert_refused(f"{wide} is 20000x1 px; set scene.width so that no side exceeds 16384 px", wide)
     floats = written(tmp_path / "floats.tiff", np.ones((9, 9, 3), np.float32))
     assert_refused(f"{floats} holds float32 values; a photograph has 8 or 16 bits: save it as PNG", floats)
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (333, 500), (64, 160), (300, 64)])
+def test_street_is_drawn_at_any_size(shape: tuple[int, int]) -> None:
+    image = street(shape, seed=0)
+    assert (image.shape, image.dtype) == (shape, np.float32)
+    assert image.min() >= 0
+    assert image.max() <= 1
+    assert image.std() > 0.1
+
+
+def test_street_depends_on_the_seed() -> None:
+    first = street((240, 320), seed=1)
+    np.testing.assert_array_equal(first, street((240, 320), seed=1))
+    assert np.abs(first - street((240, 320), seed=2)).mean() > 0.05
+
+
+def test_every_frame_has_features() -> None:
+    """Wherever a frame of 254x496 lies, SIFT finds more than a hundred keypoints, blurred as a first level sees them."""
+    image = (street((1365, 2048), seed=0) * 255).astype(np.uint8)
+    keypoints = cv2.SIFT_create().detect(cv2.GaussianBlur(image, (0, 0), 2), None)
+    places = np.array([keypoint.pt for keypoint in keypoints]).astype(int)
+    density = np.zeros(image.shape, np.float32)
+    np.add.at(density, (places[:, 1], places[:, 0]), 1)
+    sums = cv2.integral(density)
+    in_frame = sums[254:, 496:] - sums[:-254, 496:] - sums[254:, :-496] + sums[:-254, :-496]
+    assert in_frame.min() > 100
+
+
+def documented(module: ModuleType) -> set[str]:
+    """Return the keys that the description of a module explains."""
+    keys = re.findall(r"^    ([a-z, ]+):", module.__doc__, re.MULTILINE)
+    return set(re.findall(r"[a-z]+", " ".join([*keys, *re.findall(r"`[a-z]+`", module.__doc__)])))
+
+
+def marks_of(picture: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield the marks of a picture, and those in them."""
+    for mark in picture:
+        yield mark
+        draw = mark.get("draw")
+        if isinstance(draw, list) and draw and isinstance(draw[0], dict):
+            yield from marks_of(draw)
+
+
+def names_in(value: Any) -> Iterator[str]:
+    """Yield what a mapping of picked values may stand for."""
+    if isinstance(value, dict):
+        for each in value.values():
+            yield from names_in(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from names_in(each)
+    else:
+        yield str(value)
+
+
+@pytest.mark.parametrize("kind", ["street", "room", "facade", "planes"])
+def test_files_of_scenes_have_no_unknown_key_or_picture(kind: str) -> None:
+    pictures, scene = pictures_of(kind), read_scene(kind)
+    marks = [mark for picture in pictures.values() for mark in marks_of(picture)]
+    things = [*scene.get("things", []), *(thing for group in scene.get("groups", {}).values() for thing in group)]
+    picked = {name for mark in marks for value in mark.get("pick", {}).values() for name in names_in(value)}
+    variables = {"opening", "beside", "below", "surface", "goods"}
+    drawn = {"street", *picked}
+    for keys, entries in ((documented(drawing), marks), (documented(stage), things)):
+        for entry in entries:
+            assert set(entry) <= keys, entry
+            for key in ("draw", "front", "top"):
+                names = entry.get(key, [])
+                drawn |= {name for name in ([names] if isinstance(names, str) else names) if isinstance(name, str)}
+    assert drawn - variables - picked <= set(pictures)
+
+
+def test_numbers_of_scenes_are_shares_names_and_draws() -> None:
+    chance, names = Chance(np.random.default_rng(0)), {"wall": 0.5, "left": "100%-10"}
+    written = {3: 3, "25%": 50, "100%-20": 180, "wall*0.5": 0.25, "left": 190, "left-4": 186}
+    assert {each: chance.number(each, names, 200) for each in written} == written
+    between = [chance.number([2, "wall*6"], names) for _ in range(200)]
+    assert 2 <= min(between) < 2.1 < 2.9 < max(between) <= 3
+    deck = [1, 2, 3, 4]
+    assert sorted(chance.number(deck, names) for _ in range(8)) == [1, 1, 2, 2, 3, 3, 4, 4]
+    assert chance.picked(names, {"signs": [{"ink": 0.1, "paper": 0.9}]}) == names | {"ink": 0.1, "paper": 0.9}
+    with pytest.raises(ValueError, match="'3 px' is no number of a scene"):
+        chance.number("3 px", names)
+
+
+@pytest.mark.parametrize(
+    ("mark", "share"),
+    [
+        ({"box": [10, "50%", "25%", 5], "tone": 1}, 0.125),
+        ({"up": [0, 0, "100%", 5], "tone": 1}, 0.5),
+        ({"shape": "disc", "tone": 1}, np.pi / 4),
+        ({"shape": [[0, 0], [1, 0], [0, 1]], "tone": 1}, 0.5),
+        ({"cells": [10, 0], "draw": [{"box": [0, 0, "40%", "100%"], "tone": 1}]}, 0.4),
+        ({"tone": 0, "to": 1}, 0.5),
+        ({"draw": [{"tone": 1}, {"shade": 0.3}]}, 0.3),
+        ({"bricks": [4, 2], "tone": 0.8, "spread": 0, "joint": 0.8}, 0.8),
+        ({"chance": 0, "tone": 1}, 0.0),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_marks_cover_their_shares(mark: dict[str, Any], share: float) -> None:
+    drawn = Drawing((80, 160), 10, {"all": [mark]}, np.random.default_rng(0)).finished("all", {})
+    assert drawn.mean() == pytest.approx(share, abs=0.012)

@@ -9,6 +9,7 @@ import pytest
 
 from photonpano import FrameSpan, InputError
 from photonpano.captures.writing import write_packed
+from photonpano.testing.scenes import z_scores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -92,8 +93,7 @@ def test_frames_agree_with_the_truth(simulated: Simulated) -> None:
     points = np.stack([x, y, np.ones_like(x)], axis=-1) @ truth["homographies"][0].T
     px, py = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
     flux = cv2.remap(truth["scene"], px.astype(np.float32), py.astype(np.float32), cv2.INTER_LINEAR)
-    chance = 1 - np.exp(-flux.astype(np.float64))
-    z = (source.counts(source.info.span) - 3000 * chance) / np.sqrt(3000 * chance * (1 - chance))
+    z = z_scores(source.counts(source.info.span), 3000, flux)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 5 * np.sqrt(2 / z.size)
 

@@ -15,10 +15,10 @@ from photonpano import FrameSpan, InputError, SourceContext
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.paths import camera_path
-from photonpano_simulator.travel.config import TravelConfig
 from photonpano_simulator.travel.paths import centres
 from photonpano_simulator.travel.source import TravelSource
 from photonpano_simulator.travel.truth import depth, flow, read_truth, sharp_view, truth_of
+from photonpano_simulator.travel_config import TravelConfig
 
 (TRAVEL,) = (each for each in photonpano_sources() if each.name == "travel-simulator")
 SMALL = {"scene": {"kind": "planes"}, "n_frames": 400, "frame_shape": (40, 52), "focal_px": 40.0}

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import apply, camera_matrix, corners, rotation_matrices
-from photonpano_simulator.travel.building import Scene
-from photonpano_simulator.travel.planes import Planes, trace
+from photonpano_simulator.travel.planes import Planes, Scene, trace
 from photonpano_simulator.travel.rendering import View, atlas_of
 from photonpano_simulator.travel.truth import TravelTruth, depth, flow, sharp_view
 

@@ -13,10 +13,11 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.geometry import Camera, corner_displacements, rotation_vectors
+from photonpano.testing.scenes import z_scores
 from photonpano_simulator import scenes
 from photonpano_simulator.config import CameraSimulatorConfig, SimulatorConfig
+from photonpano_simulator.scenes import street
 from photonpano_simulator.source import SimulatorSource
-from photonpano_simulator.street import street
 
 SHAPE = (64, 96)
 FOCAL = 80.0
@@ -81,8 +82,7 @@ def test_frames_of_a_turn_show_what_the_rotations_say(distortion: dict[str, floa
 
 def test_counts_of_a_turn_follow_the_flux_of_the_scene() -> None:
     source = spad({"degrees": 1e-6}, n_frames=2000)
-    chance = 1 - np.exp(-seen(source.truth(), 0).astype(np.float64))
-    z = (source.counts(source.info.span) - 2000 * chance) / np.sqrt(2000 * chance * (1 - chance))
+    z = z_scores(source.counts(source.info.span), 2000, seen(source.truth(), 0))
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 5 * np.sqrt(2 / z.size)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +11,7 @@ from photonpano import FrameSpan
 from photonpano.corrections import Vignette, divided_by, estimate_vignette
 from photonpano.geometry import translation
 from photonpano.testing import KnownMotion, MemorySource
+from photonpano.testing.scenes import detected, seen_along
 
 SHAPE, N = (96, 128), 600
 MOTION = KnownMotion(lambda frame: translation(0.15 * float(frame), 0.04 * float(frame)))
@@ -24,14 +24,9 @@ def panned(street: np.ndarray) -> Callable[..., MemorySource]:
     """Return a pan over a street, seen through a lens with a vignette, in light that drifts."""
 
     def panned(vignette: float, flux: float, speed: float = 1.0) -> MemorySource:
-        rng, gain = np.random.default_rng(2), 1 - vignette * RADIUS**2
-        frames = np.empty((N, *SHAPE), np.uint8)
-        for t in range(N):
-            to_scene = translation(300, 250) @ MOTION.at([speed * t])[0]
-            view = cv2.warpPerspective(street, to_scene, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-            light = flux / 0.5 * (1 + 0.5 * t / N)
-            frames[t] = rng.random(SHAPE, np.float32) < -np.expm1(-view * gain * light)
-        return MemorySource(frames)
+        views = seen_along(street, translation(300, 250) @ MOTION.at(speed * np.arange(N)), SHAPE)
+        light = flux / 0.5 * (1 + 0.5 * np.arange(N) / N)
+        return MemorySource(detected(views * (1 - vignette * RADIUS**2) * light[:, None, None], 2))
 
     return panned
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,6 +16,7 @@ from photonpano.lighting import PixelGain, measure_pixel_gain
 from photonpano.merging.panorama import render
 from photonpano.protocols import WeightedSource
 from photonpano.testing import KnownMotion, MemorySource
+from photonpano.testing.scenes import detected, seen_along
 from photonpano.values import FrameSpan
 
 SHAPE, N = (64, 96), 120
@@ -42,12 +42,8 @@ def recorded(street: np.ndarray) -> Callable[..., MemorySource]:
 
     @cache
     def recorded(uneven: bool, motion: KnownMotion = MOTION) -> MemorySource:
-        gain, rng, frames = GAIN if uneven else EVEN, np.random.default_rng(0), np.empty((N, *SHAPE), np.uint8)
-        for t in range(N):
-            to_scene = translation(300, 250) @ motion.at([t])[0]
-            view = cv2.warpPerspective(street, to_scene, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-            frames[t] = rng.random(SHAPE, np.float32) < -np.expm1(-view * gain * 0.4)
-        return MemorySource(frames)
+        views = seen_along(street, translation(300, 250) @ motion.at(np.arange(N)), SHAPE)
+        return MemorySource(detected(0.4 * views * (GAIN if uneven else EVEN)))
 
     return recorded
 

@@ -12,8 +12,9 @@ import pytest
 
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
-from photonpano.geometry import inverse, transform_points
+from photonpano.geometry import inverse, transform_points, translation
 from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
+from photonpano.testing.scenes import detected, seen_along, textured
 
 SHAPE = (64, 96)
 MIDDLE = np.array([47.5, 31.5])
@@ -33,20 +34,11 @@ def captured(memory_source: type) -> Callable[..., Any]:
     """Simulate a textured scene that moves behind light that stands still."""
 
     def captured(motions: np.ndarray, flux: float, contrast: float = 0.8, seed: int = 0, flicker: float = 0.0) -> Any:
-        rng = np.random.default_rng(seed)
         height, width = SHAPE
-        noise = sum(size * cv2.GaussianBlur(rng.normal(0, 1, (3 * height, 3 * width)), (0, 0), size) for size in (1, 2, 4, 8))
-        scene = np.exp(contrast * noise / noise.std())
-        scene *= flux / scene.mean()
-        light, into = np.linspace(0.3, 1.7, width), np.array([[1, 0, width], [0, 1, height], [0, 0, 1.0]])
-        frames = []
-        for index, motion in enumerate(motions):
-            there = (into @ np.linalg.inv(motion))[:2]
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            view = cv2.warpAffine(scene, there, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT)
-            brightness = 1 + flicker * np.sin(2.1 * index)
-            frames.append(rng.random(SHAPE) < -np.expm1(-view * light * brightness))
-        return memory_source(frames)
+        scene = textured((3 * height, 3 * width), flux, contrast, seed)
+        views = seen_along(scene, translation(width, height) @ np.linalg.inv(motions), SHAPE)
+        brightness = 1 + flicker * np.sin(2.1 * np.arange(len(motions)))
+        return memory_source(detected(views * np.linspace(0.3, 1.7, width) * brightness[:, None, None], seed))
 
     return captured
 

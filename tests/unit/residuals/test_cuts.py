@@ -5,7 +5,6 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +17,7 @@ from photonpano.motion.tracking import runs
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import Look
 from photonpano.testing import MemorySource
+from photonpano.testing.scenes import detected, seen_along
 
 SHAPE, N_FRAMES, JUMP = (96, 128), 600, 330
 
@@ -27,12 +27,11 @@ def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
     """Look for cuts in frames of a street, given the true motion along x, in px by frame, and what the loop made of it."""
 
     def cuts_of(true_px: np.ndarray, found_px: np.ndarray, flux: float = 1.0, dark: FrameSpan | None = None) -> tuple[Cut, ...]:
-        rng, size = np.random.default_rng(3), SHAPE[::-1]
         lit = np.full(N_FRAMES, flux)
         if dark is not None:
             lit[dark.start : dark.stop] = 0
-        views = [cv2.warpAffine(street, np.float64([[1, 0, -250 - x], [0, 1, -300]]), size) for x in true_px]
-        source = MemorySource([rng.random(SHAPE) < -np.expm1(-light * view) for light, view in zip(lit, views, strict=True)])
+        views = seen_along(street, [translation(250 + x, 300) for x in true_px], SHAPE)
+        source = MemorySource(detected(lit[:, None, None] * views, 3))
         homographies = np.array([translation(x, 0) for x in found_px])
         everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
         trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
@@ -98,13 +97,12 @@ def test_dark_frames_without_jump_are_not_cut(cuts_of: Callable[..., tuple[Cut, 
 def test_long_tremor_is_searched_without_keeping_its_sums(street: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of a capture that trembles is searched: sums of 48x64 px that are kept would take 12 kB each."""
     monkeypatch.setattr(runs, "_BLOCK", 8)
-    rng, size = np.random.default_rng(5), (64, 48)
 
     def peak(n_frames: int) -> int:
         frames = np.arange(n_frames)
         tremor_px = 3 * np.sin(2 * np.pi * frames / 40)
-        views = [cv2.warpAffine(street, np.float64([[1, 0, -250 - x], [0, 1, -300]]), size) for x in tremor_px]
-        source = MemorySource([rng.random((48, 64)) < -np.expm1(-view) for view in views])
+        views = seen_along(street, [translation(250 + x, 300) for x in tremor_px], (48, 64))
+        source = MemorySource(detected(views, 5))
         homographies, everywhere = np.tile(np.eye(3), (n_frames, 1, 1)), np.ones(n_frames, dtype=bool)
         span, std_px = FrameSpan(0, n_frames), np.full(n_frames, 0.05)
         motion = FrameMotion(FrameTrajectory(homographies), span, homographies, everywhere, std_px, 0, (48, 64))

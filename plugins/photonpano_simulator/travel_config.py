@@ -16,8 +16,8 @@ Share = Annotated[float, Field(gt=0, le=2)]
 Place = Annotated[float, Field(ge=-1, le=2)]
 Speed = Annotated[float, Field(ge=-100, le=100)]
 
+# Bounds of the focal length, in widths of a frame: 127 degrees, and 0.57 degrees across a frame
 _WIDEST, _NARROWEST = 0.25, 100.0
-"""Bounds of the focal length, in widths of a frame: 127 degrees, and 0.57 degrees across a frame."""
 
 
 class _Scene(Config):
