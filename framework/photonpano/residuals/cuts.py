@@ -13,7 +13,7 @@ from photonpano.geometry import steps_px
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
 from photonpano.protocols import Source
-from photonpano.residuals.refinement import Look
+from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.sum_track import DARK, SumTrack, sum_image, track_sums
 from photonpano.residuals.unexplained import standing_out
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
@@ -62,7 +62,7 @@ class _Outlier:
     sigmas: float
 
 
-def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
+def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ...]:
     """Find the places where the image jumps.
 
     Places come into question where spans stand out from the motion. There, sums of a few frames are tracked by phase
@@ -71,11 +71,11 @@ def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
 
     Args:
         source: the capture.
-        look: the result of the loop, and what it does not explain.
+        fit: the result of the loop, and what it does not explain.
         context: threads and progress.
     """
-    size = _size_of_sums(look)
-    suspect = _suspect(look, _MARGIN * size)
+    size = _size_of_sums(fit)
+    suspect = _suspect(fit, _MARGIN * size)
     if not suspect:
         return ()
     found: list[Cut] = []
@@ -88,16 +88,16 @@ def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
     return tuple(found)
 
 
-def _suspect(look: Look, margin: int) -> list[FrameSpan]:
+def _suspect(fit: MotionFit, margin: int) -> list[FrameSpan]:
     """Return the frames up to `margin` frames from spans that stand out."""
-    spans, flags = look.residuals.spans, np.zeros(len(look.motion.located), dtype=bool)
-    for index in np.flatnonzero(standing_out(look.residuals)):
+    spans, flags = fit.residuals.spans, np.zeros(len(fit.motion.located), dtype=bool)
+    for index in np.flatnonzero(standing_out(fit.residuals)):
         flags[max(0, spans[index].start - margin) : spans[index].stop + margin] = True
-    return true_spans(flags & look.motion.located)
+    return true_spans(flags & fit.motion.located)
 
 
-def _size_of_sums(look: Look) -> int:
-    residuals, homographies = look.residuals, look.motion.homographies[look.motion.located]
+def _size_of_sums(fit: MotionFit) -> int:
+    residuals, homographies = fit.residuals, fit.motion.homographies[fit.motion.located]
     moved = steps_px(homographies, residuals.frame_shape)
     per_frame = residuals.normal[:, [0, 1], [0, 1]].mean(axis=1) / [len(span) for span in residuals.spans]
     noise_px = _TRACK_RATIO / np.sqrt(max(float(np.median(per_frame)), 1e-9))

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import photonpano
-from photonpano.captures.fingerprint import changes, fingerprint
+from photonpano.captures.fingerprint import CaptureRecord, changes
 from photonpano.pipeline.components import scale_of
-from photonpano.protocols import Source
 from photonpano.record.environment import library_versions
 from photonpano.specs.plan import Choice, Plan
 
@@ -22,10 +21,15 @@ Fingerprint = dict[str, Any]
 _STAGES = ("resample", "merge", "locate", "interpolate")
 
 
-def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
+def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, int]) -> Fingerprint:
     """Return what the results of a run depend on, as plain data.
 
     The number of threads and the run folder are left out: results do not depend on them.
+
+    Args:
+        plan: what is run.
+        capture: the fingerprint of the capture.
+        frame_shape: (height, width) of a frame.
 
     Returns:
         `versions`, `code` and `capture`, on which everything depends; `common`, the parts of the spec on which it does;
@@ -42,7 +46,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
         {
             "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
             "code": _code([plan.source], photonpano),
-            "capture": fingerprint(plan, source),
+            "capture": capture,
             "common": {
                 "source": _component(plan.source),
                 "corrections": document.get("corrections"),
@@ -51,7 +55,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
                 "run.seed": plan.run.seed,
                 "render.reference": document["render"]["reference"],
             },
-            "levels": [_level(plan, number, source.info.frame_shape) for number in range(1, len(plan.levels) + 1)],
+            "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
             "rest": rest,
         }
     )

@@ -10,8 +10,10 @@ from photonpano.captures.part import part_of
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
 from photonpano.motion.level import Level
-from photonpano.motion.loop import estimate_motion, resample
+from photonpano.motion.loop import resample
+from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.state import State
 from photonpano.protocols import Source, Trajectory
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch
@@ -85,7 +87,10 @@ class LocatedSoFar:
         self._tried = stop
         part = part_of(source, FrameSpan(self._start, stop))
         try:
-            result = estimate_motion(part, [level], self._plan.graph, self._tie - self._start, self._context)[0]
+            state = State(
+                self._plan, part, self._context, self._tie - self._start, (level,), Timeline.regular(len(part.info.span))
+            )
+            [result] = state.located([level], None).results
         except LocationError as error:
             self.problem = str(error)
             if n_groups == _MOST_GROUPS or last:

@@ -13,13 +13,18 @@ from photonpano import FrameSpan, PluginError, Refined
 from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, inverse, translation
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.timeline import Timeline
+from photonpano.pipeline.passes.refiners import refine
+from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record
 from photonpano.record.run_warnings import refinement_warnings
-from photonpano.residuals.refinement import Explained, Look, NamedRefiner, refine
+from photonpano.residuals.refinement import Explained, NamedRefiner
+from photonpano.specs import parse_spec
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
 
 SHAPE, FRAMES = (40, 64), 400
+PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})
 PATH = KnownMotion(lambda frame: translation(0.05 * (frame - FRAMES // 2), 0))
 
 
@@ -58,8 +63,8 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
         )
         component = answer if isinstance(answer, Answering) else Answering(answer)
         named = NamedRefiner("odd", component, "refiner 'odd' of toys 1.0")
-        rendering = 0.25, 2**30, Context()
-        return refine(source, Look(source, motion, *rendering), [named], *rendering)
+        state = State(PLAN, source, Context(), FRAMES // 2, (), Timeline.regular(FRAMES), refined=motion)
+        return refine(state, [named])
 
     return run
 

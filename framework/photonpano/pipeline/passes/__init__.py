@@ -1,0 +1,1 @@
+"""What is tried after the first level of the loop: see `rule.Pass`."""
