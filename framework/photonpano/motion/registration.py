@@ -24,19 +24,19 @@ from photonpano.values import Decision, Edge, FloatArray, Located, NotLocated
 
 ResultT = TypeVar("ResultT")
 
+# Predecessors with which an exposure is registered if none of its own pairs is located.
 BRIDGE = 3
-"""If no pair of an exposure with earlier ones is located, pairs with this many predecessors are tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """What is known of an exposure once its pairs with earlier ones are registered.
+    """An exposure whose pairs with earlier ones are registered.
 
     Attributes:
         edges: these pairs.
-        contrast: how much there is to see in it.
+        contrast: of its image.
         place: where it lies, at a first level that is tracked; None at others.
-        alternatives_px: the other exposures of pairs that may as well have another motion, and how far away that is.
+        alternatives_px: distance of a second motion that fits as well, by the other exposure of the pair.
     """
 
     edges: tuple[Edge, ...]
@@ -49,9 +49,8 @@ class Registrar:
     """Has the exposures of a level described and pairs of them registered: see `ExposureTasks`.
 
     Attributes:
-        contrasts: how much there is to see in each exposure described so far, by its number.
-        alternatives_px: of the pairs that may as well have another motion, how far that is from where their registration
-            started.
+        contrasts: of the exposures described so far, by their numbers.
+        alternatives_px: by pair, the distance of a second motion that fits as well from where its registration started.
         to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
@@ -223,7 +222,7 @@ class Registrar:
         return replace(closure, motion=replace(closure.motion, evidence=evidence))
 
     def _describe(self, indices: Sequence[int], keep: bool = False) -> list[tuple[Descriptions, Contrast]]:
-        """Have exposures described; return what stands for that, and how much there is to see in each."""
+        """Have exposures described; return what stands for that, and the contrast of each."""
         described, known = self._executor.keep(ExposureTasks.describe, self._tasks, indices, keep)
         return [(described, contrast) for contrast in self._noted(known)]
 
@@ -239,7 +238,7 @@ class Registrar:
         return {id(kept): kept for kept in (self._kept[index] for index in indices)}.values()
 
     def _noted(self, done: tuple[ResultT, Notes]) -> ResultT:
-        """Return the result of a task, and take note of its time and of decisions, which workers take alike, once."""
+        """Return the result of a task; add up its time, and record its decisions once, since all workers take the same."""
         result, notes = done
         self._clock.add(notes.seconds)
         with self._lock:

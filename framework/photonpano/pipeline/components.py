@@ -27,8 +27,7 @@ from photonpano.interrupts import is_interrupt
 from photonpano.motion.attributed_source import attributed
 from photonpano.motion.attribution import attributing, shown
 from photonpano.motion.checks import require_groups
-from photonpano.motion.level import Level, NamedLocator
-from photonpano.motion.recorder import Recorder
+from photonpano.motion.level import Level, NamedLocator, Recorder
 from photonpano.protocols import ColouredSource, PoseEstimator, Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream

@@ -23,12 +23,12 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
+# Length of the trial in the middle of the capture, in groups of the first level.
 TRIAL_GROUPS = 12
-"""Length of the trial, in groups of the first level. It is taken from the middle of the capture."""
+# Length of an untimed trial before it, in groups, for what is done once, such as compiling.
 _WARM_UP_GROUPS = 3
-"""Length of an untimed trial before it, in groups, so that work that is done once, such as compiling, does not count."""
+# Memory for the motion of one frame, as measured in the benchmarks.
 BYTES_PER_FRAME = 1200
-"""Memory for the motion of one frame, as measured in the benchmarks."""
 
 
 @dataclass(frozen=True, slots=True)

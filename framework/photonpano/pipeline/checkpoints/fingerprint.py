@@ -68,7 +68,7 @@ def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None
     Args:
         before: of what was kept.
         now: of the run.
-        levels: compare only what the first so many levels depend on; None for everything.
+        levels: number of levels on whose dependencies the comparison stops; None for everything.
     """
     found = [
         f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])

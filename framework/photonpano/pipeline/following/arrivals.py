@@ -11,10 +11,10 @@ from photonpano.errors import PhotonpanoError
 from photonpano.protocols import Arrived, Source
 
 _POLL_S = 0.02
+# How long an unreadable capture is tolerated: a file may appear before the one before it is complete.
 _TOLERATED_S = 1.0
-"""How long what is there may be no capture: a file may appear before the one before it is complete."""
+# Times of arrival that are kept. While frames wait for minutes, they get coarser.
 _MOST_MARKS = 4096
-"""Times of arrival that are kept: if frames wait for minutes, they get coarser."""
 
 
 class Arrivals:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+# Resolution and number of the bins of delays: 10 ms, up to two minutes.
 _STEP_S, _STEPS = 0.01, 12_000
-"""Delays are counted in steps of 10 ms, up to two minutes."""
 
 
 class Delays:

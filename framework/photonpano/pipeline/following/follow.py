@@ -39,14 +39,14 @@ from photonpano.threads import one_thread_inside, thread_count
 
 logger = logging.getLogger(__name__)
 
+# The file to which frames of a pipe are copied.
 SPOOL = "frames.raw"
-"""The file of the frames of a pipe."""
 _REFRESH_S = 1.0
 _NOTE_S = 10.0
+# Least time between windows. Long windows take less time for a frame: each repeats the last exposure of the one before.
 _WINDOW_S = 0.2
-"""Least time from one window to the next: longer windows take less time a frame, since each begins with the end of the last."""
+# Longest wait for frames between two looks at the page.
 _IDLE_S = 0.1
-"""How long to wait for frames before the page is looked after."""
 
 
 @dataclass(slots=True)

@@ -17,10 +17,10 @@ from photonpano.specs.plan import Plan
 
 logger = logging.getLogger(__name__)
 
+# Time over which the rate of arrival is measured.
 _RATE_S = 3.0
-"""The rate of arrival is that of the last seconds."""
+# Frames come too fast if they wait for longer than the first, once the second has passed since the first were located.
 _FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
-"""If frames wait for longer, so long after the first were located, they come faster than they are located."""
 
 
 class LiveRun:

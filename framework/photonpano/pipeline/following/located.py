@@ -19,10 +19,10 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch
 from photonpano.values import FrameSpan, Homography
 
+# Frames from which the first group size is chosen.
 LEAST_FRAMES = {"binary": 256, "intensity": 16}
-"""Frames from which the first group size is chosen."""
+# Groups of the longest window: as many are located in one call if frames come faster than they are located.
 _MOST_GROUPS = 8
-"""Groups of the longest window. So much is located in one call if frames come faster than they are located."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

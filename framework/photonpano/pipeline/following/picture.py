@@ -14,20 +14,20 @@ from photonpano.photometry import picture_of
 from photonpano.pipeline.following.located import Window
 from photonpano.values import FloatArray, FluxImage, Homography, Response
 
+# Most pixels of the canvas; beyond, its scale is halved.
 _MOST_PIXELS = 2_000_000
-"""Pixels of the canvas: if it needs more, its scale is halved."""
+# Least scale; beyond, the picture begins anew.
 _LEAST_SCALE = 1 / 8
-"""If even at this scale it needs more, the picture begins anew."""
+# Greatest ratio between the area of a frame on the canvas and that of the first frame, either way.
 _MOST_AREA_CHANGE = 4.0
-"""By this factor, the area of a frame on the canvas differs from that of the first frame at most."""
+# How much more than necessary the canvas grows, in longer sides of a frame.
 _MARGIN = 0.25
-"""By how much more than necessary the canvas grows, in sides of a frame."""
+# Motion within which frames are summed before they are warped.
 _TOLERANCE_PX = 1.0
-"""Motion within which frames are summed before they are warped, px."""
+# Quantile of the flux that is white.
 _WHITE = 0.995
-"""Quantile of the flux that is white."""
+# Pixels from which that quantile is estimated.
 _SAMPLES = 100_000
-"""Pixels from which that is estimated."""
 
 
 class PictureSoFar:

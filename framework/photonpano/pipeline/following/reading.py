@@ -12,8 +12,8 @@ from photonpano.source_wrapper import SourceWrapper, capabilities_of, with_capab
 from photonpano.specs.plan import Plan
 from photonpano.values import BoolArray
 
+# Frames of a capture whose length is not known yet, for checks of the stages.
 _LONG = 1_000_000
-"""Frames of a capture whose length is not known yet, for checks of the stages."""
 
 
 class ArrivedFrames:
