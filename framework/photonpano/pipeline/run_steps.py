@@ -19,8 +19,7 @@ from photonpano.context import Context, Progress
 from photonpano.corrections import CorrectedSource, FilteredSource
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
 from photonpano.motion.loop import LevelResult
-from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
-from photonpano.pipeline.checkpoints.finished import finished_run
+from photonpano.pipeline.checkpoints.fingerprint import finished_run, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, work_folder
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.observers import Observers

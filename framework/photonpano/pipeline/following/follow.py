@@ -26,8 +26,7 @@ from photonpano.locks import locked
 from photonpano.pipeline.following.arrivals import Arrivals
 from photonpano.pipeline.following.live_run import Every, LiveRun
 from photonpano.pipeline.following.page import PAGE, LivePage
-from photonpano.pipeline.following.picture import PictureSoFar
-from photonpano.pipeline.following.rehearsal import rehearse
+from photonpano.pipeline.following.picture import PictureSoFar, rehearse
 from photonpano.pipeline.following.spool import Spool
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.pipeline.run_steps import COMPILING

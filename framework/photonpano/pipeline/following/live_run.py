@@ -8,8 +8,7 @@ from collections import deque
 
 from photonpano.context import Context
 from photonpano.errors import PhotonpanoError
-from photonpano.pipeline.following.arrivals import Arrivals
-from photonpano.pipeline.following.delays import Delays
+from photonpano.pipeline.following.arrivals import Arrivals, Delays
 from photonpano.pipeline.following.located import LocatedSoFar, Window
 from photonpano.pipeline.following.reading import ArrivedFrames
 from photonpano.report import LiveFigures

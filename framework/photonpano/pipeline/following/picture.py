@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.context import Context
+from photonpano.errors import PhotonpanoError
 from photonpano.geometry import Canvas, apply, corners, normalised, rescaling, translation
 from photonpano.merging import accumulate
 from photonpano.merging.accumulate import PhotonSum
 from photonpano.merging.chunks import chunks_of
 from photonpano.photometry import picture_of
-from photonpano.pipeline.following.located import Window
-from photonpano.values import FloatArray, FluxImage, Homography, Response
+from photonpano.pipeline.following.located import LocatedSoFar, Window
+from photonpano.reading import BinarySource, FrameLayout
+from photonpano.specs.plan import Plan
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Response
+
+logger = logging.getLogger(__name__)
 
 # Most pixels of the canvas; beyond, its scale is halved.
 _MOST_PIXELS = 2_000_000
@@ -28,6 +37,8 @@ _TOLERANCE_PX = 1.0
 _WHITE = 0.995
 # Pixels from which that quantile is estimated.
 _SAMPLES = 100_000
+# The made-up capture: a frame, a block, how many frames, and how far the camera pans.
+_SHAPE, _BLOCK_PX, _N_FRAMES, _LENGTH_PX = (64, 96), 8, 2048, 32
 
 
 class PictureSoFar:
@@ -139,3 +150,36 @@ def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
     areas = 0.5 * np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1)
     change = areas / ((shape[0] - 1) * (shape[1] - 1))
     return bool(((change > 1 / _MOST_AREA_CHANGE) & (change < _MOST_AREA_CHANGE)).all())
+
+
+def rehearse(plan: Plan, context: Context) -> None:
+    """Locate a made-up capture and draw its picture, so that compiling and loading do not delay the first frames.
+
+    Problems do not matter.
+    """
+    located, picture = LocatedSoFar(plan, context), PictureSoFar()
+    try:
+        with _Blocks() as source:
+            if window := located.next_window(source, last=True):
+                picture.add(window)
+        picture.png()
+    except PhotonpanoError as error:  # as with frames of another kind; the capture itself tells what is wrong
+        logger.debug("the rehearsal failed: %s", error)
+
+
+class _Blocks(BinarySource):
+    """Frames of random blocks, over which the camera pans."""
+
+    def __init__(self) -> None:
+        height, width = _SHAPE
+        super().__init__(_N_FRAMES, FrameLayout(_SHAPE, (height, width // 8)))
+        self._rng = np.random.default_rng(0)
+        blocks = self._rng.random((height // _BLOCK_PX, (width + _LENGTH_PX) // _BLOCK_PX))
+        self._scene = np.kron(blocks, np.ones((_BLOCK_PX, _BLOCK_PX)))
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span: see `BinarySource`."""
+        for frame in range(span.start, span.stop):
+            left = frame * _LENGTH_PX // _N_FRAMES
+            lit = self._rng.random(_SHAPE) < self._scene[:, left : left + _SHAPE[1]]
+            yield slice(frame - span.start, frame - span.start + 1), np.packbits(lit, axis=-1)[None]
