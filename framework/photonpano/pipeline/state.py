@@ -30,7 +30,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is known of a capture and its motion. Nothing changes a state: passes make new ones of it.
+    """A capture as corrected so far, and its motion as known so far. It is frozen: passes return new states.
 
     Attributes:
         plan: what to do.
@@ -42,7 +42,7 @@ class State:
         model: what the motion of the camera may be.
         start: the motion known before the first level; None if there is none.
         results: of the levels so far.
-        outdated: whether the source was corrected after these levels.
+        outdated: whether the source was corrected since these levels were located.
         vignette: by which the source is divided.
         decisions: of the passes, for the record.
         refined: the motion corrected by refiners; None for that of the last level.

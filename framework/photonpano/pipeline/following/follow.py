@@ -93,7 +93,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
         if isinstance(what, Piped):
             plan = _from_file(plan, spooled)
         with run_folder(directory, overwrite=overwrite, inputs=capture_files(plan)):
-            pass  # what forbids to write it is told now, and not when the capture is complete
+            pass  # a folder that cannot be written is refused now, not when the capture is complete
         if isinstance(what, Piped):
             spool = Spool(_standard_input(), _free(spooled, plan, overwrite), what)
             stack.callback(spool.close)
@@ -112,7 +112,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
             yield Followed(plan, figures)
             page.write(replace(figures, state="finished"))
         except BaseException as error:
-            arrivals.close()  # nobody looks for the file any more, which is removed if it is empty
+            arrivals.close()  # before the spool, which may remove the file that is watched
             if spool is not None:
                 spool.close()
                 if spool.path.exists():

@@ -1,4 +1,4 @@
-"""What a run does with the frames that have arrived, and how far behind it is."""
+"""Locate frames as they arrive, and measure how far behind the run is."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
 
 
 class LiveRun:
-    """Locates frames as they arrive."""
+    """Locates frames as they arrive, and counts how long they have waited."""
 
     def __init__(self, plan: Plan, arrivals: Arrivals, context: Context) -> None:
         self._arrivals, self._delays = arrivals, Delays()
@@ -97,7 +97,7 @@ class LiveRun:
 
 
 class Every:
-    """Says when something is due that is done every so many seconds."""
+    """A timer of what is done at intervals."""
 
     def __init__(self, seconds: float, *, at_once: bool = True) -> None:
         self._seconds = seconds

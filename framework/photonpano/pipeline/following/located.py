@@ -1,4 +1,4 @@
-"""Locate the exposures of a capture in windows, as their frames arrive."""
+"""Locate a growing capture: the loop runs its first level on one window of frames after the other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOST_GROUPS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Frames that were located together.
+    """Frames that were located in one call of the loop.
 
     Attributes:
         source: the frames, as a capture of their own; those before `new` belong to the window before, too.

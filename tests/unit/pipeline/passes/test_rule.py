@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -15,10 +16,12 @@ from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.passes.cuts import Cuts
+from photonpano.pipeline.passes.levels import LaterLevels
 from photonpano.pipeline.passes.light import ChangingLight
 from photonpano.pipeline.passes.rule import Pass, tried
 from photonpano.pipeline.state import State
 from photonpano.specs import parse_spec
+from photonpano.testing import MemorySource
 
 PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})
 BEFORE = State(PLAN, None, Context(), 0, (), Timeline.regular(9))
@@ -76,6 +79,26 @@ def test_pass_that_finds_nothing_proposes_nothing(monkeypatch: pytest.MonkeyPatc
 def test_errors_of_passes_that_are_not_compared_end_the_run() -> None:
     with pytest.raises(LocationError, match="lost"):
         tried(BEFORE, Toy(LocationError("lost"), compared=False))
+
+
+@pytest.mark.parametrize(
+    ("n_levels", "outdated", "located"), [(1, False, []), (1, True, [1]), (3, False, [2, 3]), (3, True, [2, 3])]
+)
+def test_single_level_is_located_again_if_the_capture_was_corrected_since(
+    n_levels: int, outdated: bool, located: list[int], make_level: Callable, pan: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[tuple[list[int], Any]] = []
+
+    def run(state: State, levels: Any, previous: Any) -> State:
+        ran.append(([level.number for level in levels], previous))
+        return state
+
+    monkeypatch.setattr(State, "located", run)
+    levels = tuple(make_level(pan(0.3), number=number) for number in range(1, n_levels + 1))
+    first = SimpleNamespace(trajectory=pan(0.3))
+    source: Any = MemorySource(np.zeros((9, 8, 16)))
+    tried(replace(BEFORE, source=source, levels=levels, results=(first,), outdated=outdated), LaterLevels([]))
+    assert ran == [(located, first.trajectory)]
 
 
 def fitted(misfit: float, **more: Any) -> Any:
