@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -14,11 +14,15 @@ from photonpano.motion.loop import LevelResult
 from photonpano.motion.velocity import ConstantVelocity
 from photonpano.motion.velocity_search import find_velocity
 from photonpano.pipeline.components import build_levels
-from photonpano.pipeline.passes.cuts import Cuts
-from photonpano.pipeline.passes.levels import FoundLens, LaterLevels
-from photonpano.pipeline.passes.light import ChangingLight
-from photonpano.pipeline.passes.rule import Pass, tried
-from photonpano.pipeline.passes.shading import Shading
+from photonpano.pipeline.passes import (
+    Pass,
+    cut_at_jumps,
+    in_changing_light,
+    later_levels,
+    through_found_lens,
+    tried,
+    without_shading,
+)
 from photonpano.pipeline.state import State, model_of
 from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
@@ -48,9 +52,10 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     timeline = timeline_of(source, context)
     start = None if plan.motion.start == "none" else _start(source, reference, journal, context)
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)
-    passes: tuple[Pass[Any], ...] = (FoundLens(), Shading(), ChangingLight(plan), LaterLevels(journal), Cuts())
-    for step in passes:
-        before, state = state, tried(state, step).state
+    left = partial(later_levels, journal=journal)
+    passes: tuple[Pass, ...] = (through_found_lens, without_shading, in_changing_light, left, cut_at_jumps)
+    for each in passes:
+        before, state = state, tried(state, each).state
         journal += state.decisions[len(before.decisions) :]
     journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state

@@ -13,8 +13,8 @@ from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.following.follow import followed
-from photonpano.pipeline.passes.refiners import refine
 from photonpano.pipeline.pose_run import find_poses
+from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import BegunRun, Results, begun_run
 from photonpano.protocols import light_of

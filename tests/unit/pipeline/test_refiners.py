@@ -14,7 +14,7 @@ from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, inverse, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Timeline
-from photonpano.pipeline.passes.refiners import refine
+from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record
 from photonpano.record.run_warnings import refinement_warnings

@@ -1,4 +1,4 @@
-"""Passes of refiners: each corrects the motion by what short spans of frames show beyond it."""
+"""Refine the motion: each refiner corrects it by what short spans of frames show beyond it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import numpy as np
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.motion.attribution import attributing
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.pipeline.passes.rule import Pass, tried
+from photonpano.pipeline.passes import Proposal, tried
 from photonpano.pipeline.state import State
-from photonpano.protocols import Source
-from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner, Refinement, require_refined
+from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement, require_refined
 from photonpano.values import Refined
 
 # Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough.
@@ -33,51 +32,34 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""
         while len(rounds) < MAX_ROUNDS:
-            trial = tried(state, Correction(refiner, place, len(rounds) + 1))
-            if not trial.accepted:
-                kept_out = " ".join(trial.worse.split())
+            state, accepted, worse = tried(state, partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1))
+            if accepted is None:
+                kept_out = " ".join(worse.split())
                 break
-            state = trial.state
-            rounds.append(trial.found.summary)
-            state.context.progress.note(f"{refiner.name}: {trial.found.summary}")
+            rounds.append(accepted.summary)
+            state.context.progress.note(f"{refiner.name}: {accepted.summary}")
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
     return state.fit.explained(refinements)
 
 
-class Correction(Pass[Refined]):
-    """One round of a refiner."""
-
-    def __init__(self, refiner: NamedRefiner, place: int, number: int) -> None:
-        """Take the refiner, its place among those of the run, and the number of the round, from 1."""
-        self._refiner, self._place, self._number = refiner, place, number
-
-    def find(self, state: State) -> Refined | None:
-        """Call the refiner.
-
-        Raises:
-            PluginError: the refiner failed, or broke its contract.
-        """
-        source, context = state.view.source, state.view.context
-        given = self._place, self._number, state.motion.homographies, state.motion.std_px
-        return context.checkpoints.once("refined", partial(_refined, self._refiner, source, state.fit, self._number), *given)
-
-    def propose(self, state: State, found: Refined) -> State:
-        """Take the corrected motion."""
-        trajectory = FrameTrajectory(found.homographies)
-        motion = replace(state.motion, trajectory=trajectory, homographies=found.homographies, std_px=found.std_px)
-        return replace(state, refined=motion)
-
-    def rejection(self, found: Refined, worse: str) -> str:
-        """Name the refiner."""
-        return f"the correction of {self._refiner.origin} ({found.summary}) is not used: {worse}"
+def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:
+    """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
+    given = place, number, state.motion.homographies, state.motion.std_px
+    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state, number), *given)
+    if found is None:
+        return None
+    homographies, std_px = found.homographies, found.std_px
+    motion = replace(state.motion, trajectory=FrameTrajectory(homographies), homographies=homographies, std_px=std_px)
+    rejection = f"a correction of {refiner.origin} is not used"
+    return Proposal(lambda: replace(state, refined=motion), rejection=rejection, summary=found.summary)
 
 
-def _refined(refiner: NamedRefiner, source: Source, fit: MotionFit, number: int) -> Refined | None:
+def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None:
     """Call a refiner, check what it returns, and make the homography of the reference frame the identity."""
-    motion = fit.motion
+    motion, fit = state.motion, state.fit
     with attributing(refiner.origin, f"round {number}"):
         std_px = motion.std_px.copy()
-        found = refiner.component.refine(source, motion.trajectory, std_px, fit.residuals.steps(), fit.predictions)
+        found = refiner.component.refine(state.view.source, motion.trajectory, std_px, fit.residuals.steps(), fit.predictions)
         if found is None:
             return None
         require_refined(found, motion.std_px)

@@ -1,1 +1,0 @@
-"""What is tried after the first level of the loop: see `rule.Pass`."""
