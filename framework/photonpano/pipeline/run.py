@@ -89,9 +89,9 @@ def run(
     if follow:
         if resume or from_level is not None:
             raise InputError("a run that follows a capture begins anew: without resume and from_level")
-        with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as complete:
-            result = run(complete.plan, progress, overwrite=overwrite, keep_work=keep_work)
-            return replace(result, followed=complete.figures)
+        with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as (complete, figures):
+            result = run(complete, progress, overwrite=overwrite, keep_work=keep_work)
+            return replace(result, followed=figures)
     with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
         if not begun.was_finished:
             begun.end(make_panorama(begun) if plan.pose is None else find_poses(begun))

@@ -11,9 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from photonpano.captures.fingerprint import capture_files
 from photonpano.compiling import notify_on_first_compile
@@ -30,7 +31,7 @@ from photonpano.pipeline.following.picture import PictureSoFar, rehearse
 from photonpano.pipeline.following.spool import Spool
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.pipeline.run_steps import COMPILING
-from photonpano.protocols import Arrived, Piped
+from photonpano.protocols import Piped
 from photonpano.report import LiveFigures
 from photonpano.specs.plan import Plan
 from photonpano.text import counted, duration
@@ -48,26 +49,13 @@ _WINDOW_S = 0.2
 _IDLE_S = 0.1
 
 
-@dataclass(slots=True)
-class Followed:
-    """A capture that was followed until it was complete.
-
-    Attributes:
-        plan: runs the whole capture, which is now in a file.
-        figures: how far behind the frames were located.
-    """
-
-    plan: Plan
-    figures: LiveFigures
-
-
 def live_folder(run_directory: Path) -> Path:
     """Return the folder of the page, beside a run folder."""
     return run_directory.with_name(f"{run_directory.name}.live")
 
 
 @contextmanager
-def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[Followed]:
+def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[tuple[Plan, LiveFigures]]:
     """Follow a capture until it is complete; the block then runs the whole of it, and the page says how that ended.
 
     Args:
@@ -75,6 +63,9 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
         progress: receives messages.
         overwrite: whether a file of an earlier capture there is replaced, and the run folder; see `run`.
         end_after: seconds without a new frame after which a growing file counts as complete, unless it promises more frames.
+
+    Yields:
+        The plan that runs the capture, which is now in a file; and how far behind its frames were located.
 
     Raises:
         InputError: the source cannot be followed; or what arrives is no capture, or is incomplete. What arrived is kept.
@@ -98,7 +89,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
             spool = Spool(_standard_input(), _free(spooled, plan, overwrite), what)
             stack.callback(spool.close)
         page = LivePage(folder, directory)
-        arrivals = Arrivals(partial(_arrived, look, plan), None if spool is None else lambda: spool.ended, end_after)
+        arrivals = Arrivals(partial(look, plan.source.config), None if spool is None else lambda: spool.ended, end_after)
         stack.callback(arrivals.close)
         progress.note(f"following the capture; {folder / PAGE} shows the panorama so far")
         try:
@@ -109,7 +100,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
                 spool.require_whole()
             _require_complete(plan, arrivals, end_after)
             page.write(replace(figures, state="finishing"))
-            yield Followed(plan, figures)
+            yield plan, figures
             page.write(replace(figures, state="finished"))
         except BaseException as error:
             arrivals.close()  # before the spool, which may remove the file that is watched
@@ -122,8 +113,8 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
             raise
 
 
-def _followable(plan: Plan) -> Callable[..., Arrived | Piped]:
-    """Return what opens the part of the capture that is there."""
+def _followable(plan: Plan) -> Callable[[Any], Any]:
+    """Return the function that opens the part of the capture that is there: an `Arrived`, or a `Piped`."""
     contribution, config = plan.source.contribution, plan.source.config
     assert isinstance(contribution, SourceContribution)
     if plan.pose is not None:
@@ -138,12 +129,6 @@ def _followable(plan: Plan) -> Callable[..., Arrived | Piped]:
             str(plan.place("source.with.frames").problem("a part of a capture cannot be followed; remove this key"))
         )
     return contribution.arrived
-
-
-def _arrived(look: Callable[..., Arrived | Piped], plan: Plan) -> Arrived:
-    found = look(plan.source.config)
-    assert isinstance(found, Arrived)
-    return found
 
 
 def _from_file(plan: Plan, path: Path) -> Plan:
