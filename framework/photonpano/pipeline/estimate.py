@@ -55,8 +55,8 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     left = partial(later_levels, journal=journal)
     passes: tuple[Pass, ...] = (through_found_lens, without_shading, in_changing_light, left, cut_at_jumps)
     for each in passes:
-        before, state = state, tried(state, each).state
-        journal += state.decisions[len(before.decisions) :]
+        n_decisions, state = len(state.decisions), tried(state, each).state
+        journal += state.decisions[n_decisions:]
     journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state
 

@@ -53,10 +53,14 @@ Pass: TypeAlias = Callable[[State], Proposal | None]
 
 
 class Trial(NamedTuple):
-    """The state after a pass, the proposal if it was accepted, and otherwise why not."""
+    """The state after a pass; whether its proposal was accepted, with a summary of it; and otherwise why not.
+
+    It does not hold the proposal, and with it the state before: both have a panorama.
+    """
 
     state: State
-    accepted: Proposal | None = None
+    accepted: bool = False
+    summary: str = ""
     worse: str = ""
 
 
@@ -74,7 +78,7 @@ def tried(state: State, propose: Pass) -> Trial:
         worse = str(error)
     else:
         if not worse:
-            return Trial(proposal.settle(proposed), proposal)
+            return Trial(proposal.settle(proposed), accepted=True, summary=proposal.summary)
     logger.log(proposal.severity, "%s: %s", proposal.rejection, worse)
     return Trial(state, worse=worse)
 

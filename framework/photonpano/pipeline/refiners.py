@@ -32,12 +32,13 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""
         while len(rounds) < MAX_ROUNDS:
-            state, accepted, worse = tried(state, partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1))
-            if accepted is None:
+            each = partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1)
+            state, accepted, summary, worse = tried(state, each)
+            if not accepted:
                 kept_out = " ".join(worse.split())
                 break
-            rounds.append(accepted.summary)
-            state.context.progress.note(f"{refiner.name}: {accepted.summary}")
+            rounds.append(summary)
+            state.context.progress.note(f"{refiner.name}: {summary}")
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
     return state.fit.explained(refinements)
 

@@ -61,7 +61,7 @@ def test_proposal_is_accepted_if_not_worse(
 ) -> None:
     monkeypatch.setattr(State, "fit", None)
     trial = tried(BEFORE, step)
-    assert (trial.accepted is not None, trial.worse) == (accepted, worse)
+    assert (trial.accepted, trial.worse) == (accepted, worse)
     assert trial.state.reference == (5 if accepted else 0)
     assert caplog.messages == ([f"it is not used: {worse}"] if worse else [])
 
