@@ -155,14 +155,6 @@ def _checked_fallbacks(
 
     Exposures that are far apart show less of the scene in common, but all of an object that moves along with the camera. The
     first locator then fails, and the features of a fallback match on the object.
-
-    Args:
-        edges: all pairs.
-        first_locator: its name.
-        n_groups: number of exposures.
-        frame_shape: (height, width) of a frame.
-        start: (N, 3, 3) homographies by the motion known so far; None at the first level.
-        model: what the motion may be.
     """
     firsts = [edge for edge in edges if edge.locator == first_locator]
     others = [edge for edge in edges if isinstance(edge.motion, Located) and edge.locator != first_locator]
@@ -207,13 +199,8 @@ def _not_outvoting(
     """Reject loop closures that turn other pairs between their exposures into outliers; return all closures.
 
     Where a scene repeats, many closures may be wrong by the same distance, and agree with each other. An uncertain pair fits
-    right closures without becoming an outlier; a pair that becomes an outlier is more certain than they are.
-
-    Args:
-        closures: all closures.
-        edges: the other pairs.
-        alone: the solution of the other pairs, whose outliers are wrong anyway.
-        together: the solution with all closures.
+    right closures without becoming an outlier; a pair that becomes an outlier is more certain than they are. Outliers of the
+    solution without closures (`alone`) are wrong anyway.
     """
     outvoted = [edges[index] for index in set(together.outliers) - set(alone.outliers) if index < len(edges)]
 

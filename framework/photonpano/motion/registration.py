@@ -159,14 +159,7 @@ class Registrar:
     def _submitted(
         self, partners: Mapping[int, Sequence[int]], known: int, pool: ThreadPoolExecutor, threads: int
     ) -> Iterator[tuple[int, Future[list[Edge]]]]:
-        """Describe exposures in order; yield each new one with a job that registers its pairs, and maybe those of others.
-
-        Args:
-            partners: the exposures to describe, with the earlier ones that each is registered with.
-            known: the number of exposures whose pairs are registered already.
-            pool: waits for tasks.
-            threads: how many tasks are worked on ahead.
-        """
+        """Describe exposures in order; yield each from number `known` on with a job that registers its pairs."""
         bundles = list(batched(partners, self._at_once))
         job: Future[list[Edge]] | None = None
         for bundle, described in zip(bundles, in_order(self._describe, bundles, threads, pool), strict=True):
@@ -182,12 +175,7 @@ class Registrar:
             yield from ((moving, job) for moving in new)
 
     def _register_along(self, partners: Mapping[int, Sequence[int]], before: Future[list[Edge]] | None = None) -> list[Edge]:
-        """Register exposures of the first level, once those before them are.
-
-        Args:
-            partners: the exposures, each with earlier ones.
-            before: registers those before.
-        """
+        """Register exposures of the first level with earlier ones, once the job of those before them is done."""
         if before is not None:
             before.result()
         involved = {*partners, *(fixed for earlier in partners.values() for fixed in earlier)}

@@ -97,12 +97,7 @@ class PictureSoFar:
         return PhotonSum(counts[seen], weight[seen]).estimate(self._response)[0]
 
     def _grow(self, placed: FloatArray, shape: tuple[int, int]) -> bool:
-        """Make room for frames; return whether there is enough.
-
-        Args:
-            placed: (N, 3, 3), from frames to the plane.
-            shape: (height, width) of a frame.
-        """
+        """Make room for frames at (N, 3, 3) places of the plane; return whether there is enough."""
         while True:
             low, high = self._box(placed, shape)
             first, last = self._origin, self._origin + self._sums.shape[:0:-1]
