@@ -13,16 +13,8 @@ from photonpano.errors import InputError
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.velocity import ConstantVelocity
 from photonpano.motion.velocity_search import find_velocity
+from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
-from photonpano.pipeline.passes import (
-    Pass,
-    cut_at_jumps,
-    in_changing_light,
-    later_levels,
-    through_found_lens,
-    tried,
-    without_shading,
-)
 from photonpano.pipeline.state import State, model_of
 from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
@@ -52,10 +44,14 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     timeline = timeline_of(source, context)
     start = None if plan.motion.start == "none" else _start(source, reference, journal, context)
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)
-    left = partial(later_levels, journal=journal)
-    passes: tuple[Pass, ...] = (through_found_lens, without_shading, in_changing_light, left, cut_at_jumps)
-    for each in passes:
-        n_decisions, state = len(state.decisions), tried(state, each).state
+    for each in (
+        passes.through_found_lens,
+        passes.without_shading,
+        passes.in_changing_light,
+        partial(passes.later_levels, journal=journal),
+        passes.cut_at_jumps,
+    ):
+        n_decisions, state = len(state.decisions), passes.tried(state, each).state
         journal += state.decisions[n_decisions:]
     journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state

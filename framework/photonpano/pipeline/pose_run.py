@@ -16,7 +16,7 @@ from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.pose_checks import require_estimate
-from photonpano.pipeline.run_steps import BegunRun, Results
+from photonpano.pipeline.run_steps import BegunRun
 from photonpano.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
 from photonpano.record.pose_record import poses_record, poses_warnings
 from photonpano.record.run_json import started_record
@@ -29,8 +29,8 @@ from photonpano.values import CameraGuess, FluxImage, PoseEstimate, StreamInfo
 _WHITE_QUANTILE = 0.995
 
 
-def find_poses(run: BegunRun) -> Results:
-    """Estimate the poses, and write the files of the run."""
+def find_poses(run: BegunRun) -> None:
+    """Estimate the poses, write their files, and end the run."""
     plan, source, start = run.plan, run.source, time.perf_counter()
     with naming_obstacles(source, run.journal):
         estimate = _estimated(run)
@@ -41,7 +41,7 @@ def find_poses(run: BegunRun) -> Results:
         "poses": poses_record(estimate),
         "warnings": [*poses_warnings(estimate), *files],
     }
-    return Results(record, lambda record: render_pose_report(record, estimate))
+    run.end(record, lambda record: render_pose_report(record, estimate))
 
 
 def camera_guess(plan: Plan) -> CameraGuess:

@@ -16,7 +16,7 @@ from photonpano.pipeline.following.follow import followed
 from photonpano.pipeline.pose_run import find_poses
 from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.rendering import render_into
-from photonpano.pipeline.run_steps import BegunRun, Results, begun_run
+from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.protocols import light_of
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
@@ -94,12 +94,12 @@ def run(
             return replace(result, followed=figures)
     with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
         if not begun.was_finished:
-            begun.end(make_panorama(begun) if plan.pose is None else find_poses(begun))
+            (make_panorama if plan.pose is None else find_poses)(begun)
         return RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
 
 
-def make_panorama(run: BegunRun) -> Results:
-    """Estimate the motion in levels, refine and judge it, render the panorama, and write the files of the run."""
+def make_panorama(run: BegunRun) -> None:
+    """Estimate the motion in levels, refine and judge it, render the panorama, and end the run."""
     plan, folder, journal = run.plan, run.folder, run.journal
     with executor_of(plan, run.source) as executor:
         context = replace(run.context, threads=executor.under_way, executor=executor)
@@ -117,4 +117,4 @@ def make_panorama(run: BegunRun) -> Results:
     found = state.results, explained, verdict, panorama, chosen
     record = record_of(plan, source.info, journal, *found, run.seconds, run.capture)
     light, capture = light_of(source), OpenCapture(source, state.results)
-    return Results(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
+    run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)

@@ -39,21 +39,6 @@ logger = logging.getLogger(__name__)
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Results:
-    """What a run has found, once its files are written.
-
-    Attributes:
-        record: of the run.
-        draw: makes the report from the record.
-        verdict: whether motion and panorama explain the photons; None for poses.
-    """
-
-    record: RunRecord
-    draw: Callable[[RunRecord], str]
-    verdict: Verdict | None = None
-
-
 @dataclass(eq=False)
 class BegunRun:
     """A run that has begun.
@@ -70,7 +55,7 @@ class BegunRun:
         work: what the run finds, for the case of an interruption.
         was_finished: whether the run was finished before, so that nothing is left to do.
         record: of the finished run.
-        verdict: see `Results`.
+        verdict: whether motion and panorama explain the photons; None for poses.
     """
 
     plan: Plan
@@ -107,12 +92,12 @@ class BegunRun:
         """Seconds since the capture was open."""
         return time.perf_counter() - self.start
 
-    def end(self, results: Results) -> None:
-        """Put the files of the run into its folder, and then the report: once the results are there, a failure is a warning."""
-        record = self.folder.commit(results.record)
+    def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:
+        """Put the files of the run into its folder, and then the report that `draw` makes of the record."""
+        record = self.folder.commit(record)
         if self.work is not None:
             self.work.finish()
-        self.record, self.verdict = _with_report(self.folder, record, results.draw), results.verdict
+        self.record, self.verdict = _with_report(self.folder, record, draw), verdict
 
 
 @contextmanager

@@ -75,29 +75,14 @@ class State:
         """
         if not levels:
             return self
-        plan, before = self.plan, [each for each in self.results if each.level.number < levels[0].number]
-        found = estimate_motion(
-            self.source,
-            levels,
-            plan.graph,
-            self.reference,
-            self.context,
-            plan.until_converged,
-            previous,
-            self.timeline,
-            self.model,
-        )
-        return replace(self, results=(*before, *found), outdated=False)
+        before = [each for each in self.results if each.level.number < levels[0].number]
+        given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
+        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given)), outdated=False)
 
     def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
         """Return the state of a capture with one more correction, on which its checkpoints then depend."""
-        return replace(
-            self,
-            source=source,
-            context=_within(self.context, correction),
-            outdated=True,
-            decisions=(*self.decisions, decision),
-        )
+        context, decisions = _within(self.context, correction), (*self.decisions, decision)
+        return replace(self, source=source, context=context, outdated=True, decisions=decisions)
 
     @property
     def trajectory(self) -> Trajectory:
