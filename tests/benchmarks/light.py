@@ -30,7 +30,8 @@ from photonpano.merging.panorama import render
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import linear_to_srgb
 from photonpano.pipeline.components import build_levels, open_source
-from photonpano.pipeline.estimate import estimate, vignette_of
+from photonpano.pipeline.estimate import estimate
+from photonpano.pipeline.passes import vignette_of
 from photonpano.values import Decision, FloatArray, Light
 
 Settings: TypeAlias = dict[str, Any]

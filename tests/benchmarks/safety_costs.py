@@ -24,8 +24,11 @@ from unittest import mock
 from crashes import preload, prepare, warm_up
 
 COSTS = {
-    "fingerprint of the capture": ("photonpano.pipeline.run.run_fingerprint",),
-    "lock, run folder and work folder": ("photonpano.pipeline.run_steps.run_folder", "photonpano.pipeline.run.work_folder"),
+    "fingerprint of the capture": ("photonpano.pipeline.run_steps.fingerprint",),
+    "lock, run folder and work folder": (
+        "photonpano.pipeline.run_steps.run_folder",
+        "photonpano.pipeline.run_steps.work_folder",
+    ),
     "checkpoints": (
         "photonpano.pipeline.checkpoints.store.Store.save",
         "photonpano.pipeline.checkpoints.store.Store.load",

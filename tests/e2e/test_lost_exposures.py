@@ -158,7 +158,7 @@ def test_failure_of_the_report_does_not_hide_that_of_the_run(
     def fail(*_: object) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr(f"photonpano.pipeline.failed_run.{obstacle}", fail)
+    monkeypatch.setattr(f"photonpano.pipeline.run_steps.{obstacle}", fail)
     with pytest.raises(LocationError) as caught:
         run_into(with_a_wall(50, 150), "resample.with.group_size=25")
     assert caught.value.report is None

@@ -18,7 +18,7 @@ from photonpano.lighting import in_light_of
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import through_lens
 from photonpano.pipeline.components import open_source
-from photonpano.pipeline.estimate import model_of
+from photonpano.pipeline.state import model_of
 from photonpano.protocols import Source
 from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record

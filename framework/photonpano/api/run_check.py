@@ -9,7 +9,7 @@ from photonpano.api.opened_run import opened_run
 from photonpano.context import Context, Progress, usual
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
-from photonpano.residuals.refinement import Look, refine
+from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
 from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import Decision
@@ -45,8 +45,8 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
     with opened_run(Path(run_folder), catalog) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
         context = Context(thread_count(plan.run.threads), usual(progress))
-        rendering = plan.render.tolerance_px, int(plan.run.memory), context
-        explained = refine(opened.source, Look(opened.source, opened.motion, *rendering), (), *rendering)
+        fit = MotionFit(opened.source, opened.motion, plan.render.tolerance_px, int(plan.run.memory), context)
+        explained = fit.explained()
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
     unknown = []
     if not opened.has_std_px:

@@ -21,18 +21,18 @@ from photonpano.protocols import KeepsHypotheses
 from photonpano.threads import Guard, Stopwatch
 from photonpano.values import Decision, Edge, Homography, Located, NotLocated, VirtualExposure
 
+# Least weight of a pair. Shared photons carry no new information: their noise agrees with the motion known so far.
 MIN_PAIR_WEIGHT = 0.05
-"""Lower bound of a pair's weight. Shared photons carry no new information: their noise agrees with the motion known so far."""
+# Most hypotheses of a pair that are used.
 MAX_HYPOTHESES = 100
-"""Most hypotheses of a pair that are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
-    """What stays of an exposure where it was merged.
+    """An exposure as it stays in the process that has merged it.
 
     Attributes:
-        contrast: how much there is to see in it.
+        contrast: of its image.
         exposure: the exposure itself, for loop closures.
         features: what locators made of it so far, by their numbers; none of a blank exposure.
         guard: held while a locator describes it, so that each does so once.
@@ -44,8 +44,8 @@ class Described:
     guard: Guard = field(default_factory=Guard)
 
 
+# Exposures by their numbers.
 Descriptions: TypeAlias = Mapping[int, Described]
-"""Exposures, by their numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +57,8 @@ class Pair:
         fixed: number of the earlier one.
         expected: the motion known so far, if any.
         guessed: whether that is a guess of the first level, from which only locators that keep hypotheses start.
-        closure: whether it is a candidate for a loop closure. The motion known so far may have drifted by any distance between
-            its exposures, and tells nothing of whether the camera stands where it stood before.
+        closure: whether it is a candidate for a loop closure. The motion known so far may have drifted between its exposures,
+            and does not predict whether the camera is back where it was.
     """
 
     moving: int
@@ -70,7 +70,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What a task brings home beside its result.
+    """What a task returns beside its result.
 
     Attributes:
         seconds: in each stage.
@@ -121,11 +121,11 @@ class ExposureTasks:
             keep: whether the exposures themselves are kept.
 
         Returns:
-            What stays where the task was done, by exposure, and what is known of each exposure.
+            What stays in this process, by exposure; and the contrast of each.
         """
         clock, described = Stopwatch(1), dict[int, Described]()
         for index in indices:
-            exposure = self._merged(index, clock)
+            exposure = self.exposures.merged(index, clock)
             with clock("locate"):
                 contrast = contrast_of(exposure)
             described[index] = Described(contrast, exposure if keep else None)
@@ -145,7 +145,7 @@ class ExposureTasks:
         places: Mapping[int, Place],
         *described: Descriptions,
     ) -> tuple[Tracked, Notes]:
-        """Register exposures of the first level, in order; the nearest partner tells where each lies in those further away.
+        """Register exposures of the first level, in order: first with the nearest partner, whose motion predicts the others.
 
         Args:
             start: see `Track`.
@@ -253,7 +253,7 @@ class ExposureTasks:
         described = known[index]
         with described.guard:
             if locator not in described.features:
-                exposure = self._merged(index, clock) if described.exposure is None else described.exposure
+                exposure = self.exposures.merged(index, clock) if described.exposure is None else described.exposure
                 described.features[locator] = self._features_of(exposure, locator, clock)
             return described.features[locator]
 
@@ -261,9 +261,6 @@ class ExposureTasks:
         named = self.exposures.level.locators[locator]
         with clock("locate"), self.exposures.level.attributing(named):
             return named.component.describe(exposure)
-
-    def _merged(self, index: int, clock: Stopwatch) -> VirtualExposure:
-        return replace(self.exposures, clock=clock).merged(index)
 
     def _notes(self, clock: Stopwatch) -> Notes:
         return Notes(clock.seconds, self.exposures.level.recorder.taken())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any, NewType
@@ -11,14 +11,46 @@ import numpy as np
 
 from photonpano.contracts.attribution import attributing
 from photonpano.geometry import Camera, rescaled
-from photonpano.motion.recorder import Recorder
 from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler
-from photonpano.values import FloatArray, Located
+from photonpano.values import Decision, DecisionValue, FloatArray, Located
 
+# In pixels of frames, as in the motion graph and in trajectories.
 FrameHomography = NewType("FrameHomography", FloatArray)
-"""A homography in pixels of frames, as the motion graph and trajectories have it."""
+# In pixels of a level's exposures, as locators have it.
 ExposureHomography = NewType("ExposureHomography", FloatArray)
-"""A homography in pixels of a level's exposures, as locators have it."""
+
+
+class Recorder:
+    """Records decisions: what a `StageContext` offers to components as `decide`.
+
+    A component that is sent to another process takes its recorder along. There it collects decisions until a task returns them.
+    """
+
+    def __init__(self, decisions: list[Decision] | None = None) -> None:
+        """Take the list of a run that receives decisions; None in another process."""
+        self._decisions, self._waiting = decisions, list[Decision]()
+
+    def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
+        """Record a decision.
+
+        Raises:
+            TypeError: the value is no plain one.
+        """
+        if not isinstance(value, bool | int | float | str):
+            raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
+        self.add(Decision(what, value, reason))
+
+    def add(self, decision: Decision) -> None:
+        """Record a decision that was taken elsewhere."""
+        (self._waiting if self._decisions is None else self._decisions).append(decision)
+
+    def taken(self) -> tuple[Decision, ...]:
+        """Return the decisions that another process has collected, once; in that of the run, there are none."""
+        waiting, self._waiting = self._waiting, []
+        return tuple(waiting)
+
+    def __reduce__(self) -> tuple[Callable[[], Recorder], tuple[()]]:
+        return Recorder, ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +90,7 @@ class Level:
     recorder: Recorder = field(default_factory=Recorder)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel with what merges and locates; groups are chosen, and motions interpolated, where the loop runs."""
+        """Leave out what only the process of the loop needs: the resampler and the interpolator."""
         return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins, self.recorder)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:

@@ -11,9 +11,9 @@ import numpy as np
 from photonpano.context import Context
 from photonpano.contracts.loop import why_still
 from photonpano.errors import PluginError
+from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
-from photonpano.motion.fallbacks import checked_fallbacks
 from photonpano.motion.graph import Evidence, GraphOptions, GraphSolution, components, solve
 from photonpano.motion.level import Level
 from photonpano.motion.merge import VirtualExposures
@@ -26,6 +26,9 @@ from photonpano.text import listed
 from photonpano.threads import thread_pool
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
+# A fallback contradicts the first locator beyond this fraction of the shorter side of a frame.
+_CONTRADICTION = 0.05
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedLevel:
@@ -34,7 +37,7 @@ class LocatedLevel:
     Attributes:
         groups: the groups of the level.
         edges: every pair that was tried, with its motion or the reason why there is none.
-        closures: those of them, at the end, that are candidates for loop closures.
+        closures: the candidates for loop closures among them, which stand at the end.
         solution: one homography for each exposure.
         information: (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held, or (N, 3, 3)
             of its rotation vector for a camera that only turns; None for a single exposure.
@@ -108,7 +111,7 @@ def locate(
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
         _require_motion(level, edges, shape, partial(_seen_px, exposures, edges, context))
         with exposures.clock("locate"), solving(level.number):
-            edges = checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
+            edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
             started = registrar.to_plane is not None
             require_tied(
@@ -143,8 +146,49 @@ def locate(
     )
 
 
+def _checked_fallbacks(
+    edges: Sequence[Edge],
+    first_locator: str,
+    n_groups: int,
+    frame_shape: tuple[int, int],
+    start: FloatArray | None,
+    model: MotionModel,
+) -> tuple[Edge, ...]:
+    """Reject motions by fallback locators that contradict those of the first locator; return all pairs.
+
+    Exposures that are far apart show less of the scene in common, but all of an object that moves along with the camera. The
+    first locator then fails, and the features of a fallback match on the object.
+    """
+    firsts = [edge for edge in edges if edge.locator == first_locator]
+    others = [edge for edge in edges if isinstance(edge.motion, Located) and edge.locator != first_locator]
+    if not firsts or not others:
+        return tuple(edges)
+    parts = components(n_groups, firsts)
+    tied = {(edge.moving, edge.fixed) for edge in others if parts[edge.moving] == parts[edge.fixed]}
+    contradicting: dict[tuple[int, int], float] = {}
+    for part in {int(parts[moving]) for moving, _ in tied}:
+        of_part = [edge for edge in firsts if parts[edge.moving] == part]
+        anchor = of_part[len(of_part) // 2].moving
+        homographies = solve(n_groups, of_part, anchor, frame_shape, start, model).homographies
+        for edge in others:
+            if (edge.moving, edge.fixed) in tied and parts[edge.moving] == part and isinstance(edge.motion, Located):
+                between = inverse(homographies[edge.fixed]) @ homographies[edge.moving]
+                away_px = float(corner_displacements(between, edge.motion.homography, frame_shape).mean())
+                if away_px > _CONTRADICTION * min(frame_shape):
+                    contradicting[edge.moving, edge.fixed] = away_px
+
+    def checked(edge: Edge) -> Edge:
+        away_px = contradicting.get((edge.moving, edge.fixed))
+        if away_px is None:
+            return edge
+        reason = f"{edge.locator}: the motion is {away_px:.0f} px from that along the pairs of {first_locator} in between"
+        return replace(edge, motion=NotLocated(reason, edge.motion.evidence), locator="")
+
+    return tuple(map(checked, edges))
+
+
 def _seen_px(exposures: VirtualExposures, edges: Sequence[Edge], context: Context) -> float:
-    """Return the largest motion of a pair at the first level, in px, as short spans of frames show it; 0 where they do not."""
+    """Return the largest motion of a pair at level 1 by the velocities of short spans, in px; 0 where these show none."""
     if exposures.previous is not None:
         return 0.0
     start, instants = starting_motion(exposures.source, exposures.groups, context), instants_of(exposures.groups)
@@ -155,16 +199,11 @@ def _seen_px(exposures: VirtualExposures, edges: Sequence[Edge], context: Contex
 def _not_outvoting(
     closures: tuple[Edge, ...], edges: Sequence[Edge], alone: GraphSolution, together: GraphSolution
 ) -> tuple[Edge, ...]:
-    """Return the loop closures; those are not located that turn other pairs between their exposures into outliers.
+    """Reject loop closures that turn other pairs between their exposures into outliers; return all closures.
 
-    Where a scene repeats, many closures may be wrong by the same distance, and agree with each other. A pair that is uncertain
-    gives way to closures without becoming an outlier; one that becomes an outlier is surer than they are.
-
-    Args:
-        closures: all closures.
-        edges: the other pairs.
-        alone: the solution of the other pairs, whose outliers are wrong anyway.
-        together: the solution with all closures.
+    Where a scene repeats, many closures may be wrong by the same distance, and agree with each other. An uncertain pair fits
+    right closures without becoming an outlier; a pair that becomes an outlier is more certain than they are. Outliers of the
+    solution without closures (`alone`) are wrong anyway.
     """
     outvoted = [edges[index] for index in set(together.outliers) - set(alone.outliers) if index < len(edges)]
 
@@ -181,7 +220,7 @@ def _not_outvoting(
 
 
 def _ambiguity(level: int, alternatives_px: Mapping[tuple[int, int], float], edges: Sequence[Edge]) -> Ambiguity | None:
-    """Return which located pairs may as well have another motion, and how far that is away."""
+    """Return the located pairs that fit the scene at a second place, and its median distance."""
     located = {(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)}
     pairs = tuple(sorted(located & alternatives_px.keys()))
     if not pairs:

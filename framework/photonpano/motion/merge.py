@@ -44,14 +44,18 @@ class VirtualExposures:
         """Return the motion known so far at every frame of the capture: (T, 3, 3); None at the first level."""
         return None if self.previous is None else self.previous.at(np.arange(self.source.info.n_frames))
 
-    def merged(self, index: int) -> VirtualExposure:
+    def merged(self, index: int, clock: Stopwatch | None = None) -> VirtualExposure:
         """Merge a group along the motion known so far. Nothing is cached: a second call merges it again.
+
+        Args:
+            index: of the group.
+            clock: adds up the time, in place of that of the level.
 
         Raises:
             PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.
         """
         level = self.level
-        with self.clock("merge"), level.attributing("merger"):
+        with (clock or self.clock)("merge"), level.attributing("merger"):
             exposure = level.merger.merge(self.source, self.groups[index], self.previous, level.scale)
             return EXPOSURE.require(exposure, Asked(self.groups[index], level.scale, self.frame_shape))
 

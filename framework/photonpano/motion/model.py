@@ -10,8 +10,8 @@ import numpy as np
 from photonpano.geometry import Camera, camera_matrix
 
 ModelName = Literal["homography", "rotation", "auto"]
+# Initial focal length, in longer sides of a frame.
 _FIRST_FOCAL = 3.0
-"""A focal length to begin with, in sides of a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class MotionModel:
     """What the motion of a camera may be.
 
     Attributes:
-        kind: any homographies, rotations of one camera, or what the pairs say.
+        kind: any homographies, rotations of one camera, or "auto": the model that the pairs support.
         focal_px: of the camera; None if it is to be found.
         centre_px: (x, y) of its principal point; None for the middle of the frames.
         distortion: k1, k2, p1, p2 of its lens; None for those that are to be found.

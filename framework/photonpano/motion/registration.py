@@ -23,19 +23,19 @@ from photonpano.values import Decision, Edge, FloatArray, Located, NotLocated
 
 ResultT = TypeVar("ResultT")
 
+# Predecessors with which an exposure is registered if none of its own pairs is located.
 BRIDGE = 3
-"""If no pair of an exposure with earlier ones is located, pairs with this many predecessors are tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """What is known of an exposure once its pairs with earlier ones are registered.
+    """An exposure whose pairs with earlier ones are registered.
 
     Attributes:
         edges: these pairs.
-        contrast: how much there is to see in it.
+        contrast: of its image.
         place: where it lies, at a first level that is tracked; None at others.
-        alternatives_px: the other exposures of pairs that may as well have another motion, and how far away that is.
+        alternatives_px: distance of a second motion that fits as well, by the other exposure of the pair.
     """
 
     edges: tuple[Edge, ...]
@@ -48,9 +48,8 @@ class Registrar:
     """Has the exposures of a level described and pairs of them registered: see `ExposureTasks`.
 
     Attributes:
-        contrasts: how much there is to see in each exposure described so far, by its number.
-        alternatives_px: of the pairs that may as well have another motion, how far that is from where their registration
-            started.
+        contrasts: of the exposures described so far, by their numbers.
+        alternatives_px: by pair, the distance of a second motion that fits as well from where its registration started.
         to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
@@ -159,14 +158,7 @@ class Registrar:
     def _submitted(
         self, partners: Mapping[int, Sequence[int]], known: int, pool: ThreadPoolExecutor, threads: int
     ) -> Iterator[tuple[int, Future[list[Edge]]]]:
-        """Describe exposures in order; yield each new one with a job that registers its pairs, and maybe those of others.
-
-        Args:
-            partners: the exposures to describe, with the earlier ones that each is registered with.
-            known: the number of exposures whose pairs are registered already.
-            pool: waits for tasks.
-            threads: how many tasks are worked on ahead.
-        """
+        """Describe exposures in order; yield each from number `known` on with a job that registers its pairs."""
         bundles = list(batched(partners, self._at_once))
         job: Future[list[Edge]] | None = None
         for bundle, described in zip(bundles, in_order(self._describe, bundles, threads, pool), strict=True):
@@ -182,12 +174,7 @@ class Registrar:
             yield from ((moving, job) for moving in new)
 
     def _register_along(self, partners: Mapping[int, Sequence[int]], before: Future[list[Edge]] | None = None) -> list[Edge]:
-        """Register exposures of the first level, once those before them are.
-
-        Args:
-            partners: the exposures, each with earlier ones.
-            before: registers those before.
-        """
+        """Register exposures of the first level with earlier ones, once the job of those before them is done."""
         if before is not None:
             before.result()
         involved = {*partners, *(fixed for earlier in partners.values() for fixed in earlier)}
@@ -222,7 +209,7 @@ class Registrar:
         return replace(closure, motion=replace(closure.motion, evidence=evidence))
 
     def _describe(self, indices: Sequence[int], keep: bool = False) -> list[tuple[Descriptions, Contrast]]:
-        """Have exposures described; return what stands for that, and how much there is to see in each."""
+        """Have exposures described; return what stands for that, and the contrast of each."""
         described, known = self._executor.keep(ExposureTasks.describe, self._tasks, indices, keep)
         return [(described, contrast) for contrast in self._noted(known)]
 
@@ -238,7 +225,7 @@ class Registrar:
         return {id(kept): kept for kept in (self._kept[index] for index in indices)}.values()
 
     def _noted(self, done: tuple[ResultT, Notes]) -> ResultT:
-        """Return the result of a task, and take note of its time and of decisions, which workers take alike, once."""
+        """Return the result of a task; add up its time, and record its decisions once, since all workers take the same."""
         result, notes = done
         self._clock.add(notes.seconds)
         with self._lock:

@@ -1,4 +1,4 @@
-"""When the frames of a capture were taken: repeated frames, and places where the motion is cut because frames are missing."""
+"""Time of each frame, and frames where the image jumps: frames may be repeated, or missing."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from photonpano.geometry import apply, corners, inverse
 from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 
+# Names of decisions in a record.
 CUT, DARK_JUMP, REPEATED = "cut", "jump_in_the_dark", "repeated_frames"
-"""What a record names the decisions to cut the motion, at a frame or among dark ones, and not to move in repeated frames."""
+# Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
-"""Frames of the shortest part of a group that is kept beside a cut."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,7 @@ class Cut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timeline:
-    """What the numbers of the frames do not tell of time.
+    """Time of each frame, and frames where the image jumps.
 
     Attributes:
         taken: (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated.

@@ -27,8 +27,7 @@ from photonpano.contributions import (
 from photonpano.corrections import corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.interrupts import is_interrupt
-from photonpano.motion.level import Level, NamedLocator
-from photonpano.motion.recorder import Recorder
+from photonpano.motion.level import Level, NamedLocator, Recorder
 from photonpano.protocols import PoseEstimator, Resampler, Source, light_of
 from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream

@@ -22,12 +22,12 @@ from photonpano.protocols import Source, camera_of
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
+# Pictures from which the white balance "grey-world" is taken, all over the video, so that it does not flicker.
 _BALANCED_ON = 16
-"""The white balance "grey-world" is that of 16 pictures all over the video, so that it does not flicker."""
+# Brightness of the panorama outside the frame, relative to a still.
 _DIMMED = 0.4
-"""Level of the panorama around the frame, as a part of what it is in a picture."""
+# Width of the outline, as a fraction of the longer side.
 _LINES_PER_PX = 1 / 300
-"""Width of the outline, as a part of the longer side."""
 _THINNEST_PX, _MARGIN_PX = 2, 4
 
 

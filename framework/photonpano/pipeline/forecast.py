@@ -13,21 +13,22 @@ from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import View, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import render
-from photonpano.motion.loop import LevelResult, estimate_motion, resample
+from photonpano.motion.loop import LevelResult, resample
+from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels, build_renderer
-from photonpano.pipeline.estimate import model_of
+from photonpano.pipeline.state import State, model_of
 from photonpano.protocols import Source, camera_of_motion
 from photonpano.record.environment import peak_memory_bytes
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
+# Length of the trial in the middle of the capture, in groups of the first level.
 TRIAL_GROUPS = 12
-"""Length of the trial, in groups of the first level. It is taken from the middle of the capture."""
+# Length of an untimed trial before it, in groups, for what is done once, such as compiling.
 _WARM_UP_GROUPS = 3
-"""Length of an untimed trial before it, in groups, so that work that is done once, such as compiling, does not count."""
+# Memory for the motion of one frame, as measured in the benchmarks.
 BYTES_PER_FRAME = 1200
-"""Memory for the motion of one frame, as measured in the benchmarks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +95,11 @@ def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: Canvas, mor
     return (height, width) if tried.period_px is None else (tried.height, min(width, round(tried.period_px)))
 
 
-def _tried(plan: Plan, part: Source, threads: int) -> list[LevelResult]:
-    levels = build_levels(plan, part, [])
+def _tried(plan: Plan, part: Source, threads: int) -> tuple[LevelResult, ...]:
+    levels, n_frames = build_levels(plan, part, []), part.info.n_frames
+    state = State(plan, part, Context(threads), n_frames // 2, levels, Timeline.regular(n_frames), model_of(plan))
     with one_thread_inside():
-        return estimate_motion(
-            part, levels, plan.graph, part.info.n_frames // 2, Context(threads), plan.until_converged, model=model_of(plan)
-        )
+        return state.located(levels, None).results
 
 
 def _middle(n_frames: int, length: int) -> FrameSpan:

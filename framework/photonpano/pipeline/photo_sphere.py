@@ -9,8 +9,8 @@ import numpy as np
 
 from photonpano.geometry import Canvas
 
+# Bytes of a PNG's signature and of its first chunk, IHDR.
 _HEADER = 8 + 25
-"""Bytes of a PNG's signature and of its first chunk, IHDR."""
 _KEYWORD = b"XML:com.adobe.xmp"
 
 

@@ -1,81 +1,47 @@
-"""One run with `pose`: open the capture, find the pose of every frame, write the run folder."""
+"""Find the pose of every frame, and write the files of a run with `pose`."""
 
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
-from photonpano.captures.fingerprint import fingerprint
+import cv2
+import numpy as np
+
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.context import Progress, usual
 from photonpano.contracts.attribution import attributing
 from photonpano.contracts.results import POSES
-from photonpano.errors import InputError
-from photonpano.pipeline.checkpoints.finished import finished_run
+from photonpano.errors import OutputError
+from photonpano.geometry import Camera
+from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_pose_estimator
-from photonpano.pipeline.failed_run import reporting_failure
-from photonpano.pipeline.observers import Observers
-from photonpano.pipeline.pose_files import write_pose_files
-from photonpano.pipeline.run_steps import begun_run, first_decisions, require_centre, with_report
-from photonpano.poses import in_standard_world
-from photonpano.protocols import Source
+from photonpano.pipeline.estimate import require_centre
+from photonpano.pipeline.run_steps import BegunRun
+from photonpano.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
 from photonpano.record.pose_record import poses_record, poses_warnings
 from photonpano.record.run_json import started_record
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_pose_report
 from photonpano.specs.plan import Plan
-from photonpano.values import CameraGuess, Decision, PoseEstimate
+from photonpano.values import CameraGuess, FluxImage, PoseEstimate, StreamInfo
+
+# Quantile of the flux of an exposure that is white in its picture.
+_WHITE_QUANTILE = 0.995
 
 
-def run_poses(
-    plan: Plan, progress: Progress | None = None, *, overwrite: bool = False, resume: bool = False, keeps_work: bool = False
-) -> tuple[RunRecord, bool]:
-    """Run a plan with a pose estimator, and write its run folder.
-
-    Args:
-        plan: from `load_spec` or `parse_spec`.
-        progress: receives stages and messages; by default, bars in a notebook and nothing elsewhere.
-        overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
-        resume: take the results of a finished run of the same spec, capture and versions; an interrupted one begins anew,
-            since such a run keeps nothing to go on with.
-        keeps_work: whether the caller asks for work that is kept, which is refused.
-
-    Returns:
-        The content of `run.json`, and whether `resume` found that nothing was left to do.
-
-    Raises:
-        InputError: the capture cannot be used, shows nothing, or does not suit the plan; or `keeps_work`.
-        LocationError: the poses could not be found.
-        PluginError: the pose estimator failed in its own way, or broke its contract.
-        OutputError: the run folder cannot be written, or another process writes it; it is as it was.
-    """
-    if keeps_work:
-        raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
-    progress = usual(progress)
-    observers = Observers(plan.observers, plan.output.directory)
-    with begun_run(plan, observers, progress, overwrite=overwrite) as begun:
-        source, folder = begun.source, begun.folder
-        capture = fingerprint(plan, source)
-        if resume:
-            if (done := finished_run(plan, capture)) is not None:
-                begun.finished(done)
-                return done, True
-            progress.note("a run with `pose` keeps no work: it begins anew")
-        decisions = first_decisions(plan, source)
-        start = time.perf_counter()
-        with reporting_failure(plan, begun, decisions, (), capture), naming_obstacles(source, decisions):
-            estimate = _estimated(plan, source, decisions, progress)
-        observers.posed(estimate, time.perf_counter() - start)
-        warnings = [*poses_warnings(estimate), *write_pose_files(folder.staging, estimate, source.info, plan.output.exposures)]
-        record = folder.commit(
-            {
-                **started_record(plan, source.info, decisions, begun.seconds, capture),
-                "poses": poses_record(estimate),
-                "warnings": warnings,
-            }
-        )
-        record = with_report(folder, record, lambda record: render_pose_report(record, estimate))
-        begun.finished(record)
-    return record, False
+def find_poses(run: BegunRun) -> None:
+    """Estimate the poses, write their files, and end the run."""
+    plan, source, start = run.plan, run.source, time.perf_counter()
+    with naming_obstacles(source, run.journal):
+        estimate = _estimated(run)
+    run.observers.posed(estimate, time.perf_counter() - start)
+    files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)
+    record: RunRecord = {
+        **started_record(plan, source.info, run.journal, run.seconds, run.capture),
+        "poses": poses_record(estimate),
+        "warnings": [*poses_warnings(estimate), *files],
+    }
+    run.end(record, lambda record: render_pose_report(record, estimate))
 
 
 def camera_guess(plan: Plan) -> CameraGuess:
@@ -85,10 +51,102 @@ def camera_guess(plan: Plan) -> CameraGuess:
     return CameraGuess(None if camera.focal_px == "find" else camera.focal_px, camera.centre_px, (k1, k2, p1, p2))
 
 
-def _estimated(plan: Plan, source: Source, decisions: list[Decision], progress: Progress) -> PoseEstimate:
+def _estimated(run: BegunRun) -> PoseEstimate:
     """Return the poses, checked, in a world in which the path has the length 1."""
+    plan, source = run.plan, run.source
     assert plan.pose is not None
     require_centre(plan, source)
-    estimator = build_pose_estimator(plan, source, decisions)
+    estimator = build_pose_estimator(plan, source, run.journal)
     with attributing(plan.pose.label, "the capture"):
-        return in_standard_world(POSES.require(estimator.estimate(source, camera_guess(plan), progress), source.info))
+        return in_standard_world(POSES.require(estimator.estimate(source, camera_guess(plan), run.progress), source.info))
+
+
+def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
+    """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and if they are asked for pictures in images/.
+
+    Args:
+        folder: where the files of the run are gathered.
+        estimate: in a world in which the path has the length 1.
+        stream: the capture.
+        exposures: whether the exposures are written.
+
+    Returns:
+        Warnings.
+
+    Raises:
+        OutputError: the disk is full.
+    """
+    try:
+        _write(folder, estimate, stream)
+        for name, view in zip(view_names(estimate, stream.n_frames), estimate.views if exposures else (), strict=False):
+            (folder / "images").mkdir(exist_ok=True)
+            (folder / "images" / name).write_bytes(_picture(view.flux()))
+    except OSError as error:
+        reason = error.strerror or "a file was cut short"
+        raise OutputError(f"the poses could not be written ({reason}); what was in the run folder is unchanged") from error
+    if stream.frame_rate_hz is None:
+        return ["poses.tum is not written, since the capture gives no frame rate: set source.with.frame_rate_hz"]
+    return []
+
+
+def view_names(estimate: PoseEstimate, n_frames: int) -> tuple[str, ...]:
+    """Return the file names of the exposures, by the first of their frames, such as `exposure_0250.png`."""
+    digits = len(str(n_frames - 1))
+    return tuple(f"exposure_{view.span.start:0{digits}}.png" for view in estimate.views)
+
+
+def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
+    camera = Camera(estimate.camera_matrix, estimate.distortion)
+    np.savez(
+        folder / "poses.npz",
+        allow_pickle=False,
+        camera_from_world=estimate.camera_from_world,
+        camera_matrix=estimate.camera_matrix,
+        distortion=estimate.distortion,
+        located=estimate.located,
+        std_position=estimate.std_position,
+        std_rotation_deg=estimate.std_rotation_deg,
+        frame_shape=np.array(stream.frame_shape),
+        frame_rate_hz=np.array(np.nan if stream.frame_rate_hz is None else stream.frame_rate_hz),
+    )
+    rate = stream.frame_rate_hz or 1.0
+    seen = _of_views(camera, estimate, stream, rate)
+    (folder / "sparse").mkdir()
+    for name, text in colmap(seen).items():
+        (folder / "sparse" / name).write_text(text, encoding="utf-8")
+    for name, text in nerfstudio(seen).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "points.ply").write_bytes(ply(estimate.points))
+    if stream.frame_rate_hz is not None:
+        frames = np.flatnonzero(estimate.located)
+        poses = estimate.camera_from_world[frames]
+        names = tuple(map(str, frames.tolist()))
+        to_world = np.swapaxes(poses[:, :, :3], -1, -2)
+        located = Poses(camera, stream.frame_shape, names, to_world, frames / rate, centres(poses))
+        (folder / "poses.tum").write_text(tum(located)["trajectory.txt"], encoding="utf-8")
+
+
+def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: float) -> Poses:
+    """Return the poses of the exposures, with what they show."""
+    poses = np.array([view.camera_from_world for view in estimate.views]).reshape(-1, 3, 4)
+    return Poses(
+        camera,
+        stream.frame_shape,
+        view_names(estimate, stream.n_frames),
+        np.swapaxes(poses[:, :, :3], -1, -2),
+        np.array([view.instant for view in estimate.views]) / rate,
+        centres(poses),
+        tuple((np.asarray(view.points), view.xy) for view in estimate.views),
+        estimate.points,
+    )
+
+
+def _picture(flux: FluxImage) -> bytes:
+    """Return an exposure as PNG, grey or in colour, 8 bits in sRGB."""
+    known = np.isfinite(flux)
+    white = float(np.quantile(flux[known], _WHITE_QUANTILE)) if known.any() else 1.0
+    picture = tone_mapped(flux, max(white, 1e-12))
+    encoded, png = cv2.imencode(".png", picture)
+    if not encoded:
+        raise OutputError(f"OpenCV could not encode an exposure of {picture.shape} as PNG")
+    return png.tobytes()

@@ -1,38 +1,32 @@
-"""One run: open the capture, estimate the motion, render the panorama, write the run folder."""
+"""One run: begin, estimate the motion, refine and judge it, render the panorama, and end; or find the poses instead."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.context import Context, Progress, usual
+from photonpano.context import Progress, usual
 from photonpano.errors import InputError
-from photonpano.motion.loop import LevelResult
-from photonpano.pipeline.checkpoints.fingerprint import run_fingerprint
-from photonpano.pipeline.checkpoints.finished import finished_run
-from photonpano.pipeline.checkpoints.work_folder import Continuation, work_folder
+from photonpano.pipeline.checkpoints.work_folder import Continuation
 from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
-from photonpano.pipeline.failed_run import reporting_failure
 from photonpano.pipeline.following.follow import followed
-from photonpano.pipeline.observers import Observers
-from photonpano.pipeline.pose_run import run_poses
+from photonpano.pipeline.pose_run import find_poses
+from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.rendering import render_into
-from photonpano.pipeline.run_steps import begun_run, first_decisions, with_report
+from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.protocols import light_of
-from photonpano.record.run_json import record_of, verdict_of
+from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import LiveFigures, OpenCapture, render_report
 from photonpano.report.notebook import run_html
-from photonpano.residuals.refinement import refine
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 
+# Seconds without a new frame after which a capture that is followed is complete, by default.
 END_AFTER_S = 5.0
-"""Seconds without a new frame after which a capture that is followed is complete, by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,59 +89,32 @@ def run(
     if follow:
         if resume or from_level is not None:
             raise InputError("a run that follows a capture begins anew: without resume and from_level")
-        with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as complete:
-            result = run(complete.plan, progress, overwrite=overwrite, keep_work=keep_work)
-            return replace(result, followed=complete.figures)
-    if plan.pose is not None:
-        keeps_work = keep_work or from_level is not None
-        poses, was_finished = run_poses(plan, progress, overwrite=overwrite, resume=resume, keeps_work=keeps_work)
-        return RunResult(plan.output.directory, poses, None, was_finished)
-    return _panorama(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite)
+        with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as (complete, figures):
+            result = run(complete, progress, overwrite=overwrite, keep_work=keep_work)
+            return replace(result, followed=figures)
+    with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
+        if not begun.was_finished:
+            (make_panorama if plan.pose is None else find_poses)(begun)
+        return RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
 
 
-def _panorama(plan: Plan, progress: Progress, how: Continuation, *, overwrite: bool) -> RunResult:
-    """Run a plan for a panorama: estimate the motion in levels, refine and judge it, render, and write the results."""
-    observers = Observers(plan.observers, plan.output.directory)
-    finished: list[LevelResult] = []
-
-    def on_level(result: LevelResult) -> None:
-        finished.append(result)
-        observers.level_finished(result)
-
-    context = Context(progress=progress, on_level=on_level)
-    with begun_run(plan, observers, progress, overwrite=overwrite) as begun, ExitStack() as stack:
-        source, folder, memory = begun.source, begun.folder, int(plan.run.memory)
-        depends_on = run_fingerprint(plan, source)
-        if how.resume and (done := finished_run(plan, depends_on["capture"])) is not None:
-            assert done["verdict"] is not None
-            begun.finished(done)
-            return RunResult(plan.output.directory, done, verdict_of(done["verdict"]), was_finished=True)
-        decisions = first_decisions(plan, source)
-        work = stack.enter_context(work_folder(plan.output.directory, depends_on, decisions, how, progress))
-        stack.enter_context(reporting_failure(plan, begun, decisions, finished, depends_on["capture"]))
-        executor = stack.enter_context(executor_of(plan, source))
-        context = replace(context, threads=executor.under_way, checkpoints=work.checkpoints, executor=executor)
-        with naming_obstacles(source, decisions):
-            found = estimate(plan, source, decisions, context)
-        source, context = found.source, found.context
-        refiners = build_refiners(plan, source, decisions)
-        explained = refine(source, found.look, refiners, plan.render.tolerance_px, memory, context)
-        verdict = judge(explained, found.results, decisions)
-        motion = explained.motion
-        rendering = render_into(folder, plan, source, found.vignette, motion, context, (explained.canvas, explained.panorama))
-        panorama, rendered = rendering.panorama, rendering.decisions
-        observers.rendered(panorama.canvas, panorama.seconds)
+def make_panorama(run: BegunRun) -> None:
+    """Estimate the motion in levels, refine and judge it, render the panorama, and end the run."""
+    plan, folder, journal = run.plan, run.folder, run.journal
+    with executor_of(plan, run.source) as executor:
+        context = replace(run.context, threads=executor.under_way, executor=executor)
+        with naming_obstacles(run.source, journal):
+            state = estimate(plan, run.source, journal, context)
+        source, context = state.view
+        explained = refine(state, build_refiners(plan, source, journal))
+        verdict = judge(explained, state.results, journal)
+        merged = explained.canvas, explained.panorama
+        rendering = render_into(folder, plan, source, state.vignette, explained.motion, context, merged)
+        panorama, chosen = rendering.panorama, rendering.decisions
+        run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
-            folder.write_exposures(found.results, panorama.white_flux, context)
-        record = folder.commit(
-            record_of(
-                *(plan, source.info, decisions, found.results, explained, verdict, panorama, rendered, begun.seconds),
-                depends_on["capture"],
-            )
-        )
-        work.finish()
-        light = light_of(source)
-        capture = OpenCapture(source, found.results)
-        record = with_report(folder, record, lambda record: render_report(record, explained, panorama, light, capture))
-        begun.finished(record)
-    return RunResult(plan.output.directory, record, verdict)
+            folder.write_exposures(state.results, panorama.white_flux, context)
+    found = state.results, explained, verdict, panorama, chosen
+    record = record_of(plan, source.info, journal, *found, run.seconds, run.capture)
+    light, capture = light_of(source), OpenCapture(source, state.results)
+    run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)

@@ -41,8 +41,8 @@ from photonpano.record.contents import RECORD, contents_of, names_of_results, re
 from photonpano.record.schema import FileContent, RunRecord
 from photonpano.values import FluxImage, Light, Panorama
 
+# Files that a message names.
 SHOWN_FILES = 3
-"""Files that a message names."""
 
 
 class RunFolder:

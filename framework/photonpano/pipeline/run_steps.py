@@ -1,30 +1,35 @@
-"""Steps that runs of panoramas and of poses share."""
+"""Begin a run, and end it: observers, capture, run folder, work that is kept, and the report, also of a run that fails."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
+from photonpano.atomic import atomic_path
 from photonpano.capture import capture_of
-from photonpano.captures.fingerprint import capture_files
+from photonpano.captures.fingerprint import CaptureRecord, capture_files, fingerprint
 from photonpano.captures.obstacles import order_warning
 from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
-from photonpano.context import Progress
-from photonpano.errors import InputError, OutputError
+from photonpano.context import Context, Progress
+from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
+from photonpano.motion.loop import LevelResult
+from photonpano.pipeline.checkpoints.fingerprint import finished_run, run_fingerprint
+from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, work_folder
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.run_folder import RunFolder, run_folder
 from photonpano.protocols import Source
 from photonpano.record.environment import peak_memory_bytes
+from photonpano.record.run_json import level_record, started_record, verdict_of
 from photonpano.record.schema import RunRecord
-from photonpano.report import loading_figures
+from photonpano.report import loading_figures, render_failure
+from photonpano.residuals.verdict import Verdict
 from photonpano.specs.plan import Plan
 from photonpano.threads import one_thread_inside
 from photonpano.values import Decision
@@ -34,37 +39,82 @@ logger = logging.getLogger(__name__)
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(eq=False)
 class BegunRun:
     """A run that has begun.
 
     Attributes:
+        plan: what is run.
         source: the capture, which shows something.
         folder: the run folder, which is written.
-        finished: reports the record of the run to the observers.
-        start: the time at which the capture was open, in seconds of `time.perf_counter`.
+        observers: of the run.
+        progress: receives stages and messages.
+        start: when the capture was open, in seconds of `time.perf_counter`.
+        journal: the decisions so far, in the order in which they were taken.
+        levels: the levels so far; one that was located again is there more than once.
+        work: what the run finds, for the case of an interruption.
+        was_finished: whether the run was finished before, so that nothing is left to do.
+        record: of the finished run.
+        verdict: whether motion and panorama explain the photons; None for poses.
     """
 
+    plan: Plan
     source: Source
     folder: RunFolder
-    finished: Callable[[Mapping[str, Any]], None]
+    observers: Observers
+    progress: Progress
     start: float
+    journal: list[Decision] = field(default_factory=list)
+    levels: list[LevelResult] = field(default_factory=list)
+    work: Work | None = None
+    was_finished: bool = False
+    record: RunRecord = field(init=False)
+    verdict: Verdict | None = None
+
+    @cached_property
+    def capture(self) -> CaptureRecord:
+        """The fingerprint of the capture."""
+        return fingerprint(self.plan, self.source)
+
+    @property
+    def context(self) -> Context:
+        """How the run computes: with its progress, its checkpoints, and observers of levels."""
+
+        def on_level(result: LevelResult) -> None:
+            self.levels.append(result)
+            self.observers.level_finished(result)
+
+        context = Context(progress=self.progress, on_level=on_level)
+        return context if self.work is None else replace(context, checkpoints=self.work.checkpoints)
 
     @property
     def seconds(self) -> float:
         """Seconds since the capture was open."""
         return time.perf_counter() - self.start
 
+    def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:
+        """Put the files of the run into its folder, and then the report that `draw` makes of the record."""
+        record = self.folder.commit(record)
+        if self.work is not None:
+            self.work.finish()
+        self.record, self.verdict = _with_report(self.folder, record, draw), verdict
+
 
 @contextmanager
-def begun_run(plan: Plan, observers: Observers, progress: Progress, *, overwrite: bool) -> Iterator[BegunRun]:
-    """Begin a run: tell the observers, open the capture, and lock the run folder.
+def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: bool) -> Iterator[BegunRun]:
+    """Begin a run: tell the observers, open the capture, lock the run folder, and go on with what was kept.
+
+    The block ends the run, unless it was finished before. If the block fails, a report of that lies beside the run folder,
+    which stays as it was.
 
     Raises:
-        InputError: the capture cannot be used, or shows nothing.
+        InputError: the capture cannot be used, or shows nothing, or there is nothing to go on with.
         OutputError: the run folder cannot be written, or another process writes it.
         SpecError: a stage does not suit the capture.
     """
+    if plan.pose is not None and (how.keep or how.from_level is not None):
+        raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
+    observers = Observers(plan.observers, plan.output.directory)
     with (
         observers.watching(plan.document) as finished,
         open_source(plan) as source,
@@ -73,9 +123,17 @@ def begun_run(plan: Plan, observers: Observers, progress: Progress, *, overwrite
         one_thread_inside(),
         notify_on_first_compile(partial(progress.note, COMPILING)),
     ):
-        start = time.perf_counter()
+        run = BegunRun(plan, source, folder, observers, progress, time.perf_counter())
         _require_photons(plan, source)
-        yield BegunRun(source, folder, finished, start)
+        if how.resume and (done := finished_run(plan, run.capture)) is not None:
+            run.record, run.was_finished = done, True
+            run.verdict = None if done["verdict"] is None else verdict_of(done["verdict"])
+            yield run
+        else:
+            run.journal += first_decisions(plan, source)
+            with _work(run, how) as run.work, _reporting_failure(run):
+                yield run
+        finished(run.record)
 
 
 def first_decisions(plan: Plan, source: Source) -> list[Decision]:
@@ -85,23 +143,56 @@ def first_decisions(plan: Plan, source: Source) -> list[Decision]:
     return [*plan.decisions, *capture_of(source).decisions]
 
 
-def require_centre(plan: Plan, source: Source) -> None:
-    """Refuse a principal point that does not lie in the frames: the camera is then that of larger ones."""
-    if plan.camera.centre_px is None:
-        return
-    (x, y), (height, width) = plan.camera.centre_px, source.info.frame_shape
-    if not (0 <= x < width and 0 <= y < height):
-        raise InputError(
-            str(
-                plan.place("camera.centre_px").problem(
-                    f"({x:g}, {y:g}) does not lie in the frames of {height}x{width} px; a camera that was calibrated with "
-                    "other frames has another principal point and focal length here: scale and shift both"
-                )
-            )
-        )
+def failure_path(directory: Path) -> Path:
+    """Return where the report of a failed run lies: `runs/scan.failed.html` for `runs/scan`."""
+    return directory.with_name(f"{directory.name}.failed.html")
 
 
-def with_report(folder: RunFolder, record: RunRecord, draw: Callable[[RunRecord], str]) -> RunRecord:
+def _work(run: BegunRun, how: Continuation) -> AbstractContextManager[Work | None]:
+    """Open the work folder of a run; poses are found in one step, of which nothing is kept."""
+    plan = run.plan
+    if plan.pose is not None:
+        if how.resume:
+            run.progress.note("a run with `pose` keeps no work: it begins anew")
+        return nullcontext()
+    depends_on = run_fingerprint(plan, run.capture, run.source.info.frame_shape)
+    return work_folder(plan.output.directory, depends_on, run.journal, how, run.progress)
+
+
+@contextmanager
+def _reporting_failure(run: BegunRun) -> Iterator[None]:
+    """Write a report if the block raises; its path is the `report` of the error. That of the run before is removed first."""
+    path = failure_path(run.folder.directory)
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        logger.debug("the report of an earlier failure could not be removed: %s", error)
+    try:
+        yield
+    except (LocationError, CanvasTooLargeError, PluginError) as error:
+        levels = {result.level.number: level_record(result) for result in run.levels}
+        record: RunRecord = {
+            **started_record(run.plan, run.source.info, run.journal, run.seconds, run.capture),
+            "status": "failed",
+            "levels": [levels[number] for number in sorted(levels)],
+        }
+        error.report = _written_failure(path, record, error)
+        raise
+
+
+def _written_failure(path: Path, record: RunRecord, error: PhotonpanoError) -> Path | None:
+    """Write the report of a failure; return None if that fails, too: the error of the run is what counts."""
+    try:
+        page = render_failure(record, error)
+        with atomic_path(path) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+    except Exception:
+        logger.debug("the report of the failure could not be written", exc_info=True)
+        return None
+    return path
+
+
+def _with_report(folder: RunFolder, record: RunRecord, draw: Callable[[RunRecord], str]) -> RunRecord:
     """Add the report to the run folder. The results are there already: what fails now is a warning."""
     try:
         folder.reopen()

@@ -15,35 +15,34 @@ from photonpano.motion.timeline import Cut
 from photonpano.motion.tracking.runs import DARK, SumTrack, track_sums
 from photonpano.motion.tracking.spans import span_image
 from photonpano.protocols import Source
-from photonpano.residuals.refinement import Look
+from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.unexplained import standing_out
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
 
+# Sums searched on both sides of spans that stand out.
 _MARGIN = 20
-"""Sums on both sides of spans that stand out, in which a jump is searched for."""
+# Wanted noise of a shift between two sums, and its ratio to the noise of a shift against the panorama.
 _TRACK_NOISE_PX, _TRACK_RATIO = 0.25, 10.0
-"""Short sums of frames are so long that their shifts have about this noise. It is about 10 times that of a shift against the
-panorama, which has less noise than a sum."""
+# Fewest and most frames of a sum, and most motion within it.
 _SHORTEST, _LONGEST, _MOTION_PX = 4, 64, 4.0
-"""Fewest and most frames of a sum, and how far the image may move in it."""
+# Least size of an outlier, absolute and as a multiple of the median around it.
 _SMALLEST_PX, _OUTLIER = 1.0, 4.5
-"""A shift is an outlier beyond this size, and this many times the median of the others around it."""
+# Sums on either side that this median takes.
 _LOCAL = 24
-"""Sums on either side whose shifts it is compared with."""
+# Fewest sums for this median.
 _FEWEST = 6
-"""Fewer shifts around it do not tell what is usual."""
+# Sums before and after a jump that make the template of the frames between.
 _SIDE = 4
-"""Further sums before and after a jump, which make the template with which the frames between are compared."""
+# Standard deviation of the Gaussian that smooths the template, in binned px.
 _BLUR_PX = 0.7
-"""Standard deviation of the Gaussian that smooths the template, in binned px."""
+# Parts into which a jump is divided, to compare it with fast motions.
 _STEPS = 8
-"""A jump is divided into eighths, to compare it with a fast motion."""
+# Lengths of these fast motions, in frames.
 _SHORT_RAMP, _RAMPS = 4, (8, 16, 32, 64, 128)
-"""Lengths, in frames, of the fast motions that a jump is compared with."""
+# Standard deviations by which a jump must be likelier than a motion of 8 frames or more. A motion of 4 must not be likelier.
 _SURE = 4.0
-"""Standard deviations by which a jump must be likelier than motions of 8 frames and more. One of 4 must not be likelier."""
+# Least variance of a binned pixel.
 _NOISE_FLOOR = 1e-4
-"""Least variance of a binned pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +62,7 @@ class _Outlier:
     sigmas: float
 
 
-def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
+def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ...]:
     """Find the places where the image jumps.
 
     Places come into question where spans stand out from the motion. There, sums of a few frames are tracked by phase
@@ -72,11 +71,11 @@ def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
 
     Args:
         source: the capture.
-        look: the result of the loop, and what it does not explain.
+        fit: the result of the loop, and what it does not explain.
         context: threads and progress.
     """
-    size = _size_of_sums(look)
-    suspect = _suspect(look, _MARGIN * size)
+    size = _size_of_sums(fit)
+    suspect = _suspect(fit, _MARGIN * size)
     if not suspect:
         return ()
     found: list[Cut] = []
@@ -89,16 +88,16 @@ def find_cuts(source: Source, look: Look, context: Context) -> tuple[Cut, ...]:
     return tuple(found)
 
 
-def _suspect(look: Look, margin: int) -> list[FrameSpan]:
+def _suspect(fit: MotionFit, margin: int) -> list[FrameSpan]:
     """Return the frames up to `margin` frames from spans that stand out."""
-    spans, flags = look.residuals.spans, np.zeros(len(look.motion.located), dtype=bool)
-    for index in np.flatnonzero(standing_out(look.residuals)):
+    spans, flags = fit.residuals.spans, np.zeros(len(fit.motion.located), dtype=bool)
+    for index in np.flatnonzero(standing_out(fit.residuals)):
         flags[max(0, spans[index].start - margin) : spans[index].stop + margin] = True
-    return true_spans(flags & look.motion.located)
+    return true_spans(flags & fit.motion.located)
 
 
-def _size_of_sums(look: Look) -> int:
-    residuals, homographies = look.residuals, look.motion.homographies[look.motion.located]
+def _size_of_sums(fit: MotionFit) -> int:
+    residuals, homographies = fit.residuals, fit.motion.homographies[fit.motion.located]
     moved = steps_px(homographies, residuals.frame_shape)
     per_frame = residuals.normal[:, [0, 1], [0, 1]].mean(axis=1) / [len(span) for span in residuals.spans]
     noise_px = _TRACK_RATIO / np.sqrt(max(float(np.median(per_frame)), 1e-9))

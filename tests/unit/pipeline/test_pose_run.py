@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -31,6 +32,7 @@ from photonpano import (
     hookimpl,
     run,
 )
+from photonpano.pipeline.run import RunResult
 from photonpano.record.contents import changed_files
 from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
@@ -79,28 +81,32 @@ def estimate_of(source: Any, camera: Any) -> PoseEstimate:
     )
 
 
+def plan_into(directory: Path, source: Any, change: Callable[[PoseEstimate], Any] = lambda it: it, **sections: Any) -> Plan:
+    """Make the plan of a run with a pose estimator whose estimate is changed."""
+
+    def estimate(source: Any, camera: Any, progress: Any) -> Any:
+        with progress.stage("poses", 1, "capture") as advance:
+            advance(1)
+        return change(estimate_of(source, camera))
+
+    toy = PoseEstimatorContribution(name="toy", summary="Toy", config=Keys, build=lambda *_: SimpleNamespace(estimate=estimate))
+    spec = {"version": 1, "source": source, "pose": "toy", **sections}
+    return parse_spec(spec, output=directory, catalog=CATALOG.including(toy))
+
+
 @pytest.fixture
 def plan_of(small_spec: dict[str, Any], tmp_path: Path) -> Callable[..., Plan]:
-    """Make the plan of a run of the small capture with a pose estimator whose estimate is changed."""
-
-    def plan_of(change: Callable[[PoseEstimate], Any] = lambda it: it, **sections: Any) -> Plan:
-        def estimate(source: Any, camera: Any, progress: Any) -> Any:
-            with progress.stage("poses", 1, "capture") as advance:
-                advance(1)
-            return change(estimate_of(source, camera))
-
-        toy = PoseEstimatorContribution(
-            name="toy", summary="Toy", config=Keys, build=lambda *_: SimpleNamespace(estimate=estimate)
-        )
-        spec = {"version": 1, "source": small_spec["source"], "pose": "toy", **sections}
-        return parse_spec(spec, output=tmp_path / "run", catalog=CATALOG.including(toy))
-
-    return plan_of
+    return partial(plan_into, tmp_path / "run", small_spec["source"])
 
 
-def test_pose_run_writes_exactly_the_promised_files(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
-    record = run(plan_of(output={"exposures": True})).record
-    folder = tmp_path / "run"
+@pytest.fixture(scope="module")
+def finished(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """A run with exposures. Tests must not change its folder."""
+    return run(plan_into(tmp_path_factory.mktemp("poses") / "run", small_spec["source"], output={"exposures": True}))
+
+
+def test_pose_run_writes_exactly_the_promised_files(finished: RunResult) -> None:
+    record, folder = finished.record, finished.directory
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     model = {f"sparse/{name}.txt" for name in ("cameras", "images", "points3D")}
     pictures = {f"images/exposure_{start:03}.png" for start in range(0, 250, 50)}
@@ -112,11 +118,8 @@ def test_pose_run_writes_exactly_the_promised_files(plan_of: Callable[..., Plan]
     assert record == json.loads((folder / "run.json").read_text())
 
 
-def test_world_begins_at_the_first_camera_and_its_path_has_length_1(
-    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
-) -> None:
-    run(plan_of())
-    with np.load(tmp_path / "run" / "poses.npz") as archive:
+def test_world_begins_at_the_first_camera_and_its_path_has_length_1(finished: RunResult) -> None:
+    with np.load(finished.directory / "poses.npz") as archive:
         found = dict(archive)
     poses, located = found["camera_from_world"], found["located"]
     np.testing.assert_array_equal(located, np.arange(N_FRAMES) < LOST.start)
@@ -155,9 +158,8 @@ def test_colmap_reads_the_sparse_model_and_its_points_reproject(
     assert model.points3D[1].error > 0
 
 
-def test_other_files_hold_the_same_poses(plan_of: Callable[..., Plan], tmp_path: Path, without_report: None) -> None:
-    run(plan_of())
-    folder = tmp_path / "run"
+def test_other_files_hold_the_same_poses(finished: RunResult, tmp_path: Path) -> None:
+    folder = finished.directory
     poses = np.load(folder / "poses.npz")["camera_from_world"]
     tum = np.loadtxt(folder / "poses.tum")
     assert len(tum) == LOST.start
@@ -225,13 +227,10 @@ def test_record_that_lists_files_elsewhere_is_not_followed(
     assert other.read_text() == "precious"
 
 
-def test_commands_of_panoramas_refuse_a_run_of_poses(
-    plan_of: Callable[..., Plan], tmp_path: Path, without_report: None
-) -> None:
-    run(plan_of())
+def test_commands_of_panoramas_refuse_a_run_of_poses(finished: RunResult, tmp_path: Path) -> None:
     for command in (photonpano.check_run, lambda folder: photonpano.render(folder, tmp_path / "again")):
         with pytest.raises(InputError, match="is a run with `pose`: it has the poses of a camera that travels"):
-            command(tmp_path / "run")
+            command(finished.directory)
 
 
 def test_doubts_and_lost_frames_are_in_record_report_and_warnings(plan_of: Callable[..., Plan], tmp_path: Path) -> None:

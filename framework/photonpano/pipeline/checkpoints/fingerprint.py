@@ -1,4 +1,4 @@
-"""What the results of a run depend on, in parts, so that a change can be named."""
+"""What the results of a run depend on, in parts, so that a change can be named; and whether a run is finished already."""
 
 from __future__ import annotations
 
@@ -12,20 +12,28 @@ from pathlib import Path
 from typing import Any
 
 import photonpano
-from photonpano.captures.fingerprint import changes, fingerprint
+from photonpano.captures.fingerprint import CaptureRecord, changes
+from photonpano.errors import InputError
 from photonpano.pipeline.components import scale_of
-from photonpano.protocols import Source
-from photonpano.record.environment import library_versions
+from photonpano.record.contents import changed_files
+from photonpano.record.environment import library_versions, plugin_records
+from photonpano.record.run_json import read_record
+from photonpano.record.schema import RunRecord
 from photonpano.specs.plan import Choice, Plan
 
 Fingerprint = dict[str, Any]
 _STAGES = ("resample", "merge", "locate", "interpolate")
 
 
-def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
+def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, int]) -> Fingerprint:
     """Return what the results of a run depend on, as plain data.
 
     The number of threads and the run folder are left out: results do not depend on them.
+
+    Args:
+        plan: what is run.
+        capture: the fingerprint of the capture.
+        frame_shape: (height, width) of a frame.
 
     Returns:
         `versions`, `code` and `capture`, on which everything depends; `common`, the parts of the spec on which it does;
@@ -42,7 +50,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
         {
             "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
             "code": _code([plan.source], photonpano),
-            "capture": fingerprint(plan, source),
+            "capture": capture,
             "common": {
                 "source": _component(plan.source),
                 "corrections": document.get("corrections"),
@@ -51,7 +59,7 @@ def run_fingerprint(plan: Plan, source: Source) -> Fingerprint:
                 "run.seed": plan.run.seed,
                 "render.reference": document["render"]["reference"],
             },
-            "levels": [_level(plan, number, source.info.frame_shape) for number in range(1, len(plan.levels) + 1)],
+            "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
             "rest": rest,
         }
     )
@@ -64,7 +72,7 @@ def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None
     Args:
         before: of what was kept.
         now: of the run.
-        levels: compare only what the first so many levels depend on; None for everything.
+        levels: number of levels on whose dependencies the comparison stops; None for everything.
     """
     found = [
         f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])
@@ -77,6 +85,39 @@ def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None
     for number, (old, new) in enumerate(zip(before["levels"][:levels], now["levels"][:levels], strict=False), start=1):
         found += _settings(old, new, f" at level {number}")
     return found if levels is not None else found + _settings(before["rest"], now["rest"])
+
+
+def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
+    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged.
+
+    Args:
+        plan: what would be run.
+        capture: the fingerprint of the capture as it is now.
+    """
+    try:
+        record = read_record(plan.output.directory)
+        same = (
+            record["photonpano"] == importlib.metadata.version("photonpano")
+            and record["libraries"] == library_versions(plan)
+            and record["plugins"] == plugin_records(plan)
+            and _without_machine(record["spec"]) == _without_machine(plan.document)
+            and not changes(record["capture"], capture)
+            and all((plan.output.directory / name).exists() for name in record["files"])
+            and not changed_files(plan.output.directory)
+            and (plan.output.keep is None or record["spec"]["output"].get("keep") == plan.output.keep)
+        )
+        result = record["verdict"] if plan.pose is None else record["poses"]
+        return record if same and result is not None else None
+    except (InputError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _without_machine(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a spec as plain data, without what results do not depend on: the run folder, threads, and executor."""
+    run = {key: value for key, value in document["run"].items() if key not in ("threads", "executor")}
+    plain: dict[str, Any] = json.loads(json.dumps({**document, "run": run}))
+    plain.pop("output", None)
+    return plain
 
 
 def _level(plan: Plan, number: int, frame_shape: tuple[int, int]) -> dict[str, Any]:

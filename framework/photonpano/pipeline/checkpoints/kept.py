@@ -12,8 +12,8 @@ from photonpano.values import Decision
 
 ResultT = TypeVar("ResultT")
 
+# Seconds between writes of a log: a kill costs this much of its results, at most.
 FLUSH_S = 5.0
-"""The results of a log are written when this time has passed: a kill costs this much of them, at most."""
 _END = "end"
 
 

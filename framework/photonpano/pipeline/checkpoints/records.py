@@ -20,11 +20,11 @@ from photonpano.values import Decision, Edge, FrameSpan, Located, NotLocated, Pa
 
 Arrays = Mapping[str, NDArray[np.generic]]
 _KINDS = (Contrast, Decision, Edge, FrameSpan, Located, NotLocated, Panorama, Place, Refined, Registered, Residuals)
+# The dataclasses that can be read back.
 _BY_NAME: dict[str, Any] = {kind.__name__: kind for kind in _KINDS}
-"""The dataclasses that can be read back."""
 _TREE = "tree"
+# Arrays of fewer values are joined: an archive of thousands of arrays is slow.
 _SMALL = 4096
-"""Arrays of fewer values are joined: an archive of thousands of arrays is slow."""
 _ARRAY, _MAPPING, _DATACLASS = "array", "mapping", "dataclass"
 
 

@@ -17,8 +17,8 @@ from photonpano.text import byte_size
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".npz"
+# Free space that a record needs, in multiples of its own size: results come first.
 _SPARE = 8
-"""A record is kept only if the disk has room for this many more of its size: results come before it."""
 
 
 class Store:

@@ -24,8 +24,8 @@ logger = logging.getLogger(__name__)
 
 MANIFEST = "work.json"
 FORMAT = 1
+# Differences that a message names.
 _SHOWN = 3
-"""Differences that a message names."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Watch a capture that is still being written: how many frames are there, since when, and whether more will come."""
+"""Watch a capture that is still being written: how many frames are there, how long they wait, and whether more will come."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+import numpy as np
+
 from photonpano.errors import PhotonpanoError
 from photonpano.protocols import Arrived, Source
 
 _POLL_S = 0.02
+# How long an unreadable capture is tolerated: a file may appear before the one before it is complete.
 _TOLERATED_S = 1.0
-"""How long what is there may be no capture: a file may appear before the one before it is complete."""
+# Times of arrival that are kept. While frames wait for minutes, they get coarser.
 _MOST_MARKS = 4096
-"""Times of arrival that are kept: if frames wait for minutes, they get coarser."""
+# Resolution and number of the bins of delays: 10 ms, up to two minutes.
+_STEP_S, _STEPS = 0.01, 12_000
 
 
 class Arrivals:
@@ -129,3 +133,39 @@ class Arrivals:
                 self._marks = deque((later[0], earlier[1]) for earlier, later in zip(marks[::2], marks[1::2], strict=False))
                 if len(marks) % 2:
                     self._marks.append(marks[-1])
+
+
+class Delays:
+    """How long frames waited until they were located, as a histogram: memory does not grow."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_STEPS, np.int64)
+        self._sum, self._longest = 0.0, 0.0
+
+    def add(self, n_frames: int, seconds: float) -> None:
+        """Count frames that waited that long."""
+        self._counts[min(int(seconds / _STEP_S), _STEPS - 1)] += n_frames
+        self._sum += n_frames * seconds
+        self._longest = max(self._longest, seconds)
+
+    @property
+    def n_frames(self) -> int:
+        """How many frames were counted."""
+        return int(self._counts.sum())
+
+    @property
+    def mean(self) -> float | None:
+        """Mean delay, in seconds; None if no frame was counted."""
+        return self._sum / self.n_frames if self.n_frames else None
+
+    @property
+    def longest(self) -> float | None:
+        """Greatest delay, in seconds; None if no frame was counted."""
+        return self._longest if self.n_frames else None
+
+    def quantile(self, share: float) -> float | None:
+        """Return the delay that this share of the frames did not exceed, in seconds, to 10 ms; None if there are none."""
+        if not self.n_frames:
+            return None
+        step = int(np.searchsorted(np.cumsum(self._counts), share * self.n_frames))
+        return min((step + 1) * _STEP_S, self._longest)

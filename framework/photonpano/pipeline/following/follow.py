@@ -11,9 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from photonpano.captures.fingerprint import capture_files
 from photonpano.compiling import notify_on_first_compile
@@ -26,12 +27,11 @@ from photonpano.locks import locked
 from photonpano.pipeline.following.arrivals import Arrivals
 from photonpano.pipeline.following.live_run import Every, LiveRun
 from photonpano.pipeline.following.page import PAGE, LivePage
-from photonpano.pipeline.following.picture import PictureSoFar
-from photonpano.pipeline.following.rehearsal import rehearse
+from photonpano.pipeline.following.picture import PictureSoFar, rehearse
 from photonpano.pipeline.following.spool import Spool
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.pipeline.run_steps import COMPILING
-from photonpano.protocols import Arrived, Piped
+from photonpano.protocols import Piped
 from photonpano.report import LiveFigures
 from photonpano.specs.plan import Plan
 from photonpano.text import counted, duration
@@ -39,27 +39,14 @@ from photonpano.threads import one_thread_inside, thread_count
 
 logger = logging.getLogger(__name__)
 
+# The file to which frames of a pipe are copied.
 SPOOL = "frames.raw"
-"""The file of the frames of a pipe."""
 _REFRESH_S = 1.0
 _NOTE_S = 10.0
+# Least time between windows. Long windows take less time for a frame: each repeats the last exposure of the one before.
 _WINDOW_S = 0.2
-"""Least time from one window to the next: longer windows take less time a frame, since each begins with the end of the last."""
+# Longest wait for frames between two looks at the page.
 _IDLE_S = 0.1
-"""How long to wait for frames before the page is looked after."""
-
-
-@dataclass(slots=True)
-class Followed:
-    """A capture that was followed until it was complete.
-
-    Attributes:
-        plan: runs the whole capture, which is now in a file.
-        figures: how far behind the frames were located.
-    """
-
-    plan: Plan
-    figures: LiveFigures
 
 
 def live_folder(run_directory: Path) -> Path:
@@ -68,7 +55,7 @@ def live_folder(run_directory: Path) -> Path:
 
 
 @contextmanager
-def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[Followed]:
+def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[tuple[Plan, LiveFigures]]:
     """Follow a capture until it is complete; the block then runs the whole of it, and the page says how that ended.
 
     Args:
@@ -76,6 +63,9 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
         progress: receives messages.
         overwrite: whether a file of an earlier capture there is replaced, and the run folder; see `run`.
         end_after: seconds without a new frame after which a growing file counts as complete, unless it promises more frames.
+
+    Yields:
+        The plan that runs the capture, which is now in a file; and how far behind its frames were located.
 
     Raises:
         InputError: the source cannot be followed; or what arrives is no capture, or is incomplete. What arrived is kept.
@@ -94,12 +84,12 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
         if isinstance(what, Piped):
             plan = _from_file(plan, spooled)
         with run_folder(directory, overwrite=overwrite, inputs=capture_files(plan)):
-            pass  # what forbids to write it is told now, and not when the capture is complete
+            pass  # a folder that cannot be written is refused now, not when the capture is complete
         if isinstance(what, Piped):
             spool = Spool(_standard_input(), _free(spooled, plan, overwrite), what)
             stack.callback(spool.close)
         page = LivePage(folder, directory)
-        arrivals = Arrivals(partial(_arrived, look, plan), None if spool is None else lambda: spool.ended, end_after)
+        arrivals = Arrivals(partial(look, plan.source.config), None if spool is None else lambda: spool.ended, end_after)
         stack.callback(arrivals.close)
         progress.note(f"following the capture; {folder / PAGE} shows the panorama so far")
         try:
@@ -110,10 +100,10 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
                 spool.require_whole()
             _require_complete(plan, arrivals, end_after)
             page.write(replace(figures, state="finishing"))
-            yield Followed(plan, figures)
+            yield plan, figures
             page.write(replace(figures, state="finished"))
         except BaseException as error:
-            arrivals.close()  # nobody looks for the file any more, which is removed if it is empty
+            arrivals.close()  # before the spool, which may remove the file that is watched
             if spool is not None:
                 spool.close()
                 if spool.path.exists():
@@ -123,8 +113,8 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
             raise
 
 
-def _followable(plan: Plan) -> Callable[..., Arrived | Piped]:
-    """Return what opens the part of the capture that is there."""
+def _followable(plan: Plan) -> Callable[[Any], Any]:
+    """Return the function that opens the part of the capture that is there: an `Arrived`, or a `Piped`."""
     contribution, config = plan.source.contribution, plan.source.config
     assert isinstance(contribution, SourceContribution)
     if plan.pose is not None:
@@ -139,12 +129,6 @@ def _followable(plan: Plan) -> Callable[..., Arrived | Piped]:
             str(plan.place("source.with.frames").problem("a part of a capture cannot be followed; remove this key"))
         )
     return contribution.arrived
-
-
-def _arrived(look: Callable[..., Arrived | Piped], plan: Plan) -> Arrived:
-    found = look(plan.source.config)
-    assert isinstance(found, Arrived)
-    return found
 
 
 def _from_file(plan: Plan, path: Path) -> Plan:

@@ -1,4 +1,4 @@
-"""What a run does with the frames that have arrived, and how far behind it is."""
+"""Locate frames as they arrive, and measure how far behind the run is."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from collections import deque
 
 from photonpano.context import Context
 from photonpano.errors import PhotonpanoError
-from photonpano.pipeline.following.arrivals import Arrivals
-from photonpano.pipeline.following.delays import Delays
+from photonpano.pipeline.following.arrivals import Arrivals, Delays
 from photonpano.pipeline.following.located import LocatedSoFar, Window
 from photonpano.pipeline.following.reading import ArrivedFrames
 from photonpano.report import LiveFigures
@@ -17,14 +16,14 @@ from photonpano.specs.plan import Plan
 
 logger = logging.getLogger(__name__)
 
+# Time over which the rate of arrival is measured.
 _RATE_S = 3.0
-"""The rate of arrival is that of the last seconds."""
+# Frames come too fast if they wait for longer than the first, once the second has passed since the first were located.
 _FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
-"""If frames wait for longer, so long after the first were located, they come faster than they are located."""
 
 
 class LiveRun:
-    """Locates frames as they arrive."""
+    """Locates frames as they arrive, and counts how long they have waited."""
 
     def __init__(self, plan: Plan, arrivals: Arrivals, context: Context) -> None:
         self._arrivals, self._delays = arrivals, Delays()
@@ -98,7 +97,7 @@ class LiveRun:
 
 
 class Every:
-    """Says when something is due that is done every so many seconds."""
+    """A timer of what is done at intervals."""
 
     def __init__(self, seconds: float, *, at_once: bool = True) -> None:
         self._seconds = seconds

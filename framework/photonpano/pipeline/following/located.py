@@ -1,4 +1,4 @@
-"""Locate the exposures of a capture in windows, as their frames arrive."""
+"""Locate a growing capture: the loop runs its first level on one window of frames after the other."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from photonpano.capture import part_of
 from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
 from photonpano.motion.level import Level
-from photonpano.motion.loop import estimate_motion, resample
+from photonpano.motion.loop import resample
+from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.state import State
 from photonpano.protocols import Source, Trajectory
 from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch
 from photonpano.values import FrameSpan, Homography
 
+# Frames from which the first group size is chosen.
 LEAST_FRAMES = {"binary": 256, "intensity": 16}
-"""Frames from which the first group size is chosen."""
+# Groups of the longest window: as many are located in one call if frames come faster than they are located.
 _MOST_GROUPS = 8
-"""Groups of the longest window. So much is located in one call if frames come faster than they are located."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Frames that were located together.
+    """Frames that were located in one call of the loop.
 
     Attributes:
         source: the frames, as a capture of their own; those before `new` belong to the window before, too.
@@ -85,7 +87,10 @@ class LocatedSoFar:
         self._tried = stop
         part = part_of(source, FrameSpan(self._start, stop))
         try:
-            result = estimate_motion(part, [level], self._plan.graph, self._tie - self._start, self._context)[0]
+            state = State(
+                self._plan, part, self._context, self._tie - self._start, (level,), Timeline.regular(len(part.info.span))
+            )
+            [result] = state.located([level], None).results
         except LocationError as error:
             self.problem = str(error)
             if n_groups == _MOST_GROUPS or last:

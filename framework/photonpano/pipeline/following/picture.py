@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.context import Context
+from photonpano.errors import PhotonpanoError
 from photonpano.geometry import Canvas, apply, corners, normalised, rescaling, translation
 from photonpano.merging import accumulate
 from photonpano.merging.accumulate import PhotonSum
 from photonpano.merging.chunks import chunks_of
 from photonpano.photometry import picture_of
-from photonpano.pipeline.following.located import Window
-from photonpano.values import FloatArray, FluxImage, Homography, Response
+from photonpano.pipeline.following.located import LocatedSoFar, Window
+from photonpano.reading import BinarySource, FrameLayout
+from photonpano.specs.plan import Plan
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Response
 
+logger = logging.getLogger(__name__)
+
+# Most pixels of the canvas; beyond, its scale is halved.
 _MOST_PIXELS = 2_000_000
-"""Pixels of the canvas: if it needs more, its scale is halved."""
+# Least scale; beyond, the picture begins anew.
 _LEAST_SCALE = 1 / 8
-"""If even at this scale it needs more, the picture begins anew."""
+# Greatest ratio between the area of a frame on the canvas and that of the first frame, either way.
 _MOST_AREA_CHANGE = 4.0
-"""By this factor, the area of a frame on the canvas differs from that of the first frame at most."""
+# How much more than necessary the canvas grows, in longer sides of a frame.
 _MARGIN = 0.25
-"""By how much more than necessary the canvas grows, in sides of a frame."""
+# Motion within which frames are summed before they are warped.
 _TOLERANCE_PX = 1.0
-"""Motion within which frames are summed before they are warped, px."""
+# Quantile of the flux that is white.
 _WHITE = 0.995
-"""Quantile of the flux that is white."""
+# Pixels from which that quantile is estimated.
 _SAMPLES = 100_000
-"""Pixels from which that is estimated."""
+# The made-up capture: a frame, a block, how many frames, and how far the camera pans.
+_SHAPE, _BLOCK_PX, _N_FRAMES, _LENGTH_PX = (64, 96), 8, 2048, 32
 
 
 class PictureSoFar:
@@ -86,12 +97,7 @@ class PictureSoFar:
         return PhotonSum(counts[seen], weight[seen]).estimate(self._response)[0]
 
     def _grow(self, placed: FloatArray, shape: tuple[int, int]) -> bool:
-        """Make room for frames; return whether there is enough.
-
-        Args:
-            placed: (N, 3, 3), from frames to the plane.
-            shape: (height, width) of a frame.
-        """
+        """Make room for frames at (N, 3, 3) places of the plane; return whether there is enough."""
         while True:
             low, high = self._box(placed, shape)
             first, last = self._origin, self._origin + self._sums.shape[:0:-1]
@@ -139,3 +145,36 @@ def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
     areas = 0.5 * np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1)
     change = areas / ((shape[0] - 1) * (shape[1] - 1))
     return bool(((change > 1 / _MOST_AREA_CHANGE) & (change < _MOST_AREA_CHANGE)).all())
+
+
+def rehearse(plan: Plan, context: Context) -> None:
+    """Locate a made-up capture and draw its picture, so that compiling and loading do not delay the first frames.
+
+    Problems do not matter.
+    """
+    located, picture = LocatedSoFar(plan, context), PictureSoFar()
+    try:
+        with _Blocks() as source:
+            if window := located.next_window(source, last=True):
+                picture.add(window)
+        picture.png()
+    except PhotonpanoError as error:  # as with frames of another kind; the capture itself tells what is wrong
+        logger.debug("the rehearsal failed: %s", error)
+
+
+class _Blocks(BinarySource):
+    """Frames of random blocks, over which the camera pans."""
+
+    def __init__(self) -> None:
+        height, width = _SHAPE
+        super().__init__(_N_FRAMES, FrameLayout(_SHAPE, (height, width // 8)))
+        self._rng = np.random.default_rng(0)
+        blocks = self._rng.random((height // _BLOCK_PX, (width + _LENGTH_PX) // _BLOCK_PX))
+        self._scene = np.kron(blocks, np.ones((_BLOCK_PX, _BLOCK_PX)))
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span: see `BinarySource`."""
+        for frame in range(span.start, span.stop):
+            left = frame * _LENGTH_PX // _N_FRAMES
+            lit = self._rng.random(_SHAPE) < self._scene[:, left : left + _SHAPE[1]]
+            yield slice(frame - span.start, frame - span.start + 1), np.packbits(lit, axis=-1)[None]

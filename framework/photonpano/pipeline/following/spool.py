@@ -13,8 +13,8 @@ from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.protocols import Piped
 
 _BUFFER_BYTES = 1024**2
+# How long a spool that is stopped may wait for the writer.
 _WAIT_S = 0.2
-"""How long a stopped spool may wait for the writer."""
 
 
 class Spool:

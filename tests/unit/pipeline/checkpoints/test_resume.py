@@ -82,7 +82,7 @@ def kill(monkeypatch: pytest.MonkeyPatch, plan: Plan, n_records: int) -> None:
 def test_run_killed_three_times_ends_with_the_same_bytes(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
     gain = np.linspace(0.9, 1, SHAPE[0] * SHAPE[1], dtype=np.float32).reshape(SHAPE)
     vignette = Vignette(gain, np.full_like(gain, 0.3), (FrameSpan(0, 240),))
-    monkeypatch.setattr("photonpano.pipeline.estimate.vignette_of", lambda *_: vignette)
+    monkeypatch.setattr("photonpano.pipeline.passes.vignette_of", lambda *_: vignette)
     unbroken, killed = run(plan_of("unbroken")), plan_of("killed")
     for n_records in (4, 11, 6):
         kill(monkeypatch, killed, n_records)
@@ -127,7 +127,7 @@ def test_last_level_with_other_settings_starts_from_the_first(
 def test_resume_of_finished_run_returns_its_results(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
     first = run(plan_of("scan"))
     written = bytes_of(first)
-    monkeypatch.setattr("photonpano.pipeline.estimate.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
+    monkeypatch.setattr("photonpano.pipeline.state.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
     again = run(plan_of("scan"), resume=True)
     assert again.was_finished
     assert not first.was_finished

@@ -96,22 +96,52 @@ def test_error_before_anything_is_found_leaves_no_work_folder(place: Path) -> No
     assert notes.lines == []
 
 
-def test_resumed_run_finds_what_was_kept(place: Path, caplog: pytest.LogCaptureFixture) -> None:
-    notes = Notes()
-    interrupt(place, notes=notes)
-    assert notes.lines == [f"{path_of(place)} holds what was found; with --resume, the run goes on from there"]
-    with working(place, how=RESUMING, notes=notes) as work:
-        assert found(work) == {"level-1": [1], "refined": True}
-    assert notes.lines[1:] == [f"going on with the interrupted run, from {path_of(place)}"]
-    assert caplog.messages == []
+KEPT = {"level-1": [1], "refined": True}
 
 
-def test_resume_without_interrupted_run_starts_at_the_beginning(place: Path, caplog: pytest.LogCaptureFixture) -> None:
-    notes = Notes()
-    with working(place, how=RESUMING, notes=notes) as work:
-        assert found(work) == {}
-    assert notes.lines == ["there is no interrupted run to go on with: the run starts at the beginning"]
-    assert caplog.messages == []
+@pytest.mark.parametrize(
+    ("interrupted", "now", "how", "there", "note", "warning"),
+    [
+        (True, {}, RESUMING, KEPT, "going on with the interrupted run, from {work}", ""),
+        (False, {}, RESUMING, {}, "there is no interrupted run to go on with: the run starts at the beginning", ""),
+        (
+            True,
+            {},
+            Continuation(),
+            {},
+            "",
+            "{work} held the work of an interrupted run, which --resume would have continued; it is replaced",
+        ),
+        (
+            True,
+            {"rest__render__scale": 2.0},
+            Continuation(),
+            {},
+            "{work} held the work of an interrupted run of something else; it is replaced",
+            "",
+        ),
+    ],
+    ids=["resumed", "nothing to resume", "not resumed", "something else"],
+)
+def test_interrupted_run_is_continued_or_replaced(
+    place: Path,
+    interrupted: bool,
+    now: dict[str, Any],
+    how: Continuation,
+    there: dict[str, Any],
+    note: str,
+    warning: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    notes, work_path = Notes(), path_of(place)
+    if interrupted:
+        interrupt(place, notes=notes)
+        assert notes.lines == [f"{work_path} holds what was found; with --resume, the run goes on from there"]
+    notes.lines.clear()
+    with working(place, fingerprint(**now), how, notes) as work:
+        assert found(work) == there
+    assert [*notes.lines, *caplog.messages] == [(note or warning).format(work=work_path)]
+    assert len(caplog.messages) == bool(warning)
 
 
 @pytest.mark.parametrize(
@@ -157,23 +187,6 @@ def test_damaged_manifest_starts_again_and_says_why(place: Path, content: str, c
     assert caplog.messages == [
         f"{path_of(place)}: the interrupted run is not continued, but started again: work.json is missing or damaged"
     ]
-
-
-def test_run_without_resume_replaces_the_work_and_says_so(place: Path, caplog: pytest.LogCaptureFixture) -> None:
-    interrupt(place)
-    with working(place) as work:
-        assert found(work) == {}
-    assert caplog.messages == [
-        f"{path_of(place)} held the work of an interrupted run, which --resume would have continued; it is replaced"
-    ]
-
-
-def test_run_of_another_spec_replaces_the_work_and_notes_it(place: Path) -> None:
-    interrupt(place)
-    notes = Notes()
-    with working(place, fingerprint(rest__render__scale=2.0), notes=notes):
-        pass
-    assert notes.lines == [f"{path_of(place)} held the work of an interrupted run of something else; it is replaced"]
 
 
 def test_kept_work_is_replaced_in_silence(place: Path, caplog: pytest.LogCaptureFixture) -> None:

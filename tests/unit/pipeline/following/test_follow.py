@@ -262,7 +262,7 @@ def test_frames_that_cannot_be_located_are_run_all_the_same(
     def fail(*_: object, **__: object) -> None:
         raise InputError("no luck")
 
-    monkeypatch.setattr("photonpano.pipeline.following.located.estimate_motion", fail)
+    monkeypatch.setattr("photonpano.pipeline.following.located.State", fail)
     pipe_on_stdin(moving_frames.tobytes())
     with caplog.at_level(logging.WARNING, "photonpano"):
         result = follow(PIPED, tmp_path / "piped")

@@ -16,8 +16,7 @@ import pytest
 from photonpano import Arrived, FrameSpan, InputError, OutputError, Piped
 from photonpano.geometry import rescaling, translation
 from photonpano.pipeline.following import picture as picture_module
-from photonpano.pipeline.following.arrivals import Arrivals
-from photonpano.pipeline.following.delays import Delays
+from photonpano.pipeline.following.arrivals import Arrivals, Delays
 from photonpano.pipeline.following.located import Window
 from photonpano.pipeline.following.picture import PictureSoFar
 from photonpano.pipeline.following.spool import Spool

@@ -13,13 +13,18 @@ from photonpano import FrameSpan, PluginError, Refined
 from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, inverse, translation
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.timeline import Timeline
+from photonpano.pipeline.refiners import refine
+from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record
 from photonpano.record.run_warnings import refinement_warnings
-from photonpano.residuals.refinement import Explained, Look, NamedRefiner, refine
+from photonpano.residuals.refinement import Explained, NamedRefiner
+from photonpano.specs import parse_spec
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
 
 SHAPE, FRAMES = (40, 64), 400
+PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})
 PATH = KnownMotion(lambda frame: translation(0.05 * (frame - FRAMES // 2), 0))
 
 
@@ -58,8 +63,8 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
         )
         component = answer if isinstance(answer, Answering) else Answering(answer)
         named = NamedRefiner("odd", component, "refiner 'odd' of toys 1.0")
-        rendering = 0.25, 2**30, Context()
-        return refine(source, Look(source, motion, *rendering), [named], *rendering)
+        state = State(PLAN, source, Context(), FRAMES // 2, (), Timeline.regular(FRAMES), refined=motion)
+        return refine(state, [named])
 
     return run
 
@@ -69,42 +74,42 @@ def shaken(homographies: np.ndarray, std_px: np.ndarray) -> Refined:
     return Refined(homographies @ tremor, std_px, "shaken")
 
 
-def test_refiner_that_returns_other_number_of_frames_is_named(run: Callable[..., Explained]) -> None:
+def hollow(homographies: np.ndarray, std_px: np.ndarray) -> Refined:
+    homographies[17, 0, 2] = np.nan
+    return Refined(homographies, std_px, "hollow")
+
+
+BROKE = "refiner 'odd' of toys 1.0 broke its contract at round 1: "
+NOT_FINITE = "is not finite, or its std_px is negative or NaN"
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (
+            lambda homographies, std_px: Refined(homographies[:-1], std_px, "short"),
+            f"{BROKE}the capture has 400 frames: expected homographies of the shape (400, 3, 3) and std_px of the shape "
+            "(400,), got (399, 3, 3) and (400,)",
+        ),
+        (hollow, f"{BROKE}the motion of frame 17 {NOT_FINITE}"),
+        (
+            lambda homographies, std_px: Refined(homographies, std_px * 0 - 1, "odd"),
+            f"{BROKE}the motion of frame 0 {NOT_FINITE}",
+        ),
+        (
+            lambda homographies, std_px: Refined(homographies, std_px * np.nan, "odd"),
+            f"{BROKE}the motion of frame 0 {NOT_FINITE}",
+        ),
+        (lambda homographies, _: homographies, f"{BROKE}expected a Refined or None, got ndarray"),
+        (lambda *_: 1 / 0, "refiner 'odd' of toys 1.0 failed at round 1: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_refiner_that_breaks_its_contract_is_named(
+    run: Callable[..., Explained], answer: Callable[..., object], message: str
+) -> None:
     with pytest.raises(PluginError) as caught:
-        run(lambda homographies, std_px: Refined(homographies[:-1], std_px, "short"))
-    assert str(caught.value) == (
-        "refiner 'odd' of toys 1.0 broke its contract at round 1: the capture has 400 frames: expected homographies of the "
-        "shape (400, 3, 3) and std_px of the shape (400,), got (399, 3, 3) and (400,)"
-    )
-
-
-def test_refiner_that_returns_nan_is_named_with_the_frame(run: Callable[..., Explained]) -> None:
-    def hollow(homographies: np.ndarray, std_px: np.ndarray) -> Refined:
-        homographies[17, 0, 2] = np.nan
-        return Refined(homographies, std_px, "hollow")
-
-    with pytest.raises(PluginError) as caught:
-        run(hollow)
-    assert str(caught.value) == (
-        "refiner 'odd' of toys 1.0 broke its contract at round 1: the motion of frame 17 is not finite, or its std_px is "
-        "negative or NaN"
-    )
-
-
-@pytest.mark.parametrize("std", [-1.0, float("nan")])
-def test_refiner_that_returns_impossible_error_is_named(run: Callable[..., Explained], std: float) -> None:
-    with pytest.raises(PluginError, match="the motion of frame 0 is not finite, or its std_px is negative or NaN"):
-        run(lambda homographies, std_px: Refined(homographies, std_px * 0 + std, "odd"))
-
-
-def test_refiner_that_returns_something_else_or_fails_is_named(run: Callable[..., Explained]) -> None:
-    with pytest.raises(PluginError) as caught:
-        run(lambda homographies, _: homographies)
-    assert str(caught.value) == (
-        "refiner 'odd' of toys 1.0 broke its contract at round 1: expected a Refined or None, got ndarray"
-    )
-    with pytest.raises(PluginError, match=r"refiner 'odd' of toys 1\.0 failed at round 1: ZeroDivisionError: division by zero"):
-        run(lambda *_: 1 / 0)
+        run(answer)
+    assert str(caught.value) == message
 
 
 def test_motion_that_explains_photons_worse_is_kept_out_with_warning(run: Callable[..., Explained]) -> None:

@@ -1,0 +1,196 @@
+"""What is tried after the first level of the loop, and the rule: a change is accepted if it explains the photons no worse."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from photonpano.contributions import MergerContribution
+from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
+from photonpano.errors import CanvasTooLargeError, LocationError
+from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light, measure_pixel_gain
+from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.state import State
+from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
+from photonpano.residuals.cuts import find_cuts
+from photonpano.residuals.refinement import MotionFit
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision, Light
+
+logger = logging.getLogger(__name__)
+
+# Light that lowers the reduced chi-square of the photons by this factor, or more, is there.
+_EXPLAINED = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """A change of the state.
+
+    Attributes:
+        make: returns the new state; None if a closer look finds nothing to change.
+        worse: returns how the new motion explains the photons worse than the old one, as a clause, empty if it does not. None
+            to accept the new state without comparison, so that its errors end the run.
+        settle: completes the new state once it is accepted.
+        rejection: begins the message about a proposal that is rejected.
+        severity: of this message.
+        summary: of the change.
+    """
+
+    make: Callable[[], State | None]
+    worse: Callable[[MotionFit, MotionFit], str] | None = MotionFit.worse_than
+    settle: Callable[[State], State] = lambda proposed: proposed
+    rejection: str = ""
+    severity: int = logging.DEBUG
+    summary: str = ""
+
+
+Pass: TypeAlias = Callable[[State], Proposal | None]
+
+
+class Trial(NamedTuple):
+    """The state after a pass; whether its proposal was accepted, with a summary of it; and otherwise why not.
+
+    It does not hold the proposal, and with it the state before: both have a panorama.
+    """
+
+    state: State
+    accepted: bool = False
+    summary: str = ""
+    worse: str = ""
+
+
+def tried(state: State, propose: Pass) -> Trial:
+    """Try a pass. The state before is kept where the new motion cannot be estimated, or explains the photons worse."""
+    if (proposal := propose(state)) is None:
+        return Trial(state)
+    try:
+        if (proposed := proposal.make()) is None:
+            return Trial(state)
+        worse = "" if proposal.worse is None else proposal.worse(proposed.fit, state.fit)
+    except (LocationError, CanvasTooLargeError) as error:
+        if proposal.worse is None:
+            raise
+        worse = str(error)
+    else:
+        if not worse:
+            return Trial(proposal.settle(proposed), accepted=True, summary=proposal.summary)
+    logger.log(proposal.severity, "%s: %s", proposal.rejection, worse)
+    return Trial(state, worse=worse)
+
+
+def through_found_lens(state: State) -> Proposal | None:
+    """Run the first level again: through a lens that nobody knew, it has located pairs with errors of pixels."""
+    if not state.model.finds_lens or camera_of_motion(state.trajectory) is None:
+        return None
+    return Proposal(lambda: state.located(state.levels[:1], state.trajectory), worse=None)
+
+
+def without_shading(state: State) -> Proposal | None:
+    """Divide the capture by the flat field that its spec asks for, or by its vignette.
+
+    Raises:
+        InputError: the motion cannot tell a flat field from the scene, or the camera turns too far.
+    """
+    plan, source = state.plan, state.view.source
+    asked = any(isinstance(each, FlatField) for each in plan.corrections)
+    found = _flat_field(state) if asked else vignette_of(plan, source, state.trajectory)
+    if found is None:
+        return None
+    divided = state.corrected(divided_by(state.source, found), found, found.decision)
+    return Proposal(lambda: replace(divided, vignette=found), worse=None)
+
+
+def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
+    """Measure the vignette of a capture, unless its spec lists corrections, or a merger does not accept corrected sums."""
+    mergers = [level.merge.contribution for level in plan.levels]
+    accepted = all(isinstance(merger, MergerContribution) and merger.accepts_corrected_sums for merger in mergers)
+    if not plan.corrects_itself or source.info.kind != "binary" or not accepted:
+        return None
+    return estimate_vignette(source, trajectory)
+
+
+def _flat_field(state: State) -> Vignette:
+    source = state.view.source
+    measured = measure_pixel_gain(source, state.trajectory, state.context)
+    counts = np.sum([source.counts(span) for span in measured.spans], axis=0) / sum(map(len, measured.spans))
+    return Vignette(measured.gain, counts.astype(np.float32), measured.spans, measured.std)
+
+
+def in_changing_light(state: State) -> Proposal | None:
+    """Measure the light along the motion, and locate the first level again in it.
+
+    The first motion was estimated as if the light were steady, so that the light is measured once more along the second one.
+    `light: auto` takes the light for steady if it does not change along that, or if it explains the photons worse. `light:
+    steady` warns if it changes.
+    """
+    mode, levels, source = state.plan.light.mode, state.levels[:1], state.source
+    measure = measure_light if mode == "changing" else find_light
+    light = measure(state.view.source, state.trajectory, state.context)
+    if light is None:
+        return None
+    if mode == "steady":
+        logger.warning(f"light: steady, but {decision_of(light, source.info.frame_rate_hz).reason}; write light: auto")
+        return None
+
+    def lit(light: Light) -> State:
+        return state.corrected(in_light(source, light), light, decision_of(light, source.info.frame_rate_hz))
+
+    def make() -> State | None:
+        first = lit(light).located(levels, state.trajectory)
+        again = measure(replace(first, source=source).view.source, first.trajectory, state.context)
+        return None if again is None else lit(again).located(levels, first.trajectory)
+
+    def settle(proposed: State) -> State:
+        found, residuals = light_of(proposed.source), proposed.fit.residuals
+        assert found is not None
+        corrected = corrected_light(found, residuals.spans, *residuals.gains())
+        return replace(lit(corrected), results=proposed.results, outdated=False)
+
+    rejection = "the light is taken for steady, since in the light that was found"
+    return Proposal(make, None if mode == "changing" else worse_in_light, settle, rejection)
+
+
+def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
+    """Compare a motion in changing light with that in steady light.
+
+    Where the light explains the brightness of the frames, the scatter of the shifts does not count: groups blur the panorama
+    of level 1 by a tremor, and the steps against it are wrong by much more than their noise.
+    """
+    return "" if proposed.misfit < _EXPLAINED * before.misfit else proposed.worse_than(before)
+
+
+def later_levels(state: State, journal: list[Decision]) -> Proposal:
+    """Run the levels that are left; a single one again, if the capture was corrected since.
+
+    In light that flickers, group sizes that are chosen from the capture are chosen anew: whole periods of the light.
+    """
+    levels, light = state.levels, light_of(state.source)
+    if light is not None and light.frequency:
+        journal[:] = [each for each in journal if each.what != "group_size"]
+        levels = build_levels(state.plan, state.source, journal)
+    left = levels if state.outdated and len(levels) == 1 else levels[1:]
+    return Proposal(lambda: replace(state, levels=levels).located(left, state.trajectory), worse=None)
+
+
+def cut_at_jumps(state: State) -> Proposal | None:
+    """Cut the motion where the image jumps, and locate all levels again: exposures across a jump mislead the first one, too."""
+    cuts = find_cuts(state.source, state.fit, state.context)
+    if not cuts:
+        return None
+
+    def make() -> State:
+        levels = build_levels(state.plan, state.source, [])
+        cut = replace(state, timeline=state.timeline.cut_at(cuts), levels=levels).located(levels, state.start)
+        measured = [each.along(cut.motion.trajectory, cut.motion.frame_shape) for each in cuts]
+        return replace(cut, timeline=cut.timeline.cut_at(measured))
+
+    # Dark frames contradict any motion, and a surer one the more. Their run is doubtful in any case.
+    dark = any(each.dark is not None for each in cuts)
+    places = ", ".join(f"frame {each.frame}" for each in cuts)
+    rejection = f"the image seems to jump before {places}, but the motion is not cut there"
+    return Proposal(make, (lambda *_: "") if dark else MotionFit.worse_than, rejection=rejection, severity=logging.WARNING)

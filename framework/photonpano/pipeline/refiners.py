@@ -1,0 +1,82 @@
+"""Refine the motion: each refiner corrects it by what short spans of frames show beyond it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from photonpano.contracts.attribution import attributing
+from photonpano.contracts.results import REFINED
+from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.pipeline.passes import Proposal, tried
+from photonpano.pipeline.state import State
+from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
+from photonpano.values import Refined
+
+# Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough.
+MAX_ROUNDS = 6
+
+
+def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
+    """Correct the motion by refiners, each until it finds nothing, and measure what is left.
+
+    Raises:
+        CanvasTooLargeError: the panorama is far larger than what fits into the memory.
+        LocationError: frames reach the horizon of the reference plane.
+        PluginError: a refiner failed, or broke its contract.
+    """
+    refinements = []
+    for place, refiner in enumerate(refiners):
+        before, rounds, kept_out = state.motion, list[str](), ""
+        while len(rounds) < MAX_ROUNDS:
+            each = partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1)
+            state, accepted, summary, worse = tried(state, each)
+            if not accepted:
+                kept_out = " ".join(worse.split())
+                break
+            rounds.append(summary)
+            state.context.progress.note(f"{refiner.name}: {summary}")
+        refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
+    return state.fit.explained(refinements)
+
+
+def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:
+    """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
+    given = place, number, state.motion.homographies, state.motion.std_px
+    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state, number), *given)
+    if found is None:
+        return None
+    homographies, std_px = found.homographies, found.std_px
+    motion = replace(state.motion, trajectory=FrameTrajectory(homographies), homographies=homographies, std_px=std_px)
+    rejection = f"a correction of {refiner.origin} is not used"
+    return Proposal(lambda: replace(state, refined=motion), rejection=rejection, summary=found.summary)
+
+
+def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None:
+    """Call a refiner, check what it returns, and make the homography of the reference frame the identity."""
+    motion, fit = state.motion, state.fit
+    with attributing(refiner.origin, f"round {number}"):
+        std_px = motion.std_px.copy()
+        found = refiner.component.refine(state.view.source, motion.trajectory, std_px, fit.residuals.steps(), fit.predictions)
+        if found is None:
+            return None
+        found = REFINED.require(found, motion.std_px)
+        homographies = inverse(found.homographies[motion.reference]) @ found.homographies
+        if motion.camera is not None:
+            turned = nearest_rotations(motion.camera.rotations(homographies))
+            return replace(found, homographies=motion.camera.homographies(turned[motion.reference].T @ turned))
+        homographies /= homographies[:, 2:, 2:].copy()
+        return replace(found, homographies=homographies)
+
+
+def _change_px(before: FrameMotion, after: FrameMotion) -> float:
+    """Return the mean displacement of the corners of the located frames."""
+    total = 0.0
+    for block in before.span.blocks(BLOCK_FRAMES):
+        first, last = (motion.homographies[block.start : block.stop] for motion in (before, after))
+        total += float(corner_displacements(inverse(first) @ last, np.eye(3), before.frame_shape).mean(axis=-1).sum())
+    return total / len(before.span)

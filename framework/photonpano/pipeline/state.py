@@ -1,0 +1,130 @@
+"""The state of an estimate: the capture as corrected so far, and the motion known so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+from photonpano.context import Context
+from photonpano.corrections import Vignette
+from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
+from photonpano.motion.level import Level
+from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.timeline import Timeline
+from photonpano.protocols import Source, Trajectory, camera_of_motion
+from photonpano.residuals.refinement import MotionFit
+from photonpano.source_wrapper import seen_through
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision, Light
+
+
+class View(NamedTuple):
+    """A capture as its camera sees it, and the context of what is done with it."""
+
+    source: Source
+    context: Context
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A capture as corrected so far, and its motion as known so far. It is frozen: passes return new states.
+
+    Attributes:
+        plan: what to do.
+        source: the capture as corrected so far, in its light, but not yet through the camera that was found.
+        context: threads, progress, and checkpoints that depend on these corrections.
+        reference: the frame whose homography is the identity.
+        levels: the components of each level.
+        timeline: repeated frames, and where the motion is cut.
+        model: what the motion of the camera may be.
+        start: the motion known before the first level; None if there is none.
+        results: of the levels so far.
+        outdated: whether the source was corrected since these levels were located.
+        vignette: by which the source is divided.
+        decisions: of the passes, for the record.
+        refined: the motion corrected by refiners; None for that of the last level.
+    """
+
+    plan: Plan
+    source: Source
+    context: Context
+    reference: int
+    levels: tuple[Level, ...]
+    timeline: Timeline
+    model: MotionModel = HOMOGRAPHIES
+    start: Trajectory | None = None
+    results: tuple[LevelResult, ...] = ()
+    outdated: bool = False
+    vignette: Vignette | None = None
+    decisions: tuple[Decision, ...] = ()
+    refined: FrameMotion | None = None
+
+    def located(self, levels: Sequence[Level], previous: Trajectory | None) -> State:
+        """Run levels of the loop, and return the state with their results in place of those of the same and later levels.
+
+        Args:
+            levels: some of the levels, in order.
+            previous: the motion from which the first of them starts; None if nothing is known.
+
+        Raises:
+            LocationError: too few exposures could be located.
+            PluginError: a component failed, or broke its contract.
+        """
+        if not levels:
+            return self
+        before = [each for each in self.results if each.level.number < levels[0].number]
+        given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
+        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given)), outdated=False)
+
+    def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
+        """Return the state of a capture with one more correction, on which its checkpoints then depend."""
+        context, decisions = _within(self.context, correction), (*self.decisions, decision)
+        return replace(self, source=source, context=context, outdated=True, decisions=decisions)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion after the last level."""
+        return self.results[-1].trajectory
+
+    @cached_property
+    def view(self) -> View:
+        """The capture as the camera sees it that the last level has found."""
+        camera = camera_of_motion(self.trajectory) if self.results else None
+        if camera is None:
+            return View(through_lens(self.source, self.model), self.context)
+        return View(seen_through(self.source, camera), _within(self.context, camera))
+
+    @cached_property
+    def motion(self) -> FrameMotion:
+        """The motion of every frame."""
+        return self.refined or motion_of_frames(self.results, self.source.info, self.reference)
+
+    @cached_property
+    def fit(self) -> MotionFit:
+        """How well the motion explains the photons.
+
+        Raises:
+            CanvasTooLargeError: the panorama is far larger than what fits into the memory.
+            LocationError: frames reach the horizon of the reference plane.
+        """
+        render, memory = self.plan.render, int(self.plan.run.memory)
+        return MotionFit(self.view.source, self.motion, render.tolerance_px, memory, self.view.context)
+
+
+def model_of(plan: Plan) -> MotionModel:
+    """Return the motions that a spec allows the camera."""
+    camera, distortion = plan.camera, plan.camera.distortion
+    k1, k2, p1, p2 = (_given(each) for each in (distortion.k1, distortion.k2, distortion.p1, distortion.p2))
+    return MotionModel(plan.motion.model, _given(camera.focal_px), camera.centre_px, (k1, k2, p1, p2))
+
+
+def _given(number: float | Literal["find"]) -> float | None:
+    return None if number == "find" else number
+
+
+def _within(context: Context, given: object) -> Context:
+    """Return a context whose checkpoints depend on one more value."""
+    return replace(context, checkpoints=context.checkpoints.within(given))
