@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano.api.batch.job import Job
+from photonpano.api.batching.sweeps import Job
 
 DASH = "\N{EN DASH}"
 SPEC = "version: 1\nsource: {use: auto}\nresample: {with: {group_size: 25}}\n"
@@ -31,7 +31,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             failed = replace(job.row, status="failed", reason="cut short\ncopy it again")
             yield [(index, failed if job.row.name == "bad" else done)]
 
-    monkeypatch.setattr("photonpano.api.batch.batch.rows_of", rows_of)
+    monkeypatch.setattr("photonpano.api.batch.rows_of", rows_of)
     return tmp_path
 
 

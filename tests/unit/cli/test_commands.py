@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,18 @@ import pytest
 from ruamel.yaml import YAML
 
 from photonpano import RunCheck
+from photonpano.api.command import COMMANDS
+from photonpano.cli.app import commands
 from photonpano.pipeline.run import RunResult
 from photonpano.residuals.verdict import Reason, Verdict
 from photonpano.specs import load_spec, parse_spec
+
+
+def answer(monkeypatch: pytest.MonkeyPatch, name: str, result: Any) -> None:
+    """Let a command have a result without work."""
+    commands()[name]
+    module = f"photonpano.api.{name.replace('-', '_')}"
+    monkeypatch.setitem(COMMANDS, module, replace(COMMANDS[module], calls=lambda **_: result))
 
 
 def test_simulate_prints_files_and_spec_section(finished: Path) -> None:
@@ -101,7 +111,7 @@ def run_with(folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.Monke
             **more,
         }
         result = RunResult(folder / "run", record | more, verdict)
-        monkeypatch.setattr("photonpano.pipeline.run.run", lambda *_, **_options: result)
+        monkeypatch.setattr("photonpano.api.run.run", lambda *_, **_options: result)
         return invoke("run", "capture.yaml", *arguments)
 
     return run_with
@@ -159,7 +169,7 @@ def test_check_run_prints_verdict_and_what_is_unknown(
     folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, ratio: float | None, scatter: str
 ) -> None:
     found = RunCheck(Verdict("doubtful", (TREMBLING,), ratio), ("pairs are not judged",))
-    monkeypatch.setattr("photonpano.api.run_check.check_run", lambda *_: found)
+    answer(monkeypatch, "check-run", found)
     result = invoke("check-run", "run")
     assert (result.exit_code, result.stdout) == (0, f"verdict   doubtful\nscatter   {scatter}\n")
     assert result.stderr == f"{SENTENCE}warning: pairs are not judged\n"
@@ -300,7 +310,7 @@ def test_explain_marks_origin_of_fallbacks(folder: Path, invoke: Callable[..., A
 
 def test_warm_up_prints_seconds(invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """`make test` compiles with it before any test."""
-    monkeypatch.setattr("photonpano.api.runs.warm_up", lambda: 31.4)
+    answer(monkeypatch, "warm-up", 31.4)
     assert invoke("warm-up").stdout == "ready after 31 s\n"
 
 

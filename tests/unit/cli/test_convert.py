@@ -85,7 +85,7 @@ class Grey:
 def test_convert_refuses_intensities(cube: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     grey = SourceContribution(name="grey", summary="Toy", config=GreyConfig, build=lambda *_: Grey())
     catalog = discover().including(grey)
-    monkeypatch.setattr("photonpano.specs.loading.discover", lambda: catalog)
+    monkeypatch.setattr("photonpano.registry.discover", lambda: catalog)
     result = invoke("convert", "cube.npy", "out.npy", "--source", "grey")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == (

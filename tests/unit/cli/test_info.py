@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano.api.capture_info import percent
+from photonpano.api.info import percent
 from photonpano.specs import parse_spec
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonpano.cli.errors import WrongArgumentError
-from photonpano.cli.options import capture_plan
+from photonpano.api.command import WrongArgumentError
+from photonpano.cli.plans import capture_plan
 from photonpano.errors import SpecError
 
 

@@ -12,8 +12,7 @@ import pytest
 from pydantic import Field
 
 from photonpano import Config, LocatorContribution, Requirement, hookimpl
-from photonpano.cli.plugins import KindName
-from photonpano.registry import KINDS, BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
+from photonpano.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.registry.plugins import observation_of
 from photonpano.specs import parse_spec
@@ -111,10 +110,6 @@ def test_plugins_list_of_kind_includes_disabled_plugins(invoke: Callable[..., An
     assert invoke("plugins", "list", "--kind", "source").stdout == (
         "KIND      NAME  PLUGIN       SUMMARY\ndisabled  e     epsilon 0.4  By PHOTONPANO_DISABLE_PLUGINS=e\n"
     )
-
-
-def test_plugins_commands_know_every_kind() -> None:
-    assert [kind.value for kind in KindName] == list(KINDS)
 
 
 def test_plugins_list_broken_prints_a_line_when_none_is(invoke: Callable[..., Any]) -> None:
