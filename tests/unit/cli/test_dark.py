@@ -55,31 +55,3 @@ def test_dark_applies_corrections_that_move_pixels(folder: Path, invoke: Callabl
     invoke("dark", "covered.yaml", "-o", "dark.npz", "--correct", "rot90", "--correct", "{crop: {rows: [0, 10]}}")
     with np.load(folder / "dark.npz") as archive:
         assert archive["rates"].shape == (10, 24)
-
-
-def test_dark_warns_of_bright_capture(folder: Path, invoke: Callable[..., Any]) -> None:
-    done = invoke("dark", "capture.yaml", "-o", "dark.npz")
-    assert done.exit_code == 0
-    assert done.stderr == "warning: half of the pixels count more than 0.1 photons per frame; was the lens covered?\n"
-
-
-@pytest.mark.usefixtures("hot")
-def test_dark_refuses_other_suffix_and_leaves_nothing(folder: Path, invoke: Callable[..., Any]) -> None:
-    done = invoke("dark", "covered.yaml", "-o", "dark.txt")
-    assert done.exit_code == 1
-    assert (
-        done.stderr == "error: cannot write dark.txt: dark counts are an .npz file, and a mask of hot pixels is a .npy file\n"
-    )
-    assert not list(folder.glob("*dark*"))
-
-
-@pytest.mark.usefixtures("hot")
-def test_explain_prints_corrections_as_written(folder: Path, invoke: Callable[..., Any]) -> None:
-    corrections = "corrections:\n  - rot90\n  - crop: {rows: [2, null]}\nresample: {with: {group_size: 50}}\n"
-    (folder / "scan.yaml").write_text(f"{SPEC}{corrections}")
-    printed = invoke("explain", "scan.yaml").stdout
-    assert (
-        "corrections:\n  - rot90\n  - crop:\n      rows: [2, null]\n      columns: [null, null]  # default\nresample:"
-        in printed
-    )
-    assert printed.startswith("# scan.yaml as it will run, on 1,000 binary frames of 30x24\n")

@@ -81,21 +81,6 @@ def test_version_is_printed(invoke: Callable[..., Any]) -> None:
     assert invoke("--version").stdout == f"photonpano {photonpano.__version__}\n"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["run"], "Missing argument 'SPEC'"),
-        (["run", "a.yaml", "--ouput", "b"], "No such option: --ouput"),
-        (["rum", "a.yaml"], "No such command 'rum'"),
-        (["simulate", "a.yaml"], "Missing option '--output' / '-o'"),
-    ],
-)
-def test_wrong_command_line_exits_2(arguments: list[str], message: str, invoke: Callable[..., Any]) -> None:
-    result = invoke(*arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert message in result.stderr
-
-
 def test_module_is_the_program() -> None:
     done = subprocess.run([sys.executable, "-m", "photonpano", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"photonpano {photonpano.__version__}\n"
