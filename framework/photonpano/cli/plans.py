@@ -49,7 +49,7 @@ def plan_of(kind: str | None, given: Mapping[str, Any], catalog: Catalog | None 
 
     if kind == "spec":
         return nullcontext(load_spec(given["spec"], given["changes"] or (), catalog=catalog))
-    return capture_plan(*(given[name] for name in PLANS[kind]), catalog) if kind else nullcontext()
+    return capture_plan(**{name: given[name] for name in PLANS[kind]}, catalog=catalog) if kind else nullcontext()
 
 
 @contextmanager

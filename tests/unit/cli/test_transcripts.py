@@ -95,7 +95,7 @@ class World:
     def run(self) -> None:
         """Copy a capture with its truth, and its run."""
         for name in ("cube.npy", "cube.truth.npz"):
-            shutil.copy(self.finished / name, name)
+            shutil.copy2(self.finished / name, name)
         shutil.copytree(self.finished / "run", "run")
         here = str(Path("cube.npy").absolute())
         self.record(lambda record: record["spec"]["source"]["with"].update(path=here))
@@ -283,7 +283,7 @@ def test_commands_print_what_is_written(
                     Path(head[2:]).write_text(body.partition("<\n")[0], encoding="utf-8")
                 elif head.startswith("$ "):
                     found = output_of(shlex.split(head[2:]), invoke).replace(str(folder), "{here}")
-                    if not pattern_of(body.strip("\n")).fullmatch(found):
+                    if not pattern_of(body.strip("\n")).fullmatch(f"{found}\n"):
                         wrong.append(f"{path.name}: {head}\n--- written\n{body}\n--- found\n{found}")
                         step = f"{head}\n{found}"
                 shown += [step.strip("\n")] if step.strip() else []
@@ -306,4 +306,4 @@ def pattern_of(written: str) -> re.Pattern[str]:
     lines = (
         "(?:.*\n)*?" if line == "..." else ".*".join(map(re.escape, line.split("..."))) + "\n" for line in written.split("\n")
     )
-    return re.compile("".join(lines).removesuffix("\n") + ("\n?" if written.endswith("...") else ""))
+    return re.compile("".join(lines))

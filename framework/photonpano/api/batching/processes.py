@@ -7,7 +7,7 @@ clean memory, and may crash or be killed: its row says how it ended.
 from __future__ import annotations
 
 import fcntl
-import multiprocessing
+import multiprocessing.forkserver
 import os
 import signal
 import sys
@@ -89,7 +89,7 @@ class _Process(ForkServerProcess):
     @staticmethod
     def _Popen(process: Any) -> Any:  # noqa: N802
         with _without_main():
-            return ForkServerProcess._Popen(process)  # type: ignore[attr-defined]
+            return ForkServerProcess._Popen(process)
 
 
 @contextmanager

@@ -56,7 +56,7 @@ def test_each_way_to_end_is_a_row(odd: ModuleType, tmp_path: Path) -> None:
         "raise ValueError('odd')": r"ValueError: odd \(a defect of photonpano or of a plugin\)",
         "raise MemoryError": r"there is not enough memory; lower run\.memory, or the number of jobs",
         "": r"1:1: source\.use: required: .*",
-        "os.kill(os.getppid(), signal.SIGKILL); time.sleep(60)": r"the run ended with the exit code 255: printed by a library; .*",
+        "os.kill(os.getppid(), signal.SIGKILL); time.sleep(60)": r"the run ended with the exit code 255: .*",
     }
     changes = list(rows_of([odd.job(way, tmp_path) for way in ways], 1))
     ended = {index: row for changed in changes for index, row in changed if row.status != "running"}
