@@ -5,10 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 
-_MOST = 3
-"""The largest number of names that are suggested."""
-_SAME_WORD = 0.8
-"""The similarity of two words from which one counts as a misspelling of the other."""
+_MOST = 3  # the largest number of names that are suggested
+_SAME_WORD = 0.8  # the similarity of two words from which one counts as a misspelling of the other
 
 
 def listed(words: Iterable[str], last: str = "and") -> str:

@@ -60,8 +60,7 @@ SPEC = typer.Argument(metavar="SPEC", help="The spec: a YAML file.")
 CHANGES = typer.Option(
     "--set", metavar="KEY=VALUE", help="Change a value of the spec, such as run.seed=1 or levels.0.scale=0.5."
 )
-COMMANDS: dict[str, Command] = {}
-"""The commands whose modules are imported, by module."""
+COMMANDS: dict[str, Command] = {}  # the commands whose modules are imported, by module
 
 
 def command(example: str, prints: Callable[..., Iterable[str]], **declared: Any) -> Callable[[FunctionT], FunctionT]:

@@ -24,8 +24,7 @@ from photonpano.record.schema import RunRecord
 from photonpano.report import ComparedRun, render_comparison
 from photonpano.text import columns
 
-_PICTURE_PIXELS = 1600
-"""Longer side of a panorama on the page."""
+_PICTURE_PIXELS = 1600  # longer side of a panorama on the page
 _FILES = ("trajectory.npz", "panorama.png")
 
 

@@ -23,8 +23,7 @@ from photonpano.specs.corrections import written_corrections
 from photonpano.text import columns
 from photonpano.values import BoolArray, FluxImage, StreamInfo
 
-BRIGHT = 0.1
-"""Median photons per frame above which a binary capture was not recorded with the lens covered."""
+BRIGHT = 0.1  # median photons per frame above which a binary capture was not recorded with the lens covered
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,8 +23,7 @@ from photonpano.text import columns
 from photonpano.threads import thread_count
 from photonpano.values import Panorama
 
-_FEW = 0.1
-"""If a smaller share of the positions lies within 3 expected errors, poses and truth hardly belong together."""
+_FEW = 0.1  # if a smaller share of the positions lies within 3 expected errors, poses and truth hardly belong together
 
 
 def _score(run_folder: Path, truth: Path, **how: Any) -> Evaluation | PoseScore:

@@ -23,12 +23,9 @@ from photonpano.text import columns, duration
 from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import CaptureSummary, StreamInfo
 
-HOT_SHARE = 0.001
-"""Share of hot pixels above which the warnings recommend a mask."""
-STANDING_SHARE = 0.5
-"""Share of the frame that stands still above which nothing is masked by itself."""
-SATURATED_SHARE = 0.01
-"""Share of pixels saturated in every frame above which the warnings recommend less light."""
+HOT_SHARE = 0.001  # share of hot pixels above which the warnings recommend a mask
+STANDING_SHARE = 0.5  # if more of the frame is static than this, `corrections: auto` masks nothing
+SATURATED_SHARE = 0.01  # share of pixels saturated in every frame above which the warnings recommend less light
 
 
 @dataclass(frozen=True, slots=True)

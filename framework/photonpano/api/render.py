@@ -24,8 +24,8 @@ from photonpano.registry import Catalog
 from photonpano.report.notebook import run_html
 from photonpano.threads import one_thread_inside, thread_count
 
+# Sections of a spec that may differ from those of the run. That of the source tells where the capture is now.
 _SECTIONS = ("render", "output", "run", "source")
-"""Sections of a spec that may differ from those of the run. That of the source tells where the capture is now."""
 
 
 @dataclass(frozen=True, slots=True)

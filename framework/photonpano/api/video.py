@@ -29,8 +29,7 @@ from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 View = Literal["panorama", "smooth"]
-_SMOOTH_S = 0.5
-"""Standard deviation of the smooth path, in seconds of the video."""
+_SMOOTH_S = 0.5  # standard deviation of the smooth path, in seconds of the video
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 

@@ -20,8 +20,8 @@ from photonpano.cli.verbosity import with_verbosity
 from photonpano.errors import OutputError
 from photonpano.interrupts import interrupted_by
 
+# The commands that `--help` lists before all others
 _FIRST = ("info", "check", "run", "batch", "check_run", "verify", "evaluate", "compare", "render", "video", "export")
-"""The commands that `--help` lists before all others."""
 
 
 class _Command(TyperCommand):

@@ -15,8 +15,7 @@ from photonpano.interrupts import interrupted_by
 
 FAILED = 1
 WRONG_SPEC = 2
-SIGNALLED = 128
-"""Plus the number of the signal: 130 for Ctrl-C."""
+SIGNALLED = 128  # plus the number of the signal: 130 for Ctrl-C
 INTERRUPTED = "\ninterrupted; no file is left half-written under its final name"
 
 

@@ -30,6 +30,7 @@ _CORRECTIONS = typer.Option(
     metavar="CORRECTION",
     help="Apply a correction, as in a spec, such as rot90 or '{crop: {rows: [2, null]}}'.",
 )
+# The type, option and default of each option that gives a plan
 PLANS: dict[str | None, dict[str, tuple[Any, Any, Any]]] = {
     None: {},
     "spec": {"spec": (Path, SPEC, ...), "changes": (list[str], CHANGES, None)},
@@ -40,7 +41,6 @@ PLANS: dict[str | None, dict[str, tuple[Any, Any, Any]]] = {
         "corrections": (list[str], _CORRECTIONS, None),
     },
 }
-"""The type, option and default of each option that gives a plan."""
 
 
 def plan_of(kind: str | None, given: Mapping[str, Any], catalog: Catalog | None = None) -> AbstractContextManager[Plan | None]:

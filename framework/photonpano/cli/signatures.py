@@ -22,8 +22,8 @@ from photonpano.cli.plans import PLANS, plan_of
 from photonpano.cli.verbosity import verbosity_of, with_verbosity
 
 SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
-_GIVEN = {"plan", "progress", "catalog", "resumed"}
-"""Parameters that no option gives."""
+_GIVEN = {"plan", "progress", "catalog", "resumed"}  # parameters that no option gives
+# How parameters are given that several commands have
 _USUAL: dict[str, Any] = {
     "run_folder": typer.Argument(metavar="RUN", help="A run folder."),
     "output": typer.Option("--output", "-o", metavar="DIR"),
@@ -32,7 +32,6 @@ _USUAL: dict[str, Any] = {
     "strict": typer.Option(help="Exit with 1 if the verdict is doubtful."),
     "as_json": typer.Option("--json", help="Print JSON, for programs."),
 }
-"""How parameters are given that several commands have."""
 
 
 class LoadedCommand(TyperCommand):
